@@ -1,0 +1,271 @@
+"""What a plant is, as plain data: names, units, limits, levels, sensor, nominal values.
+
+A `PlantDescription` needs neither JAX nor NumPy, so that a report, a web page or a
+laboratory computer reads it at once. Its hash identifies the plant in records and
+policies: it is the SHA-256 of canonical JSON with a format number, never of source
+code, so that moving or reformatting a plant file does not change it, and changing any
+number does.
+
+All values are in SI units and radians.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+FORMAT = 1
+"""Version of the canonical JSON below; it enters every hash."""
+
+
+def _require(condition: bool, sentence: str) -> None:
+    if not condition:
+        raise ValueError(sentence)
+
+
+class _Named:
+    """Checks and normalises the fields that all parts of a description share."""
+
+    name: str
+
+    def __post_init__(self) -> None:
+        _require(
+            self.name.isidentifier() and not self.name.startswith("_"),
+            f"{type(self).__name__.lower()} name {self.name!r} is not allowed: "
+            "letters, digits and underscores, beginning with a letter",
+        )
+        for field in fields(self):  # pyright: ignore[reportArgumentType]
+            value = getattr(self, field.name)
+            # 1 and 1.0 are the same number and must give the same hash.
+            if isinstance(value, int) and not isinstance(value, bool):
+                object.__setattr__(self, field.name, float(value))
+            elif isinstance(value, float):
+                _require(
+                    math.isfinite(value),
+                    f"{field.name} of {self.name!r} is {value}; a finite number is needed "
+                    "(leave a bound out for none)",
+                )
+
+
+@dataclass(frozen=True)
+class State(_Named):
+    """One component of the state: its value at rest and a typical size, in `unit`."""
+
+    name: str
+    unit: str
+    initial: float = 0.0
+    scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _require(self.scale > 0, f"scale of state {self.name!r} must be positive")
+
+
+@dataclass(frozen=True)
+class Input(_Named):
+    """One input with its limits, and the amplitude at which classical signals are safe.
+
+    `amplitude` counts from the middle of the limits and defaults to half their width.
+    """
+
+    name: str
+    unit: str
+    lower: float
+    upper: float
+    amplitude: float | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _require(
+            self.lower < self.upper,
+            f"limits of input {self.name!r} must grow: got {self.lower} to {self.upper}",
+        )
+        half = (self.upper - self.lower) / 2
+        if self.amplitude is None:
+            object.__setattr__(self, "amplitude", half)
+        _require(
+            0 < (self.amplitude or 0.0) <= half,
+            f"amplitude of input {self.name!r} must lie in (0, {half}]: got {self.amplitude}",
+        )
+
+
+@dataclass(frozen=True)
+class Output(_Named):
+    """One measured output: typical size, sensor, and the safety levels of its magnitude.
+
+    `noise_sd` is the standard deviation of Gaussian sensor noise, `resolution` the step
+    of an encoder (0: none), both in `unit`. A level left out is a level not watched.
+    """
+
+    name: str
+    unit: str
+    scale: float
+    noise_sd: float = 0.0
+    resolution: float = 0.0
+    warning_level: float | None = None
+    critical_level: float | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _require(self.scale > 0, f"scale of output {self.name!r} must be positive")
+        _require(
+            self.noise_sd >= 0 and self.resolution >= 0,
+            f"noise_sd and resolution of output {self.name!r} must not be negative",
+        )
+        _require(
+            0 < (self.warning_level or 0.1) and 0 < (self.critical_level or 1.0),
+            f"the levels of output {self.name!r} are magnitudes and must be positive",
+        )
+        if self.warning_level is not None and self.critical_level is not None:
+            _require(
+                self.warning_level < self.critical_level,
+                f"warning level of output {self.name!r} must be below its critical level",
+            )
+
+
+@dataclass(frozen=True)
+class Parameter(_Named):
+    """One unknown parameter.
+
+    `positive` parameters are estimated through their logarithm, free ones over `scale`.
+    `target` says whether an experiment is designed for it. `symbol` is how a report
+    writes it (TeX), `scale` the size of a relevant change (default: the nominal value).
+    """
+
+    name: str
+    unit: str
+    nominal: float
+    symbol: str = ""
+    scale: float | None = None
+    lower: float | None = None
+    upper: float | None = None
+    positive: bool = True
+    target: bool = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.symbol:
+            object.__setattr__(self, "symbol", self.name)
+        if self.scale is None:
+            object.__setattr__(self, "scale", abs(self.nominal))
+        _require((self.scale or 0.0) > 0, f"scale of parameter {self.name!r} must be positive")
+        _require(
+            not self.positive or self.nominal > 0,
+            f"parameter {self.name!r} is positive, its nominal value {self.nominal} is not",
+        )
+        lower = -math.inf if self.lower is None else self.lower
+        upper = math.inf if self.upper is None else self.upper
+        _require(
+            lower < self.nominal < upper,
+            f"nominal value of parameter {self.name!r} must lie inside its bounds: "
+            f"got {self.nominal} for {lower} to {upper}",
+        )
+        _require(
+            not self.positive or self.lower is None or self.lower > 0,
+            f"lower bound of the positive parameter {self.name!r} must be positive",
+        )
+
+
+@dataclass(frozen=True)
+class Constant(_Named):
+    """One known physical constant."""
+
+    name: str
+    unit: str
+    value: float
+
+
+@dataclass(frozen=True)
+class PlantDescription:
+    """A plant as plain data.
+
+    Attributes:
+        name: the word by which command line, studies and records know it.
+        states, inputs, outputs, parameters, constants: in the order of their arrays.
+        dt: sampling time [s]; inputs are held over it.
+        substeps: Runge-Kutta steps in one `dt`.
+        band: lowest and highest frequency [Hz] at which the plant is worth exciting.
+    """
+
+    name: str
+    states: tuple[State, ...]
+    inputs: tuple[Input, ...]
+    outputs: tuple[Output, ...]
+    parameters: tuple[Parameter, ...]
+    dt: float
+    band: tuple[float, float]
+    constants: tuple[Constant, ...] = ()
+    substeps: int = 1
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "dt", float(self.dt))
+        object.__setattr__(self, "band", (float(self.band[0]), float(self.band[1])))
+        _require(math.isfinite(self.dt) and self.dt > 0, f"dt must be positive: got {self.dt}")
+        _require(self.substeps >= 1, f"substeps must be at least 1: got {self.substeps}")
+        _require(
+            0 < self.band[0] < self.band[1] <= 0.5 / self.dt,
+            f"band must grow and end at or below {0.5 / self.dt:g} Hz, half the sampling "
+            f"rate: got {self.band[0]:g} to {self.band[1]:g} Hz",
+        )
+        for kind in ("states", "inputs", "outputs", "parameters", "constants"):
+            parts = getattr(self, kind)
+            names = [part.name for part in parts]
+            _require(bool(parts) or kind == "constants", f"plant {self.name!r} has no {kind}")
+            _require(len(set(names)) == len(names), f"{kind} of {self.name!r} repeat a name")
+        columns = {"time", *names_of(self.inputs)}
+        _require(
+            columns.isdisjoint(names_of(self.outputs)) and "time" not in names_of(self.inputs),
+            f"inputs and outputs of {self.name!r} are file columns beside 'time': "
+            "all their names must differ",
+        )
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Columns of an experiment file: time, inputs, outputs."""
+        return ("time", *names_of(self.inputs), *names_of(self.outputs))
+
+    def to_dict(self) -> dict[str, Any]:
+        """The description as JSON-ready data; `from_dict` reads it back."""
+        return {"format": FORMAT, **asdict(self)}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> PlantDescription:
+        """The description written by `to_dict`.
+
+        Raises:
+            ValueError: for another format number, or a missing or unknown field.
+        """
+        if data.get("format") != FORMAT:
+            raise ValueError(
+                f"plant description has format {data.get('format')!r}; this version reads {FORMAT}"
+            )
+        kinds = {
+            "states": State,
+            "inputs": Input,
+            "outputs": Output,
+            "parameters": Parameter,
+            "constants": Constant,
+        }
+        try:
+            parts = {k: tuple(kind(**entry) for entry in data[k]) for k, kind in kinds.items()}
+            rest = {k: v for k, v in data.items() if k != "format" and k not in kinds}
+            return cls(**{**rest, **parts})
+        except (KeyError, TypeError) as error:
+            raise ValueError(f"plant description is incomplete or malformed: {error}") from None
+
+    @property
+    def hash(self) -> str:
+        """SHA-256 of the canonical JSON, as 64 hexadecimal digits."""
+        text = json.dumps(
+            self.to_dict(), sort_keys=True, separators=(",", ":"), allow_nan=False
+        )
+        return hashlib.sha256(text.encode()).hexdigest()
+
+
+def names_of(parts: Iterable[_Named]) -> tuple[str, ...]:
+    """Names of states, inputs, outputs, parameters or constants, in order."""
+    return tuple(part.name for part in parts)

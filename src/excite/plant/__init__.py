@@ -1,0 +1,10 @@
+"""Plants: the contract (`base`) and one file per shipped plant."""
+
+from .aero2 import Aero2 as Aero2
+from .base import AbstractARXPlant as AbstractARXPlant
+from .base import AbstractPlant as AbstractPlant
+from .base import Params as Params
+from .base import Sensor as Sensor
+from .cart_pole import CartPole as CartPole
+from .dc_motor import DCMotor as DCMotor
+from .emps import EMPS as EMPS
