@@ -1,0 +1,9 @@
+"""Estimators: the contract (`base`), `ARX` and `NLS`."""
+
+from .arx import ARX as ARX
+from .base import AbstractEstimator as AbstractEstimator
+from .base import Estimate as Estimate
+from .base import Experiments as Experiments
+from .base import Status as Status
+from .base import stack_experiments as stack_experiments
+from .nls import NLS as NLS

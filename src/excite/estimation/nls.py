@@ -1,0 +1,187 @@
+"""Continuous-time output-error estimation by nonlinear least squares.
+
+The parameters whose simulated outputs come closest to the measured ones, in the norm of
+the sensor's noise, are found by Levenberg-Marquardt on exact sensitivities. For Gaussian
+noise that is the maximum-likelihood estimate (Ljung, System Identification, ch. 7).
+
+After many periods a wrong resonance frequency has slipped in phase, and the sum of
+squares has other minima. The search therefore sees a growing part of the experiment:
+the first samples pin the frequency down well enough for the next, longer part.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Bool, Float
+
+from ..information import marginal_information, require_double_precision
+from ..plant import AbstractPlant, Params
+from .base import (
+    AbstractEstimator,
+    Estimate,
+    Experiments,
+    Status,
+    from_search,
+    residual_of,
+    simulate_experiments,
+    to_search,
+)
+
+
+class NLS(AbstractEstimator):
+    """Output-error nonlinear least squares with a growing horizon.
+
+    Attributes:
+        horizons: parts of the experiment that the search sees one after the other.
+        tolerance: relative and absolute, of the last search, in standard deviations of
+            the noise and in search coordinates; the first searches stop at 0.1.
+        max_steps: of each search.
+    """
+
+    horizons: tuple[float, ...] = eqx.field(static=True, default=(0.08, 0.16, 0.32, 0.6, 1.0))
+    tolerance: float = eqx.field(static=True, default=1e-5)
+    max_steps: int = eqx.field(static=True, default=64)
+
+    @eqx.filter_jit
+    def __call__(
+        self,
+        plant: AbstractPlant,
+        experiments: Experiments,
+        start: Params | None = None,
+        free: Bool[Array, " param"] | None = None,
+    ) -> Estimate:
+        """Estimate; the initial states are estimated along unless they are known."""
+        require_double_precision()
+        problem = _Problem(plant, experiments, plant.nominal if start is None else start, free)
+        unknowns, sd, converged = self._search(problem)
+        return problem.estimate(unknowns, sd, converged)
+
+    def _search(self, problem: _Problem) -> tuple[Array, Array, Array]:
+        """Unknowns, noise standard deviations, and whether the last search converged."""
+        samples = problem.experiments.valid.shape[1]
+        parts = [max(part * samples, min(samples, 40)) for part in self.horizons]
+        tolerances = [0.1] * (len(parts) - 1) + [self.tolerance]
+        if problem.num_outputs > 1:
+            # Once more with each output weighted by the noise that it turned out to have.
+            parts, tolerances = [*parts, parts[-1]], [*tolerances, self.tolerance]
+        stages = jnp.asarray(parts), jnp.asarray(tolerances)
+
+        def search(carry: tuple, stage: tuple) -> tuple[tuple, Array]:
+            unknowns, sd = carry
+            horizon, tolerance = stage
+
+            def weighted(z: Array, _: Any) -> Array:
+                seen = jnp.arange(samples)[None, :, None] < horizon
+                return jnp.where(seen, problem.residual(z) / sd[None, None], 0.0)
+
+            solver = optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance)  # pyright: ignore[reportArgumentType]
+            solution = optx.least_squares(
+                weighted, solver, unknowns, max_steps=self.max_steps, throw=False
+            )
+            if problem.num_outputs > 1:
+                complete = horizon >= samples
+                sd = jnp.where(complete, problem.noise_sd(solution.value), sd)
+            return (solution.value, sd), solution.result == optx.RESULTS.successful
+
+        start = problem.start_point, problem.assumed_sd
+        (unknowns, sd), converged = jax.lax.scan(search, start, stages)
+        return unknowns, sd, converged[-1]
+
+
+class _Problem(eqx.Module):
+    """The residual as a function of one vector: parameters, then initial states."""
+
+    plant: AbstractPlant
+    experiments: Experiments
+    start: Float[Array, " param"]
+    free: Bool[Array, " param"]
+
+    def __init__(
+        self, plant: AbstractPlant, experiments: Experiments, start: Params, free: Array | None
+    ) -> None:
+        self.plant, self.experiments = plant, experiments
+        self.start = to_search(plant.definition, start)
+        self.free = jnp.ones(len(self.start), bool) if free is None else free
+
+    @property
+    def num_outputs(self) -> int:
+        return self.experiments.measured.shape[2]
+
+    @property
+    def start_point(self) -> Array:
+        if self.experiments.initial_state_known:
+            return self.start
+        scales = self._state_scales[None]
+        return jnp.concatenate([self.start, (self.experiments.initial_state / scales).ravel()])
+
+    @property
+    def _state_scales(self) -> Array:
+        return jnp.asarray([s.scale for s in self.plant.definition.states])
+
+    @property
+    def assumed_sd(self) -> Array:
+        """The sensor's; a thousandth of an output's scale where no noise is described."""
+        scales = jnp.asarray([o.scale for o in self.plant.definition.outputs])
+        return jnp.where(self.plant.sensor.sd > 0, self.plant.sensor.sd, 1e-3 * scales)
+
+    def params(self, unknowns: Array) -> Array:
+        z = jnp.where(self.free, unknowns[: len(self.start)], self.start)
+        return from_search(self.plant.definition, z)
+
+    def initial_state(self, unknowns: Array) -> Array:
+        if self.experiments.initial_state_known:
+            return self.experiments.initial_state
+        rest = unknowns[len(self.start) :].reshape(self.experiments.initial_state.shape)
+        return rest * self._state_scales[None]
+
+    def residual(self, unknowns: Array) -> Array:
+        params = self.plant.Params(*self.params(unknowns))
+        simulated = simulate_experiments(
+            self.plant, params, self.experiments, self.initial_state(unknowns)
+        )
+        return residual_of(self.experiments, simulated)
+
+    def noise_sd(self, unknowns: Array) -> Array:
+        """Standard deviation of each output's residual, for the unknowns spent on it."""
+        count = jnp.sum(self.experiments.valid)
+        spent = (jnp.sum(self.free) + len(unknowns) - len(self.start)) / self.num_outputs
+        squares = jnp.sum(self.residual(unknowns) ** 2, axis=(0, 1))
+        scales = jnp.asarray([o.scale for o in self.plant.definition.outputs])
+        sd = jnp.sqrt(squares / jnp.maximum(count - spent, 1.0))
+        return jnp.maximum(sd, 1e-9 * scales)  # noise-free data keep a finite weight
+
+    def estimate(self, unknowns: Array, sd: Array, converged: Array) -> Estimate:
+        """The estimate at the end of the search, its covariance from the noise found."""
+        del sd
+        num_params = len(self.start)
+        residual = self.residual(unknowns)
+        S = jax.jacfwd(self.residual)(unknowns).reshape(-1, self.num_outputs, len(unknowns))
+        information = marginal_information(S, self.noise_sd(unknowns), num_params)
+        active = jnp.outer(self.free, self.free)
+        information = jnp.where(active, information, 0.0)
+        held = jnp.diag(jnp.where(self.free, 0.0, 1.0))
+        in_search = jnp.where(active, jnp.linalg.inv(information + held), 0.0)
+        slope = jax.jacfwd(lambda z: from_search(self.plant.definition, z))(
+            unknowns[:num_params]
+        )
+        params = self.params(unknowns)
+        return Estimate(
+            params=self.plant.Params(*params),
+            covariance=slope @ in_search @ slope.T,
+            information=information,
+            status=_status(params, in_search, converged),
+            initial_state=self.initial_state(unknowns),
+            residual=residual,
+        )
+
+
+def _status(params: Array, covariance: Array, converged: Array) -> Array:
+    seen = jnp.all(jnp.isfinite(covariance)) & jnp.all(jnp.diagonal(covariance) >= 0)
+    status = jnp.where(converged, Status.SUCCESSFUL, Status.ITERATIONS_EXHAUSTED)
+    status = jnp.where(seen, status, Status.ILL_CONDITIONED)
+    return jnp.where(jnp.all(jnp.isfinite(params)), status, Status.NOT_FINITE)

@@ -1,0 +1,92 @@
+"""What an experiment can tell about its parameters, before anything is estimated.
+
+With outputs y(theta) and independent Gaussian noise of standard deviation sigma, the
+Fisher information is M = sum_k S_k' S_k / sigma^2, S = dy/dtheta, and no unbiased
+estimator has a covariance below M^-1 (Cramér-Rao; L. Ljung, System Identification, 2nd
+ed., ch. 7; G. Goodwin and R. Payne, Dynamic System Identification, 1977). In logarithms
+of the parameters all of it is relative, and comparable between parameters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+Information = Float[Array, "param param"]
+
+
+def require_double_precision() -> None:
+    """Raises ValueError where JAX computes in single precision."""
+    if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
+        raise ValueError(
+            "estimation and information need double precision: "
+            'call jax.config.update("jax_enable_x64", True) first'
+        )
+
+
+def sensitivity(
+    response: Callable[[Float[Array, " param"]], Float[Array, "time output"]],
+    theta: Float[Array, " param"],
+) -> Float[Array, "time output param"]:
+    """Derivative of a response with respect to its parameters, in forward mode."""
+    require_double_precision()
+    return jax.jacfwd(response)(theta)
+
+
+def fisher_information(
+    sensitivity: Float[Array, "time output param"], noise_sd: Float[Array, " output"]
+) -> Information:
+    """S' S / sigma^2, summed over time and outputs."""
+    weighted = sensitivity / noise_sd[None, :, None]
+    return jnp.einsum("koi,koj->ij", weighted, weighted)
+
+
+def marginal_information(
+    sensitivity: Float[Array, "time output param"],
+    noise_sd: Float[Array, " output"],
+    num_params: int,
+) -> Information:
+    """Information on the first `num_params` parameters when the others are unknown too.
+
+    The others (an initial state) are eliminated by an orthogonal factorisation, which
+    keeps the digits that a Schur complement of the information loses.
+    """
+    weighted = (sensitivity / noise_sd[None, :, None]).reshape(-1, sensitivity.shape[-1])
+    columns = jnp.roll(weighted, -num_params, axis=1)
+    num_others = columns.shape[1] - num_params
+    # A direction of the others that the data do not see must not make the rest singular.
+    prior = jnp.concatenate(
+        [1e-6 * jnp.eye(num_others), jnp.zeros((num_others, num_params))], axis=1
+    )
+    R = jnp.linalg.qr(jnp.concatenate([columns, prior]), mode="r")[num_others:, num_others:]
+    return R.T @ R
+
+
+def d_optimality(information: Information) -> Float[Array, ""]:
+    """log det M: minus twice the logarithm of the confidence ellipsoid's volume."""
+    sign, value = jnp.linalg.slogdet(information)
+    return jnp.where(sign > 0, value, -jnp.inf)
+
+
+def a_optimality(information: Information) -> Float[Array, ""]:
+    """trace M^-1: the sum of the parameters' least variances."""
+    return jnp.sum(cramer_rao_bound(information) ** 2)
+
+
+def e_optimality(information: Information) -> Float[Array, ""]:
+    """Smallest eigenvalue of M: the information in the direction seen worst."""
+    return jnp.linalg.eigvalsh(information)[0]
+
+
+def cramer_rao_bound(information: Information) -> Float[Array, " param"]:
+    """Least standard deviation of each parameter; infinite where M is singular."""
+    # Scaling to a unit diagonal first: parameters may differ by many orders of magnitude.
+    size = jnp.sqrt(jnp.diagonal(information))
+    safe = jnp.where(size > 0, size, 1.0)
+    correlation = information / jnp.outer(safe, safe)
+    variance = jnp.diagonal(jnp.linalg.inv(correlation)) / safe**2
+    seen = (size > 0) & (variance > 0) & jnp.isfinite(variance)
+    return jnp.sqrt(jnp.where(seen, variance, jnp.inf))

@@ -1,0 +1,41 @@
+"""Warning and critical level of an output, as pure functions over arrays.
+
+The functions use only what NumPy and JAX arrays share, so that a batch of thousands of
+simulated episodes and a loop in real time are judged by the same lines. A level of
+infinity is a level not watched. Axis 0 of one episode is time, axis 1 output; JAX maps
+over episodes with `vmap`, NumPy by broadcasting.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, TypeAlias
+
+from .description import PlantDescription
+
+AnyArray: TypeAlias = Any
+"""A NumPy or a JAX array."""
+
+
+def critical_levels(description: PlantDescription) -> tuple[float, ...]:
+    """Critical level of each output's magnitude, in its unit; infinity for none."""
+    return tuple(
+        math.inf if o.critical_level is None else o.critical_level for o in description.outputs
+    )
+
+
+def max_abs_output(outputs: AnyArray) -> AnyArray:
+    """Largest magnitude of each output over time."""
+    return abs(outputs).max(axis=-2)
+
+
+def is_violation(outputs: AnyArray, levels: AnyArray) -> AnyArray:
+    """Whether an episode reaches the critical level of any output at any sample.
+
+    Args:
+        outputs: true (noise-free) outputs, time and output the last two axes.
+        levels: critical level of each output.
+
+    A value that is not a number counts: a run that cannot be computed is not a safe run.
+    """
+    return ~(max_abs_output(outputs) < levels).all(axis=-1)
