@@ -38,14 +38,14 @@ class NLS(AbstractEstimator):
 
     Attributes:
         horizons: parts of the experiment that the search sees one after the other.
-        tolerance: relative and absolute, of the last search, in standard deviations of
-            the noise and in search coordinates; the first searches stop at 0.1.
+        tolerance: of the last search, in search coordinates and relative to the residual;
+            the first searches stop at 0.1.
         max_steps: of each search.
     """
 
     horizons: tuple[float, ...] = eqx.field(static=True, default=(0.08, 0.16, 0.32, 0.6, 1.0))
     tolerance: float = eqx.field(static=True, default=1e-5)
-    max_steps: int = eqx.field(static=True, default=64)
+    max_steps: int = eqx.field(static=True, default=200)
 
     @eqx.filter_jit
     def __call__(
@@ -58,30 +58,30 @@ class NLS(AbstractEstimator):
         """Estimate; the initial states are estimated along unless they are known."""
         require_double_precision()
         problem = _Problem(plant, experiments, plant.nominal if start is None else start, free)
-        unknowns, sd, converged = self._search(problem)
-        return problem.estimate(unknowns, sd, converged)
+        unknowns, converged = self._search(problem)
+        return problem.estimate(unknowns, converged)
 
-    def _search(self, problem: _Problem) -> tuple[Array, Array, Array]:
-        """Unknowns, noise standard deviations, and whether the last search converged."""
+    def _search(self, problem: _Problem) -> tuple[Array, Bool[Array, ""]]:
+        """Unknowns at the minimum, and whether the last search converged."""
         samples = problem.experiments.valid.shape[1]
-        parts = [max(part * samples, min(samples, 40)) for part in self.horizons]
-        tolerances = [0.1] * (len(parts) - 1) + [self.tolerance]
-        if problem.num_outputs > 1:
-            # Once more with each output weighted by the noise that it turned out to have.
-            parts, tolerances = [*parts, parts[-1]], [*tolerances, self.tolerance]
-        stages = jnp.asarray(parts), jnp.asarray(tolerances)
+        stages = _stages(self, samples, reweighted=problem.num_outputs > 1)
 
         def search(carry: tuple, stage: tuple) -> tuple[tuple, Array]:
             unknowns, sd = carry
-            horizon, tolerance = stage
+            horizon, tolerance, boldness = stage
+            seen = jnp.arange(samples)[None, :, None] < horizon
 
-            def weighted(z: Array, _: Any) -> Array:
-                seen = jnp.arange(samples)[None, :, None] < horizon
-                return jnp.where(seen, problem.residual(z) / sd[None, None], 0.0)
+            def weighted(unknowns: Array) -> Array:
+                return jnp.where(seen, problem.residual(unknowns) / sd[None, None], 0.0)
 
-            solver = optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance)  # pyright: ignore[reportArgumentType]
+            # Relative to its size at the start, so that damping means the same for any data.
+            size = jnp.maximum(jnp.linalg.norm(weighted(unknowns)), 1e-6) / boldness
             solution = optx.least_squares(
-                weighted, solver, unknowns, max_steps=self.max_steps, throw=False
+                lambda z, _: weighted(z) / size,
+                _solver(tolerance),
+                unknowns,
+                max_steps=self.max_steps,
+                throw=False,
             )
             if problem.num_outputs > 1:
                 complete = horizon >= samples
@@ -89,8 +89,32 @@ class NLS(AbstractEstimator):
             return (solution.value, sd), solution.result == optx.RESULTS.successful
 
         start = problem.start_point, problem.assumed_sd
-        (unknowns, sd), converged = jax.lax.scan(search, start, stages)
-        return unknowns, sd, converged[-1]
+        (unknowns, _), converged = jax.lax.scan(search, start, stages)
+        return unknowns, converged[-1]
+
+
+def _stages(nls: NLS, samples: int, reweighted: bool) -> tuple[Array, Array, Array]:
+    """Horizon [samples], tolerance and boldness of each search.
+
+    The first searches start far away and step carefully. The last starts close by and
+    steps boldly, that is with damping 1 / boldness^2 of the misfit it starts from: a
+    careful search would creep along the valleys that friction makes.
+    """
+    horizons = [max(part * samples, min(samples, 40)) for part in nls.horizons]
+    early = len(horizons) - 1
+    tolerances, boldness = [0.1] * early + [nls.tolerance], [1.0] * early + [100.0]
+    if reweighted:
+        # Once more with each output weighted by the noise that it turned out to have.
+        horizons, tolerances = [*horizons, horizons[-1]], [*tolerances, nls.tolerance]
+        boldness = [*boldness, boldness[-1]]
+    return jnp.asarray(horizons), jnp.asarray(tolerances), jnp.asarray(boldness)
+
+
+def _solver(tolerance: Any) -> optx.LevenbergMarquardt:
+    """Levenberg-Marquardt whose damping also falls after steps that were merely good."""
+    solver = optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
+    search = optx.ClassicalTrustRegion(high_cutoff=0.75)
+    return eqx.tree_at(lambda s: s.search, solver, search)
 
 
 class _Problem(eqx.Module):
@@ -155,9 +179,8 @@ class _Problem(eqx.Module):
         sd = jnp.sqrt(squares / jnp.maximum(count - spent, 1.0))
         return jnp.maximum(sd, 1e-9 * scales)  # noise-free data keep a finite weight
 
-    def estimate(self, unknowns: Array, sd: Array, converged: Array) -> Estimate:
+    def estimate(self, unknowns: Array, converged: Array) -> Estimate:
         """The estimate at the end of the search, its covariance from the noise found."""
-        del sd
         num_params = len(self.start)
         residual = self.residual(unknowns)
         S = jax.jacfwd(self.residual)(unknowns).reshape(-1, self.num_outputs, len(unknowns))
