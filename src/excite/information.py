@@ -15,6 +15,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .plant import AbstractPlant, Params
+from .simulation import simulate
+
 Information = Float[Array, "param param"]
 
 
@@ -63,6 +66,48 @@ def marginal_information(
     )
     R = jnp.linalg.qr(jnp.concatenate([columns, prior]), mode="r")[num_others:, num_others:]
     return R.T @ R
+
+
+def experiment_information(
+    plant: AbstractPlant,
+    params: Params,
+    inputs: Float[Array, "time input"],
+    initial_state: Float[Array, " state"] | None = None,
+) -> Information:
+    """Relative Fisher information of an experiment with these inputs and this plant's sensor.
+
+    In logarithms of positive parameters, and of free ones over their scale.
+
+    Args:
+        initial_state: where it starts, if that is unknown too and must be estimated
+            along; left out, the plant starts at its known initial state.
+    """
+    require_double_precision()
+    theta = jnp.stack([jnp.asarray(p, float) for p in params])
+    start = plant.initial_state if initial_state is None else initial_state
+    num_params = len(theta)
+    size = relative_size(plant, params)
+
+    def response(unknowns: Array) -> Array:
+        values = theta + size * unknowns[:num_params]
+        state = start + unknowns[num_params:] if initial_state is not None else start
+        return simulate(plant, plant.Params(*values), inputs, state)
+
+    count = num_params + (0 if initial_state is None else len(start))
+    S = sensitivity(response, jnp.zeros(count))
+    if initial_state is None:
+        return fisher_information(S, plant.sensor.sd)
+    return marginal_information(S, plant.sensor.sd, num_params)
+
+
+def relative_size(plant: AbstractPlant, params: Params) -> Float[Array, " param"]:
+    """What one unit of relative information means for each parameter, in its unit."""
+    return jnp.stack(
+        [
+            jnp.asarray(value if p.positive else p.scale, float)
+            for p, value in zip(plant.definition.parameters, params, strict=True)
+        ]
+    )
 
 
 def d_optimality(information: Information) -> Float[Array, ""]:

@@ -52,6 +52,7 @@ class ARX(AbstractEstimator):
         forgetting_factor: weight of a sample one step older.
     """
 
+    name = "arx-rls"
     start_covariance: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1000.0)
     forgetting_factor: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1.0)
 

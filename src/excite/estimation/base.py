@@ -9,6 +9,7 @@ from __future__ import annotations
 import abc
 import enum
 from collections.abc import Sequence
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -105,7 +106,9 @@ class Estimate(eqx.Module):
 
 
 class AbstractEstimator(eqx.Module):
-    """Base of all estimators."""
+    """Base of all estimators; `name` is its word on the command line."""
+
+    name: ClassVar[str]
 
     @abc.abstractmethod
     def __call__(
@@ -192,3 +195,9 @@ def from_search(description: PlantDescription, z: Float[Array, " param"]) -> Arr
     low, width = np.where(bounded, lower, 0.0), np.where(bounded, upper - lower, 1.0)
     c = jnp.where(bounded, low + width * jax.nn.sigmoid(4 * z * scale / width), z * scale)
     return jnp.where(positive, jnp.exp(jnp.where(positive, c, 0.0)), c)
+
+
+def search_slope(description: PlantDescription, params: Params) -> Float[Array, " param"]:
+    """Derivative of each parameter with respect to its own search coordinate."""
+    z = to_search(description, params)
+    return jnp.diagonal(jax.jacfwd(lambda z: from_search(description, z))(z))

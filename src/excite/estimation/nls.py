@@ -28,6 +28,7 @@ from .base import (
     Status,
     from_search,
     residual_of,
+    search_slope,
     simulate_experiments,
     to_search,
 )
@@ -43,6 +44,7 @@ class NLS(AbstractEstimator):
         max_steps: of each search.
     """
 
+    name = "nls"
     horizons: tuple[float, ...] = eqx.field(static=True, default=(0.08, 0.16, 0.32, 0.6, 1.0))
     tolerance: float = eqx.field(static=True, default=1e-5)
     max_steps: int = eqx.field(static=True, default=200)
@@ -60,6 +62,27 @@ class NLS(AbstractEstimator):
         problem = _Problem(plant, experiments, plant.nominal if start is None else start, free)
         unknowns, converged = self._search(problem)
         return problem.estimate(unknowns, converged)
+
+    @eqx.filter_jit
+    def sensitivity(
+        self,
+        plant: AbstractPlant,
+        experiments: Experiments,
+        estimate: Estimate,
+        free: Bool[Array, " param"] | None = None,
+    ) -> tuple[
+        Float[Array, "experiment time output unknown"], Float[Array, "experiment time output"]
+    ]:
+        """Sensitivity and residual at an estimate, over the noise's standard deviation.
+
+        The unknowns are the parameters in search coordinates, then the initial states if
+        they were estimated.
+        """
+        problem = _Problem(plant, experiments, estimate.params, free)
+        unknowns = problem.with_initial_state(estimate.initial_state)
+        sd = problem.noise_sd(unknowns)
+        S = -jax.jacfwd(problem.residual)(unknowns) / sd[None, None, :, None]
+        return S, problem.residual(unknowns) / sd[None, None]
 
     def _search(self, problem: _Problem) -> tuple[Array, Bool[Array, ""]]:
         """Unknowns at the minimum, and whether the last search converged."""
@@ -88,7 +111,7 @@ class NLS(AbstractEstimator):
                 sd = jnp.where(complete, problem.noise_sd(solution.value), sd)
             return (solution.value, sd), solution.result == optx.RESULTS.successful
 
-        start = problem.start_point, problem.assumed_sd
+        start = problem.with_initial_state(problem.experiments.initial_state), problem.assumed_sd
         (unknowns, _), converged = jax.lax.scan(search, start, stages)
         return unknowns, converged[-1]
 
@@ -136,12 +159,11 @@ class _Problem(eqx.Module):
     def num_outputs(self) -> int:
         return self.experiments.measured.shape[2]
 
-    @property
-    def start_point(self) -> Array:
+    def with_initial_state(self, initial_state: Array) -> Array:
+        """Unknowns at the start parameters and this initial state."""
         if self.experiments.initial_state_known:
             return self.start
-        scales = self._state_scales[None]
-        return jnp.concatenate([self.start, (self.experiments.initial_state / scales).ravel()])
+        return jnp.concatenate([self.start, (initial_state / self._state_scales[None]).ravel()])
 
     @property
     def _state_scales(self) -> Array:
@@ -189,13 +211,11 @@ class _Problem(eqx.Module):
         information = jnp.where(active, information, 0.0)
         held = jnp.diag(jnp.where(self.free, 0.0, 1.0))
         in_search = jnp.where(active, jnp.linalg.inv(information + held), 0.0)
-        slope = jax.jacfwd(lambda z: from_search(self.plant.definition, z))(
-            unknowns[:num_params]
-        )
         params = self.params(unknowns)
+        slope = search_slope(self.plant.definition, self.plant.Params(*params))
         return Estimate(
             params=self.plant.Params(*params),
-            covariance=slope @ in_search @ slope.T,
+            covariance=in_search * jnp.outer(slope, slope),
             information=information,
             status=_status(params, in_search, converged),
             initial_state=self.initial_state(unknowns),

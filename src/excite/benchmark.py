@@ -1,0 +1,265 @@
+"""Methods x estimators over common plants and noise.
+
+Every method meets the same plants and the same sensor noise, episode by episode; every
+estimator sees the same data. Beside each error stands the Cramér-Rao bound of the data it
+was made from, so that a reader sees how much of an error is the excitation's and how much
+the estimator's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from .description import PlantDescription, names_of
+from .estimation import AbstractEstimator, Estimate, Status, stack_experiments
+from .excitation import AbstractExcitation
+from .information import cramer_rao_bound, experiment_information, relative_size
+from .plant import AbstractPlant, Params
+from .records import new_run_folder, write_json
+from .safety import critical_levels, is_violation, max_abs_output
+from .simulation import Trajectory, run_episode
+from .study import Study
+
+CHUNK = 100
+"""Episodes computed in one call: enough to be fast, few enough to show progress."""
+
+Progress = Callable[[str, int, int], None]
+"""Called with what is being computed, how much of it is done, and how much there is."""
+
+
+class Episodes(eqx.Module):
+    """A batch of evaluation episodes of one method; the leading axis is the episode.
+
+    Attributes:
+        params: true parameters.
+        trajectory: inputs and outputs.
+        is_violation: whether the critical level was reached.
+        max_abs_output: largest magnitude of each output.
+        bound: least relative standard deviation of each parameter (Cramér-Rao).
+    """
+
+    params: Params
+    trajectory: Trajectory
+    is_violation: Array
+    max_abs_output: Float[Array, "episode output"]
+    bound: Float[Array, "episode param"]
+
+
+def draw_params(plant: AbstractPlant, key: PRNGKeyArray, spread: float) -> Params:
+    """True parameters of one episode: uniform, nominal value ± spread times its scale."""
+    unit = jax.random.uniform(key, (len(plant.nominal),), float, -1.0, 1.0)
+    scales = [p.scale for p in plant.definition.parameters]
+    return plant.Params(
+        *(n + spread * s * u for n, s, u in zip(plant.nominal, scales, unit, strict=True))
+    )
+
+
+@eqx.filter_jit
+def evaluate(
+    plant: AbstractPlant,
+    excitation: AbstractExcitation,
+    num_steps: int,
+    spread: float,
+    keys: PRNGKeyArray,
+) -> Episodes:
+    """One episode a key. The plant and the noise of a key are the same for any excitation."""
+
+    def episode(key: PRNGKeyArray) -> Episodes:
+        params_key, episode_key = jax.random.split(key)
+        params = draw_params(plant, params_key, spread)
+        trajectory = run_episode(plant, params, excitation, num_steps, episode_key)
+        information = experiment_information(plant, params, trajectory.inputs)
+        true = jnp.stack(params)
+        relative = relative_size(plant, params) / jnp.abs(true)
+        return Episodes(
+            params=params,
+            trajectory=trajectory,
+            is_violation=is_violation(
+                trajectory.outputs, jnp.asarray(critical_levels(plant.definition))
+            ),
+            max_abs_output=max_abs_output(trajectory.outputs),
+            bound=cramer_rao_bound(information) * relative,
+        )
+
+    return jax.vmap(episode)(keys)
+
+
+@eqx.filter_jit
+def estimate_all(
+    plant: AbstractPlant, estimator: AbstractEstimator, trajectory: Trajectory
+) -> tuple[Float[Array, "episode param"], Array]:
+    """Estimated parameters and status of every episode; initial states are known."""
+
+    def one(inputs: Array, measured: Array) -> tuple[Array, Array]:
+        data = stack_experiments(plant, [inputs], [measured], True)
+        estimate: Estimate = estimator(plant, data)
+        return jnp.stack(estimate.params), estimate.status
+
+    return jax.vmap(one)(trajectory.inputs, trajectory.measured)
+
+
+@dataclass(frozen=True)
+class _Outcome:
+    """All episodes of one method and one estimator, on NumPy arrays."""
+
+    true: Float[np.ndarray, "episode param"]
+    estimated: Float[np.ndarray, "episode param"]
+    status: np.ndarray
+    episodes: Mapping[str, np.ndarray]
+
+
+def run_benchmark(study: Study, progress: Progress = lambda *_: None) -> list[dict[str, Any]]:
+    """Rows of the study's table, methods in order, each with all estimators."""
+    plant = study.build_plant()
+    if not np.all(np.asarray(plant.sensor.sd) > 0):
+        raise ValueError("a sensor without noise has no Cramér-Rao bound; give it a noise_sd")
+    methods, estimators = study.build_methods(plant), study.build_estimators(plant)
+    keys = jax.random.split(jax.random.key(study.seed), study.episodes)
+    chunks = [keys[i : i + CHUNK] for i in range(0, study.episodes, CHUNK)]
+    total, rows = len(chunks) * len(methods), []
+    for m, (name, excitation) in enumerate(methods.items()):
+        parts: dict[str, list[_Outcome]] = {e: [] for e in estimators}
+        for c, chunk in enumerate(chunks):
+            progress(name, m * len(chunks) + c, total)
+            episodes = evaluate(plant, excitation, study.num_steps, study.spread, chunk)
+            for e, estimator in estimators.items():
+                parts[e].append(_outcome(plant, estimator, episodes))
+        for e, outcomes in parts.items():
+            rows.append(_row(plant.description, name, e, _joined(outcomes)))
+    progress("done", total, total)
+    return rows
+
+
+def _outcome(
+    plant: AbstractPlant, estimator: AbstractEstimator, episodes: Episodes
+) -> _Outcome:
+    estimated, status = estimate_all(plant, estimator, episodes.trajectory)
+    return _Outcome(
+        true=np.stack(episodes.params, axis=1),
+        estimated=np.asarray(estimated),
+        status=np.asarray(status),
+        episodes={
+            "is_violation": np.asarray(episodes.is_violation),
+            "max_abs_output": np.asarray(episodes.max_abs_output),
+            "bound": np.asarray(episodes.bound),
+        },
+    )
+
+
+def _joined(parts: list[_Outcome]) -> _Outcome:
+    return _Outcome(
+        true=np.concatenate([p.true for p in parts]),
+        estimated=np.concatenate([p.estimated for p in parts]),
+        status=np.concatenate([p.status for p in parts]),
+        episodes={
+            k: np.concatenate([p.episodes[k] for p in parts]) for k in parts[0].episodes
+        },
+    )
+
+
+def _row(
+    description: PlantDescription, method: str, estimator: str, outcome: _Outcome
+) -> dict[str, Any]:
+    """One row of the table; its keys are documented in the README."""
+    good = outcome.status == Status.SUCCESSFUL
+    error = 100 * np.abs(outcome.estimated / outcome.true - 1)[good]
+    bound = 100 * outcome.episodes["bound"]
+    violations, count = int(outcome.episodes["is_violation"].sum()), len(good)
+    watched = watched_output(description)
+    unit, factor = display_unit(description.outputs[watched].unit)
+    largest = factor * outcome.episodes["max_abs_output"][:, watched]
+    names = names_of(description.parameters)
+    return {
+        "method": method,
+        "estimator": estimator,
+        "evaluations": count,
+        "failed": int(count - good.sum()),
+        "failures": {
+            Status(s).name.lower(): int(n)
+            for s, n in zip(*np.unique(outcome.status[~good], return_counts=True), strict=True)
+        },
+        "violations": violations,
+        "violation_rate": {"estimate": violations / count, "ci95": wilson(violations, count)},
+        "max_abs_output": {
+            "output": description.outputs[watched].name,
+            **_mean_sd(largest),
+            "unit": unit,
+        },
+        "relative_error_percent": {
+            n: {**_mean_sd(error[:, i]), **_median_rms(error[:, i])} for i, n in enumerate(names)
+        },
+        "cramer_rao_percent": {n: float(bound[:, i].mean()) for i, n in enumerate(names)},
+    }
+
+
+def watched_output(description: PlantDescription) -> int:
+    """Index of the first output with a critical level, else of the first output."""
+    levels = critical_levels(description)
+    return next((i for i, level in enumerate(levels) if level < math.inf), 0)
+
+
+def display_unit(unit: str) -> tuple[str, float]:
+    """Unit in which people read a quantity, and its factor: degrees for radians."""
+    if unit in ("rad", "rad/s"):
+        return unit.replace("rad", "deg"), 180 / math.pi
+    return unit, 1.0
+
+
+def _mean_sd(values: np.ndarray) -> dict[str, float]:
+    nothing = values.size == 0
+    return {
+        "mean": math.nan if nothing else float(values.mean()),
+        "sd": math.nan if values.size < 2 else float(values.std(ddof=1)),
+    }
+
+
+def _median_rms(values: np.ndarray) -> dict[str, float]:
+    nothing = values.size == 0
+    return {
+        "median": math.nan if nothing else float(np.median(values)),
+        "rms": math.nan if nothing else float(np.sqrt(np.mean(values**2))),
+    }
+
+
+def wilson(successes: int, count: int) -> tuple[float, float]:
+    """95 % interval of a rate.
+
+    E. B. Wilson, "Probable inference, the law of succession, and statistical inference",
+    J. American Statistical Association 22, 1927.
+    """
+    z, rate = 1.959964, successes / count
+    centre = rate + z**2 / (2 * count)
+    half = z * math.sqrt(rate * (1 - rate) / count + z**2 / (4 * count**2))
+    scale = 1 + z**2 / count
+    return max(0.0, (centre - half) / scale), min(1.0, (centre + half) / scale)
+
+
+def write_benchmark(
+    study: Study,
+    rows: list[dict[str, Any]],
+    tables: Mapping[str, str],
+    path: Path,
+    overwrite: bool = False,
+) -> None:
+    """Leaves a run folder: the study, its rows as JSON, and ready-made `tables` by file name.
+
+    Raises:
+        ValueError: where `path` holds something else, or a run and not `overwrite`.
+    """
+    with new_run_folder(path, overwrite) as folder:
+        for name, text in tables.items():
+            (folder / name).write_text(text, encoding="utf-8")
+        write_json(folder / "table.json", {"rows": rows})
+        plant = study.build_plant().description
+        write_json(folder / "study.json", study.model_dump())
+        write_json(folder / "run.json", {"kind": "excite benchmark", "plant": plant.to_dict()})

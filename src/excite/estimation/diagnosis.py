@@ -1,0 +1,126 @@
+"""What an estimate is worth: fit, whiteness of the residual, what the data cannot see.
+
+Everything here runs once, after a fit, on NumPy arrays; nothing is differentiated.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.special
+from jaxtyping import Float
+
+UNSEEN_SD = 0.5
+"""A direction in search coordinates (relative, for positive parameters) known no better
+than this is not seen by the data: its 95 % interval reaches from nothing to the double."""
+
+EXPLAINS_NOTHING = 5.0
+"""Fit in percent below which a simulation has nothing to do with the data."""
+
+
+def fit_percent(
+    measured: Float[np.ndarray, " sample"], simulated: Float[np.ndarray, " sample"]
+) -> float:
+    """100 (1 - |y - y_s| / |y - mean y|); not a number for an output that never moves."""
+    spread = np.linalg.norm(measured - measured.mean())
+    if spread == 0:
+        return float("nan")
+    return float(100 * (1 - np.linalg.norm(measured - simulated) / spread))
+
+
+def ljung_box(residual: Float[np.ndarray, " sample"], num_lags: int = 25) -> float:
+    """p-value of the hypothesis that a residual is white.
+
+    G. Ljung and G. Box, "On a measure of lack of fit in time series models", Biometrika
+    65, 1978. A residual of exact zeros is not a number.
+    """
+    n = residual.size
+    num_lags = min(num_lags, n // 5)
+    centred = residual - residual.mean()
+    power = float(centred @ centred)
+    if power == 0 or num_lags < 1:
+        return float("nan")
+    lags = np.arange(1, num_lags + 1)
+    r = np.array([centred[lag:] @ centred[:-lag] for lag in lags]) / power
+    return float(scipy.special.chdtrc(num_lags, n * (n + 2) * np.sum(r**2 / (n - lags))))
+
+
+def correlation(covariance: Float[np.ndarray, "param param"]) -> Float[np.ndarray, "param param"]:
+    """Correlation of the estimates; not a number for a parameter without variance."""
+    sd = np.sqrt(np.diag(covariance))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return covariance / np.outer(sd, sd)
+
+
+def robust_covariance(
+    sensitivity: Float[np.ndarray, "experiment time output unknown"],
+    residual: Float[np.ndarray, "experiment time output"],
+) -> Float[np.ndarray, "unknown unknown"]:
+    """Covariance of a least-squares estimate whose residual is correlated in time.
+
+    H^-1 V H^-1 with H = S' S and V the long-run covariance of the scores S_k' r_k, by
+    Bartlett's window with the bandwidth of D. Andrews ("Heteroskedasticity and
+    autocorrelation consistent covariance matrix estimation", Econometrica 59, 1991) for
+    the autocorrelation of the residual. Both arguments are over the noise's standard
+    deviation. Directions that are not seen get zero.
+    """
+    H = np.einsum("etou,etov->uv", sensitivity, sensitivity)
+    size = np.sqrt(np.diag(H))
+    size[size == 0] = 1.0
+    inverse = np.linalg.pinv(H / np.outer(size, size), hermitian=True) / np.outer(size, size)
+    scores = np.einsum("etou,eto->etu", sensitivity, residual)
+    flat = residual.reshape(-1, residual.shape[1])
+    rho = np.sum(residual[:, 1:] * residual[:, :-1]) / max(np.sum(residual**2), 1e-300)
+    rho = min(abs(rho), 1 - 1 / flat.shape[1])
+    alpha = (2 * rho / (1 - rho**2)) ** 2
+    width = int(np.clip(1.1447 * (alpha * flat.shape[1]) ** (1 / 3), 1, flat.shape[1] // 3))
+    # Sums over every window of `width` samples: their squares are Bartlett's estimate.
+    padded = np.pad(scores, ((0, 0), (width, width - 1), (0, 0))).cumsum(axis=1)
+    sums = padded[:, width:] - padded[:, :-width]
+    V = np.einsum("etu,etv->uv", sums, sums) / width
+    return inverse @ V @ inverse
+
+
+def worst_seen(
+    names: tuple[str, ...], information: Float[np.ndarray, "param param"], free: np.ndarray
+) -> tuple[int, str] | None:
+    """The free parameter to hold because the data do not see it, and why, in words.
+
+    None when every direction of the free parameters is known better than `UNSEEN_SD`.
+    The direction is the eigenvector of the information with the smallest eigenvalue.
+    """
+    index = np.flatnonzero(free)
+    if index.size == 0:
+        return None
+    block = information[np.ix_(index, index)]
+    if np.all(np.isfinite(block)):
+        values, vectors = np.linalg.eigh(block)
+        value, direction = max(values[0], 0.0), vectors[:, 0]
+    else:
+        value, direction = 0.0, np.ones(index.size)
+    if value * UNSEEN_SD**2 >= 1:
+        return None
+    chosen = index[np.argmax(np.abs(direction))]
+    involved = [names[i] for i, v in zip(index, direction, strict=True) if abs(v) > 0.3]
+    if len(involved) == 1:
+        return chosen, f"the data cannot see {names[chosen]}"
+    combination = " ".join(
+        f"{names[i]}^{v:+.2g}"
+        for i, v in zip(index, direction / direction[np.argmax(np.abs(direction))], strict=True)
+        if names[i] in involved
+    )
+    return chosen, (
+        f"the data cannot tell {' and '.join(involved)} apart: "
+        f"{combination} could have any size"
+    )
+
+
+def identifiability(
+    names: tuple[str, ...], information: Float[np.ndarray, "param param"], free: np.ndarray
+) -> str:
+    """How well the worst direction of the free parameters is seen, in words."""
+    index = np.flatnonzero(free)
+    values, vectors = np.linalg.eigh(information[np.ix_(index, index)])
+    sd, direction = 1 / np.sqrt(values[0]), vectors[:, 0]
+    involved = [names[i] for i, v in zip(index, direction, strict=True) if abs(v) > 0.3]
+    what = involved[0] if len(involved) == 1 else f"a combination of {' and '.join(involved)}"
+    return f"the data see all of {', '.join(names[i] for i in index)}; worst is {what}, to {100 * sd:.2g} %"

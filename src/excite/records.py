@@ -1,0 +1,359 @@
+"""Experiment files and run folders: the only things that cross from computing to showing.
+
+An experiment file is CSV or MAT with the columns `time`, the plant's inputs and its
+outputs, in SI units: row k holds the outputs measured at time[k] and the inputs held from
+time[k] to time[k + 1]. A JSON file of the same name beside it (the sidecar) says which
+plant it was, which parameters, and how the experiment began.
+
+Everything is written under another name first and then renamed: a file is either
+complete or not there.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import io
+import json
+import math
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.io
+from jaxtyping import Float
+
+from .description import Input, Output, PlantDescription, names_of
+
+RECORD_KIND = "excite record"
+_UNEVEN = 0.05  # of the sampling time: more than printing it with few digits explains
+_TIMES_LIMIT = 2.0  # inputs beyond this many times the limits are in another unit
+_TIMES_SCALE = 10.0  # likewise outputs beyond this many times their typical size
+
+
+@dataclass(frozen=True)
+class Record:
+    """One recorded experiment.
+
+    Attributes:
+        time: sampling instants [s].
+        inputs: row k is held from time[k] on; the last row acts after the record's end.
+        outputs: measured outputs.
+        metadata: what the sidecar says; empty without one.
+        source: where the record came from, for messages.
+    """
+
+    time: Float[np.ndarray, " sample"]
+    inputs: Float[np.ndarray, "sample input"]
+    outputs: Float[np.ndarray, "sample output"]
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+    source: str = ""
+
+    @property
+    def dt(self) -> float:
+        """Sampling time [s]."""
+        return float((self.time[-1] - self.time[0]) / (len(self.time) - 1))
+
+    @property
+    def starts_at_initial_state(self) -> bool:
+        """Whether the sidecar says that the plant was at its initial state."""
+        return bool(self.metadata.get("starts_at_initial_state", False))
+
+
+def read_record(
+    path: str | os.PathLike[str],
+    description: PlantDescription,
+    columns: Mapping[str, str] | None = None,
+    scales: Mapping[str, float] | None = None,
+) -> Record:
+    """The experiment in a CSV or MAT file, checked against a plant.
+
+    Args:
+        path: the file; its ending tells its kind.
+        columns: names in the file where they are not the plant's: {"pitch": "qm"}.
+        scales: factors from the file's unit to the plant's: {"pitch": 0.01745}.
+
+    Raises:
+        ValueError: one sentence for anything that cannot be used: an unreadable or
+            truncated file, a missing column or sample, a value that is not finite,
+            uneven sampling, values far outside what the plant can do.
+    """
+    path, columns, scales = Path(path), columns or {}, scales or {}
+    for name in (*columns, *scales):
+        if name not in description.columns:
+            raise ValueError(
+                f"plant {description.name!r} has no column {name!r}; "
+                f"it has {', '.join(description.columns)}"
+            )
+    table = _read_table(path)
+    values = {
+        name: _column(table, columns.get(name, name), name, path) * scales.get(name, 1.0)
+        for name in description.columns
+    }
+    _check_time(values["time"], path)
+    for part in (*description.inputs, *description.outputs):
+        _check_finite(values[part.name], part.name, path)
+        _check_size(values[part.name], part, path)
+    return Record(
+        time=values["time"],
+        inputs=np.stack([values[n] for n in names_of(description.inputs)], axis=1),
+        outputs=np.stack([values[n] for n in names_of(description.outputs)], axis=1),
+        metadata=_read_sidecar(path),
+        source=str(path),
+    )
+
+
+def _read_table(path: Path) -> dict[str, np.ndarray | list[str]]:
+    """Columns by name; those of a CSV file still as text."""
+    kind = path.suffix.lower()
+    if kind not in (".csv", ".mat"):
+        raise ValueError(f"{path}: experiment files end in .csv or .mat")
+    if not path.is_file():
+        raise ValueError(f"{path}: no such file")
+    return _read_mat(path) if kind == ".mat" else _read_csv(path)
+
+
+def _read_csv(path: Path) -> dict[str, np.ndarray | list[str]]:
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (UnicodeDecodeError, OSError) as error:
+        raise ValueError(f"{path}: cannot be read as CSV text ({error})") from None
+    lines = text.splitlines()
+    if not lines:
+        raise ValueError(f"{path}: the file is empty")
+    delimiter = next((d for d in (",", ";", "\t") if d in lines[0]), ",")
+    rows = list(csv.reader(lines, delimiter=delimiter))
+    header = [name.strip() for name in rows[0]]
+    if len(set(header)) < len(header):
+        raise ValueError(f"{path}: the header names a column twice: {', '.join(header)}")
+    body = [(number, row) for number, row in enumerate(rows[1:], 2) if row]
+    for number, row in body:
+        if len(row) != len(header):
+            raise ValueError(
+                f"{path}: line {number} has {len(row)} values where the header names "
+                f"{len(header)}; is the file truncated?"
+            )
+    return {name: [row[i].strip() for _, row in body] for i, name in enumerate(header)}
+
+
+def _read_mat(path: Path) -> dict[str, np.ndarray | list[str]]:
+    try:
+        content = scipy.io.loadmat(path)
+    except NotImplementedError:
+        raise ValueError(
+            f"{path}: MAT files of version 7.3 are HDF5; save it with -v7 or as CSV"
+        ) from None
+    except Exception as error:  # a damaged file makes the reader fail in any way
+        raise ValueError(f"{path}: not a readable MAT file ({error})") from None
+    return {
+        name: np.asarray(value, float).ravel()
+        for name, value in content.items()
+        if isinstance(value, np.ndarray)
+        and value.dtype.kind in "fiu"
+        and max(value.shape, default=0) == value.size > 1
+    }
+
+
+def _column(
+    table: Mapping[str, np.ndarray | list[str]], name: str, meaning: str, path: Path
+) -> Float[np.ndarray, " sample"]:
+    if name not in table:
+        raise ValueError(
+            f"{path}: no column {name!r}; the file has {', '.join(table) or 'none'} "
+            f"(map one with --column {meaning}=NAME)"
+        )
+    column = table[name]
+    if isinstance(column, np.ndarray):
+        return column
+    values = np.empty(len(column))
+    for row, text in enumerate(column):
+        try:
+            values[row] = float(text)
+        except ValueError:
+            found = f"is {text!r}, not a number" if text else "is missing"
+            raise ValueError(f"{path}: sample {row + 1} of {name!r} {found}") from None
+    return values
+
+
+def _check_finite(values: np.ndarray, name: str, path: Path) -> None:
+    bad = np.flatnonzero(~np.isfinite(values))
+    if bad.size:
+        raise ValueError(
+            f"{path}: sample {bad[0] + 1} of {name!r} is {values[bad[0]]}; "
+            f"{bad.size} of {values.size} samples are not finite numbers"
+        )
+
+
+def _check_time(time: np.ndarray, path: Path) -> None:
+    if time.size < 2:
+        raise ValueError(f"{path}: {time.size} samples; at least two are needed")
+    _check_finite(time, "time", path)
+    steps = np.diff(time)
+    usual = float(np.median(steps))
+    if usual <= 0:
+        raise ValueError(f"{path}: 'time' does not grow")
+    bad = np.flatnonzero(np.abs(steps - usual) > _UNEVEN * usual)
+    if bad.size:
+        k, gap = bad[0], steps[bad[0]]
+        what = "samples are missing" if gap > 1.5 * usual else "sampling is uneven"
+        raise ValueError(
+            f"{path}: {what}: {gap:.6g} s between samples {k + 1} and {k + 2}, "
+            f"{usual:.6g} s elsewhere; one sampling time within {_UNEVEN:.0%} is needed"
+        )
+
+
+def _check_size(values: np.ndarray, part: Input | Output, path: Path) -> None:
+    """Values that only another unit can explain are refused."""
+    if isinstance(part, Input):
+        middle, half = (part.upper + part.lower) / 2, (part.upper - part.lower) / 2
+        worst = values[np.argmax(np.abs(values - middle))]
+        excess, allowed = abs(worst - middle) / half, _TIMES_LIMIT
+        expected = f"the plant's limits are {part.lower:g} to {part.upper:g}"
+    else:
+        worst = values[np.argmax(np.abs(values))]
+        excess, allowed = abs(worst) / part.scale, _TIMES_SCALE
+        expected = f"around {part.scale:g} is usual"
+    if excess > allowed:
+        raise ValueError(
+            f"{path}: {part.name!r} reaches {worst:g} {part.unit} and {expected} {part.unit}; "
+            f"is it in another unit? (a factor is given with --scale {part.name}=FACTOR)"
+        )
+
+
+def _read_sidecar(path: Path) -> Mapping[str, Any]:
+    """The sidecar's content; empty where there is none, or where it is not ours."""
+    sidecar = path.with_suffix(".json")
+    if not sidecar.is_file():
+        return {}
+    try:
+        content = json.loads(sidecar.read_text(encoding="utf-8"))
+    except (ValueError, OSError) as error:
+        raise ValueError(f"{sidecar}: cannot be read as JSON ({error})") from None
+    ours = isinstance(content, dict) and content.get("kind") == RECORD_KIND
+    return content if ours else {}
+
+
+def write_record(
+    path: str | os.PathLike[str], record: Record, description: PlantDescription
+) -> None:
+    """Writes a record as CSV or MAT, as the ending says, and its sidecar.
+
+    Raises:
+        ValueError: for another ending, or a folder that does not exist.
+    """
+    path = Path(path)
+    columns = dict(
+        zip(
+            description.columns,
+            np.column_stack([record.time, record.inputs, record.outputs]).T,
+            strict=True,
+        )
+    )
+    buffer = io.BytesIO()
+    if path.suffix.lower() == ".mat":
+        scipy.io.savemat(buffer, {name: values[:, None] for name, values in columns.items()})
+    elif path.suffix.lower() == ".csv":
+        buffer.write(csv_text(columns).encode())
+    else:
+        raise ValueError(f"{path}: experiment files end in .csv or .mat")
+    sidecar = {
+        **record.metadata,
+        "kind": RECORD_KIND,
+        "plant": description.to_dict(),
+        "plant_hash": description.hash,
+        "dt": record.dt,
+    }
+    # The sidecar first: a record without one would be read as one of unknown start.
+    write_json(path.with_suffix(".json"), sidecar)
+    write_bytes(path, buffer.getvalue())
+
+
+def csv_text(columns: Mapping[str, Any]) -> str:
+    """Columns of numbers as CSV text; every number is read back exactly."""
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow(columns)
+    rows = zip(*(np.asarray(v, float).tolist() for v in columns.values()), strict=True)
+    writer.writerows([repr(value) for value in row] for row in rows)
+    return buffer.getvalue()
+
+
+def json_ready(value: Any) -> Any:
+    """A copy with plain types only; a number that is not finite becomes None."""
+    if isinstance(value, Mapping):
+        return {str(k): json_ready(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [json_ready(v) for v in value]
+    if isinstance(value, np.ndarray | np.generic) or hasattr(value, "__array__"):
+        return json_ready(np.asarray(value).tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value
+
+
+def json_text(value: Any) -> str:
+    """`value` as one JSON object."""
+    return json.dumps(json_ready(value), indent=2, ensure_ascii=False, allow_nan=False)
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Writes `value` as JSON, whole or not at all."""
+    write_bytes(path, (json_text(value) + "\n").encode())
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Writes a file, whole or not at all.
+
+    Raises:
+        ValueError: where the folder does not exist or cannot be written.
+    """
+    if not path.parent.is_dir():
+        raise ValueError(f"{path}: the folder {path.parent} does not exist")
+    try:
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be written ({error.strerror})") from None
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+        os.chmod(name, 0o644)  # mkstemp makes files that nobody else may read
+        os.replace(name, path)
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be written ({error.strerror})") from None
+    finally:
+        Path(name).unlink(missing_ok=True)
+
+
+def require_free_run_folder(path: Path, overwrite: bool) -> None:
+    """Raises ValueError where a run folder at `path` would hide or lose something."""
+    if not path.exists() or (path.is_dir() and not any(path.iterdir())):
+        return
+    if not (path / "run.json").is_file():
+        raise ValueError(f"{path} exists and is no run folder; choose another name")
+    if not overwrite:
+        raise ValueError(f"{path} holds a run; choose another name or add --overwrite")
+
+
+@contextlib.contextmanager
+def new_run_folder(path: Path, overwrite: bool = False) -> Iterator[Path]:
+    """A folder to fill, which appears at `path` only when everything in it is written."""
+    require_free_run_folder(path, overwrite)
+    path = path.absolute()
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        unfinished = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be written ({error.strerror})") from None
+    try:
+        yield unfinished
+        unfinished.chmod(0o755)
+        if path.exists():
+            shutil.rmtree(path)
+        unfinished.rename(path)
+    finally:
+        shutil.rmtree(unfinished, ignore_errors=True)
