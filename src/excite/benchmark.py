@@ -20,13 +20,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from .description import PlantDescription, names_of
+from .description import PlantDescription, display_unit, names_of
 from .estimation import AbstractEstimator, Estimate, Status, stack_experiments
 from .excitation import AbstractExcitation
 from .information import cramer_rao_bound, experiment_information, relative_size
 from .plant import AbstractPlant, Params
 from .records import new_run_folder, write_json
-from .safety import critical_levels, is_violation, max_abs_output
+from .safety import critical_levels, is_violation, max_abs_output, watched_output
 from .simulation import Trajectory, run_episode
 from .study import Study
 
@@ -84,9 +84,7 @@ def evaluate(
         return Episodes(
             params=params,
             trajectory=trajectory,
-            is_violation=is_violation(
-                trajectory.outputs, jnp.asarray(critical_levels(plant.definition))
-            ),
+            is_violation=is_violation(trajectory.outputs, critical_levels(plant.definition)),
             max_abs_output=max_abs_output(trajectory.outputs),
             bound=cramer_rao_bound(information) * relative,
         )
@@ -140,9 +138,7 @@ def run_benchmark(study: Study, progress: Progress = lambda *_: None) -> list[di
     return rows
 
 
-def _outcome(
-    plant: AbstractPlant, estimator: AbstractEstimator, episodes: Episodes
-) -> _Outcome:
+def _outcome(plant: AbstractPlant, estimator: AbstractEstimator, episodes: Episodes) -> _Outcome:
     estimated, status = estimate_all(plant, estimator, episodes.trajectory)
     return _Outcome(
         true=np.stack(episodes.params, axis=1),
@@ -161,9 +157,7 @@ def _joined(parts: list[_Outcome]) -> _Outcome:
         true=np.concatenate([p.true for p in parts]),
         estimated=np.concatenate([p.estimated for p in parts]),
         status=np.concatenate([p.status for p in parts]),
-        episodes={
-            k: np.concatenate([p.episodes[k] for p in parts]) for k in parts[0].episodes
-        },
+        episodes={k: np.concatenate([p.episodes[k] for p in parts]) for k in parts[0].episodes},
     )
 
 
@@ -200,19 +194,6 @@ def _row(
         },
         "cramer_rao_percent": {n: float(bound[:, i].mean()) for i, n in enumerate(names)},
     }
-
-
-def watched_output(description: PlantDescription) -> int:
-    """Index of the first output with a critical level, else of the first output."""
-    levels = critical_levels(description)
-    return next((i for i, level in enumerate(levels) if level < math.inf), 0)
-
-
-def display_unit(unit: str) -> tuple[str, float]:
-    """Unit in which people read a quantity, and its factor: degrees for radians."""
-    if unit in ("rad", "rad/s"):
-        return unit.replace("rad", "deg"), 180 / math.pi
-    return unit, 1.0
 
 
 def _mean_sd(values: np.ndarray) -> dict[str, float]:

@@ -69,14 +69,14 @@ class State(_Named):
 class Input(_Named):
     """One input with its limits, and the amplitude at which classical signals are safe.
 
-    `amplitude` counts from the middle of the limits and defaults to half their width.
+    `amplitude` counts from the middle of the limits; left out (0) it is half their width.
     """
 
     name: str
     unit: str
     lower: float
     upper: float
-    amplitude: float | None = None
+    amplitude: float = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -85,10 +85,10 @@ class Input(_Named):
             f"limits of input {self.name!r} must grow: got {self.lower} to {self.upper}",
         )
         half = (self.upper - self.lower) / 2
-        if self.amplitude is None:
+        if self.amplitude == 0:
             object.__setattr__(self, "amplitude", half)
         _require(
-            0 < (self.amplitude or 0.0) <= half,
+            0 < self.amplitude <= half,
             f"amplitude of input {self.name!r} must lie in (0, {half}]: got {self.amplitude}",
         )
 
@@ -117,7 +117,7 @@ class Output(_Named):
             f"noise_sd and resolution of output {self.name!r} must not be negative",
         )
         _require(
-            0 < (self.warning_level or 0.1) and 0 < (self.critical_level or 1.0),
+            (self.warning_level or 0.1) > 0 and (self.critical_level or 1.0) > 0,
             f"the levels of output {self.name!r} are magnitudes and must be positive",
         )
         if self.warning_level is not None and self.critical_level is not None:
@@ -133,14 +133,15 @@ class Parameter(_Named):
 
     `positive` parameters are estimated through their logarithm, free ones over `scale`.
     `target` says whether an experiment is designed for it. `symbol` is how a report
-    writes it (TeX), `scale` the size of a relevant change (default: the nominal value).
+    writes it (TeX), `scale` the size of a relevant change
+    (left out: that of the nominal value).
     """
 
     name: str
     unit: str
     nominal: float
     symbol: str = ""
-    scale: float | None = None
+    scale: float = 0.0
     lower: float | None = None
     upper: float | None = None
     positive: bool = True
@@ -150,9 +151,9 @@ class Parameter(_Named):
         super().__post_init__()
         if not self.symbol:
             object.__setattr__(self, "symbol", self.name)
-        if self.scale is None:
+        if self.scale == 0:
             object.__setattr__(self, "scale", abs(self.nominal))
-        _require((self.scale or 0.0) > 0, f"scale of parameter {self.name!r} must be positive")
+        _require(self.scale > 0, f"scale of parameter {self.name!r} must be positive")
         _require(
             not self.positive or self.nominal > 0,
             f"parameter {self.name!r} is positive, its nominal value {self.nominal} is not",
@@ -260,12 +261,17 @@ class PlantDescription:
     @property
     def hash(self) -> str:
         """SHA-256 of the canonical JSON, as 64 hexadecimal digits."""
-        text = json.dumps(
-            self.to_dict(), sort_keys=True, separators=(",", ":"), allow_nan=False
-        )
+        text = json.dumps(self.to_dict(), sort_keys=True, separators=(",", ":"), allow_nan=False)
         return hashlib.sha256(text.encode()).hexdigest()
 
 
 def names_of(parts: Iterable[_Named]) -> tuple[str, ...]:
     """Names of states, inputs, outputs, parameters or constants, in order."""
     return tuple(part.name for part in parts)
+
+
+def display_unit(unit: str) -> tuple[str, float]:
+    """Unit in which people read a quantity, and its factor: degrees for radians."""
+    if unit in ("rad", "rad/s"):
+        return unit.replace("rad", "deg"), 180 / math.pi
+    return unit, 1.0

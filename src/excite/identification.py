@@ -34,6 +34,14 @@ from .estimation.diagnosis import (
     robust_covariance,
     worst_seen,
 )
+from .information import (
+    a_optimality,
+    cramer_rao_bound,
+    d_optimality,
+    e_optimality,
+    experiment_information,
+    relative_size,
+)
 from .plant import AbstractPlant, Params
 from .records import Record, csv_text, new_run_folder, write_json, write_record
 
@@ -317,9 +325,7 @@ def _residuals(
     return [residual[i, : len(record.time)] for i, record in enumerate(records)]
 
 
-def _with_initial_state(
-    plant: AbstractPlant, experiments: Experiments, params: Params
-) -> Estimate:
+def _with_initial_state(plant: AbstractPlant, experiments: Experiments, params: Params) -> Estimate:
     """The best initial states for given parameters."""
     return NLS()(plant, experiments, params, jnp.zeros(len(params), bool))
 
@@ -344,9 +350,7 @@ def _confidence(
     what = f"the residual of {' and '.join(coloured)} is not white"
     if not isinstance(estimator, NLS):
         return covariance, (*verdict, f"{what}: the intervals assume it is, and are too narrow")
-    S, residual = estimator.sensitivity(
-        plant, experiments, fit.estimate, jnp.asarray(fit.free)
-    )
+    S, residual = estimator.sensitivity(plant, experiments, fit.estimate, jnp.asarray(fit.free))
     count = len(names)
     robust = robust_covariance(np.asarray(S), np.asarray(residual))[:count, :count]
     slope = np.asarray(search_slope(plant.definition, fit.estimate.params))
@@ -377,6 +381,47 @@ def _validated(plant: AbstractPlant, record: Record, params: Params) -> Fitted:
     """A record beside its simulation; only its initial state is fitted."""
     estimate = _with_initial_state(plant, _experiments(plant, [record], False), params)
     return _fitted(plant.definition, record, np.asarray(estimate.residual[0]))
+
+
+def best_possible(
+    plant: AbstractPlant,
+    params: Params,
+    inputs: Float[np.ndarray, "time input"],
+    *,
+    initial_state_known: bool,
+) -> dict[str, Any]:
+    """Least standard deviation of each parameter for an input, as JSON-ready data.
+
+    Raises:
+        ValueError: for a sensor without noise, which sets no bound.
+    """
+    if not np.all(np.asarray(plant.sensor.sd) > 0):
+        raise ValueError("a sensor without noise sets no bound; give every output a noise")
+    state = None if initial_state_known else plant.initial_state
+    information = experiment_information(plant, params, jnp.asarray(inputs), state)
+    size = np.asarray(relative_size(plant, params))
+    sd = np.asarray(cramer_rao_bound(information)) * size
+    names, free = names_of(plant.definition.parameters), np.ones(len(size), bool)
+    unseen = worst_seen(names, np.asarray(information), free)
+    seen = () if unseen else (identifiability(names, np.asarray(information), free),)
+    return {
+        "plant": plant.definition.name,
+        "initial_state": "known" if initial_state_known else "free",
+        "params": {
+            p.name: {
+                "value": float(value),
+                "std_error": float(s) if np.isfinite(s) else None,
+                "percent": float(100 * s / abs(value)) if np.isfinite(s) and value else None,
+                "unit": p.unit,
+            }
+            for p, value, s in zip(plant.definition.parameters, params, sd, strict=True)
+        },
+        "log_det_information": float(d_optimality(information)),
+        "a_optimality": float(a_optimality(information)),
+        "e_optimality": float(e_optimality(information)),
+        "information": np.asarray(information),
+        "verdict": [unseen[1]] if unseen else list(seen),
+    }
 
 
 def write_run(result: Identification, path: Path, overwrite: bool = False) -> None:

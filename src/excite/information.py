@@ -111,13 +111,13 @@ def relative_size(plant: AbstractPlant, params: Params) -> Float[Array, " param"
 
 
 def d_optimality(information: Information) -> Float[Array, ""]:
-    """log det M: minus twice the logarithm of the confidence ellipsoid's volume."""
+    """Log det M: minus twice the logarithm of the confidence ellipsoid's volume."""
     sign, value = jnp.linalg.slogdet(information)
     return jnp.where(sign > 0, value, -jnp.inf)
 
 
 def a_optimality(information: Information) -> Float[Array, ""]:
-    """trace M^-1: the sum of the parameters' least variances."""
+    """Trace M^-1: the sum of the parameters' least variances."""
     return jnp.sum(cramer_rao_bound(information) ** 2)
 
 

@@ -54,6 +54,15 @@ class Record:
     metadata: Mapping[str, Any] = field(default_factory=dict)
     source: str = ""
 
+    @classmethod
+    def of_episode(
+        cls, time: Any, inputs: Any, outputs: Any, metadata: Mapping[str, Any] | None = None
+    ) -> Record:
+        """A record of T + 1 samples from T inputs; its last row goes on holding the last."""
+        inputs = np.asarray(inputs)
+        held = np.concatenate([inputs, inputs[-1:]])
+        return cls(np.asarray(time), held, np.asarray(outputs), metadata or {})
+
     @property
     def dt(self) -> float:
         """Sampling time [s]."""
@@ -70,6 +79,8 @@ def read_record(
     description: PlantDescription,
     columns: Mapping[str, str] | None = None,
     scales: Mapping[str, float] | None = None,
+    *,
+    inputs_only: bool = False,
 ) -> Record:
     """The experiment in a CSV or MAT file, checked against a plant.
 
@@ -77,6 +88,8 @@ def read_record(
         path: the file; its ending tells its kind.
         columns: names in the file where they are not the plant's: {"pitch": "qm"}.
         scales: factors from the file's unit to the plant's: {"pitch": 0.01745}.
+        inputs_only: whether the file is a designed input without outputs; the record
+            then has none either.
 
     Raises:
         ValueError: one sentence for anything that cannot be used: an unreadable or
@@ -91,18 +104,26 @@ def read_record(
                 f"it has {', '.join(description.columns)}"
             )
     table = _read_table(path)
-    values = {
-        name: _column(table, columns.get(name, name), name, path) * scales.get(name, 1.0)
-        for name in description.columns
-    }
-    _check_time(values["time"], path)
-    for part in (*description.inputs, *description.outputs):
-        _check_finite(values[part.name], part.name, path)
-        _check_size(values[part.name], part, path)
+
+    def read(name: str) -> np.ndarray:
+        return _column(table, columns.get(name, name), name, path) * scales.get(name, 1.0)
+
+    time = read("time")
+    _check_time(time, path)
+    outputs = () if inputs_only else description.outputs
+    parts = {part.name: read(part.name) for part in (*description.inputs, *outputs)}
+    for part in (*description.inputs, *outputs):
+        if len(parts[part.name]) != len(time):
+            raise ValueError(
+                f"{path}: {part.name!r} has {len(parts[part.name])} samples, 'time' {len(time)}"
+            )
+        _check_finite(parts[part.name], part.name, path)
+        _check_size(parts[part.name], part, path)
+    chosen = [parts[n] for n in names_of(outputs)]
     return Record(
-        time=values["time"],
-        inputs=np.stack([values[n] for n in names_of(description.inputs)], axis=1),
-        outputs=np.stack([values[n] for n in names_of(description.outputs)], axis=1),
+        time=time,
+        inputs=np.stack([parts[n] for n in names_of(description.inputs)], axis=1),
+        outputs=np.stack(chosen, axis=1) if chosen else np.empty((len(time), 0)),
         metadata=_read_sidecar(path),
         source=str(path),
     )
@@ -110,12 +131,22 @@ def read_record(
 
 def _read_table(path: Path) -> dict[str, np.ndarray | list[str]]:
     """Columns by name; those of a CSV file still as text."""
-    kind = path.suffix.lower()
-    if kind not in (".csv", ".mat"):
-        raise ValueError(f"{path}: experiment files end in .csv or .mat")
+    _require_record_ending(path)
     if not path.is_file():
         raise ValueError(f"{path}: no such file")
-    return _read_mat(path) if kind == ".mat" else _read_csv(path)
+    return _read_mat(path) if path.suffix.lower() == ".mat" else _read_csv(path)
+
+
+def _require_record_ending(path: Path) -> None:
+    if path.suffix.lower() not in (".csv", ".mat"):
+        raise ValueError(f"{path}: experiment files end in .csv or .mat")
+
+
+def require_record_path(path: Path) -> None:
+    """Raises ValueError, before anything is computed, where no record can be written."""
+    _require_record_ending(path)
+    if not path.parent.is_dir():
+        raise ValueError(f"{path}: the folder {path.parent} does not exist")
 
 
 def _read_csv(path: Path) -> dict[str, np.ndarray | list[str]]:
@@ -247,6 +278,7 @@ def write_record(
         ValueError: for another ending, or a folder that does not exist.
     """
     path = Path(path)
+    require_record_path(path)
     columns = dict(
         zip(
             description.columns,
@@ -257,10 +289,8 @@ def write_record(
     buffer = io.BytesIO()
     if path.suffix.lower() == ".mat":
         scipy.io.savemat(buffer, {name: values[:, None] for name, values in columns.items()})
-    elif path.suffix.lower() == ".csv":
-        buffer.write(csv_text(columns).encode())
     else:
-        raise ValueError(f"{path}: experiment files end in .csv or .mat")
+        buffer.write(csv_text(columns).encode())
     sidecar = {
         **record.metadata,
         "kind": RECORD_KIND,

@@ -11,17 +11,27 @@ from __future__ import annotations
 import math
 from typing import Any, TypeAlias
 
+import numpy as np
+from jaxtyping import Float
+
 from .description import PlantDescription
 
 AnyArray: TypeAlias = Any
 """A NumPy or a JAX array."""
 
 
-def critical_levels(description: PlantDescription) -> tuple[float, ...]:
+def critical_levels(description: PlantDescription) -> Float[np.ndarray, " output"]:
     """Critical level of each output's magnitude, in its unit; infinity for none."""
-    return tuple(
+    levels = [
         math.inf if o.critical_level is None else o.critical_level for o in description.outputs
-    )
+    ]
+    return np.array(levels)
+
+
+def watched_output(description: PlantDescription) -> int:
+    """Index of the first output with a critical level, else of the first output."""
+    levels = critical_levels(description)
+    return next((i for i, level in enumerate(levels) if level < math.inf), 0)
 
 
 def max_abs_output(outputs: AnyArray) -> AnyArray:

@@ -79,9 +79,7 @@ def measure(
     sensor = plant.sensor
     noisy = output + sensor.noise_sd * jax.random.normal(key, output.shape, float)
     resolution = jnp.where(sensor.resolution > 0, sensor.resolution, 1.0)
-    rounded = jnp.where(
-        sensor.resolution > 0, jnp.round(noisy / resolution) * resolution, noisy
-    )
+    rounded = jnp.where(sensor.resolution > 0, jnp.round(noisy / resolution) * resolution, noisy)
     # Straight-through: rounding has no useful derivative, the measurement has.
     return noisy + jax.lax.stop_gradient(rounded - noisy)
 

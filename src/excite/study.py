@@ -87,6 +87,26 @@ def plant_named(name: str) -> AbstractPlant:
         raise ValueError(f"{class_name} in {path} is not a complete plant: {error}") from None
 
 
+def with_sensor(
+    plant: AbstractPlant, noise_sd: Mapping[str, float], resolution: Mapping[str, float]
+) -> AbstractPlant:
+    """The plant with another noise or resolution of the outputs named, in their units.
+
+    Raises:
+        ValueError: for an unknown output, or a value that is negative or not finite.
+    """
+    outputs, sensor = names_of(plant.definition.outputs), plant.sensor
+    numbers = {"noise": sensor.noise_sd.tolist(), "resolution": sensor.resolution.tolist()}
+    for what, given in (("noise", noise_sd), ("resolution", resolution)):
+        for name, value in given.items():
+            if name not in outputs:
+                raise _unknown(f"output of plant {plant.definition.name!r}", name, outputs)
+            if not (math.isfinite(value) and value >= 0):
+                raise ValueError(f"{what} of {name!r} must be zero or positive: got {value:g}")
+            numbers[what][outputs.index(name)] = value
+    return plant.changed(sensor=Sensor(*(jnp.asarray(v) for v in numbers.values())))
+
+
 def _module(path: Path) -> Any:
     name = f"excite_plant_{path.stem}"
     spec = importlib.util.spec_from_file_location(name, path)
@@ -97,9 +117,7 @@ def _module(path: Path) -> Any:
     try:
         spec.loader.exec_module(module)
     except Exception as error:
-        raise ValueError(
-            f"{path} cannot be imported: {type(error).__name__}: {error}"
-        ) from error
+        raise ValueError(f"{path} cannot be imported: {type(error).__name__}: {error}") from error
     return module
 
 
@@ -131,7 +149,7 @@ def estimator_named(name: str, options: Mapping[str, Any] | None = None) -> Abst
         return default
     estimator = _build(type(default), name, options)
     for option, value in options.items():
-        if not isinstance(value, list) and not 0 < float(value):
+        if not isinstance(value, list) and not float(value) > 0:
             raise ValueError(f"{option} of {name!r} must be positive: got {value!r}")
     return estimator
 
@@ -222,6 +240,14 @@ class EstimatorSettings(_Settings):
         return dict(self.model_extra or {})
 
 
+class ReferenceRow(_Settings):
+    """A published row of the same table: mean and standard deviation of each column."""
+
+    relative_error_percent: dict[str, tuple[float, float]]
+    max_abs_output: tuple[float, float]
+    violations: str
+
+
 class Study(_Settings):
     """Methods x estimators over common plants and noise.
 
@@ -235,6 +261,8 @@ class Study(_Settings):
         sensor: by output, where it differs from the plant's.
         methods, estimators: by the name that tables show.
         inferred: settings that the source of the study does not state, in words.
+        reference: published rows by method, shown in tables for comparison.
+        source: where they were published.
     """
 
     name: str
@@ -248,6 +276,8 @@ class Study(_Settings):
     methods: dict[str, MethodSettings]
     estimators: dict[str, EstimatorSettings]
     inferred: list[str] = []
+    reference: dict[str, ReferenceRow] = {}
+    source: str = ""
 
     def build_plant(self) -> AbstractPlant:
         """The plant behind the study's sensor.
@@ -255,21 +285,18 @@ class Study(_Settings):
         Raises:
             ValueError: for an unknown plant or output.
         """
-        plant = plant_named(self.plant)
-        outputs = names_of(plant.definition.outputs)
-        for name in self.sensor:
-            if name not in outputs:
-                raise _unknown(f"output of plant {self.plant!r}", name, outputs)
-        noise, resolution = plant.sensor.noise_sd.tolist(), plant.sensor.resolution.tolist()
-        for i, name in enumerate(outputs):
-            own = self.sensor.get(name, SensorSettings())
-            noise[i] = noise[i] if own.noise_sd is None else own.noise_sd
-            resolution[i] = resolution[i] if own.resolution is None else own.resolution
-        return plant.changed(sensor=Sensor(jnp.asarray(noise), jnp.asarray(resolution)))
+        own = self.sensor.items()
+        return with_sensor(
+            plant_named(self.plant),
+            {n: s.noise_sd for n, s in own if s.noise_sd is not None},
+            {n: s.resolution for n, s in own if s.resolution is not None},
+        )
 
     def build_methods(self, plant: AbstractPlant) -> dict[str, AbstractExcitation]:
         """The study's excitations, checked against the plant."""
-        return {n: excitation_named(m.excitation, m.options, plant) for n, m in self.methods.items()}
+        return {
+            n: excitation_named(m.excitation, m.options, plant) for n, m in self.methods.items()
+        }
 
     def build_estimators(self, plant: AbstractPlant) -> dict[str, AbstractEstimator]:
         """The study's estimators.
@@ -345,7 +372,9 @@ def _sentence(error: pydantic.ValidationError) -> str:
     first = error.errors()[0]
     location = ".".join(str(part) for part in first["loc"])
     if first["type"] == "extra_forbidden":
-        model = SensorSettings if first["loc"][0] == "sensor" else Study
+        model = {"sensor": SensorSettings, "reference": ReferenceRow}.get(
+            str(first["loc"][0]) if len(first["loc"]) > 1 else "", Study
+        )
         return str(_unknown("key", location.rpartition(".")[2], model.model_fields))
     if first["type"] == "missing":
         return f"the key {location!r} is missing"

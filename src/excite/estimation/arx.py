@@ -118,9 +118,7 @@ class ARX(AbstractEstimator):
         variance = jnp.sum(innovations**2) / jnp.maximum(jnp.sum(valid) - 4, 1)
         params, status = physical_params(plant, memory.coefficients)
         status = jnp.where(_is_ill_conditioned(regressors, valid), Status.ILL_CONDITIONED, status)
-        slope = jax.jacfwd(lambda c: jnp.stack(physical_params(plant, c)[0]))(
-            memory.coefficients
-        )
+        slope = jax.jacfwd(lambda c: jnp.stack(physical_params(plant, c)[0]))(memory.coefficients)
         covariance = variance * slope @ memory.covariance @ slope.T
         size = jnp.stack(params)
         simulated = simulate_experiments(plant, params, experiments, experiments.initial_state)

@@ -109,8 +109,7 @@ def worst_seen(
         if names[i] in involved
     )
     return chosen, (
-        f"the data cannot tell {' and '.join(involved)} apart: "
-        f"{combination} could have any size"
+        f"the data cannot tell {' and '.join(involved)} apart: {combination} could have any size"
     )
 
 
@@ -123,4 +122,5 @@ def identifiability(
     sd, direction = 1 / np.sqrt(values[0]), vectors[:, 0]
     involved = [names[i] for i, v in zip(index, direction, strict=True) if abs(v) > 0.3]
     what = involved[0] if len(involved) == 1 else f"a combination of {' and '.join(involved)}"
-    return f"the data see all of {', '.join(names[i] for i in index)}; worst is {what}, to {100 * sd:.2g} %"
+    seen = ", ".join(names[i] for i in index)
+    return f"the data see all of {seen}; worst is {what}, to {100 * sd:.2g} %"

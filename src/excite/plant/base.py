@@ -16,7 +16,7 @@ import abc
 import dataclasses
 import math
 from collections import namedtuple
-from functools import lru_cache
+from functools import cache
 from typing import Any, ClassVar, Self, TypeAlias
 
 import equinox as eqx
@@ -29,7 +29,7 @@ Params: TypeAlias = Any
 """The unknown parameters: a named tuple of scalars in the order of the description."""
 
 
-@lru_cache(maxsize=None)
+@cache
 def _tuple_type(title: str, names: tuple[str, ...]) -> type:
     # One class for one set of names: a pytree of another class would compile anew.
     return namedtuple(title, names)  # pyright: ignore[reportUntypedNamedTuple]

@@ -19,9 +19,7 @@ class DCMotor(AbstractPlant):
         inputs=(Input("voltage", "V", -24.0, 24.0, amplitude=3.0),),
         outputs=(
             Output("speed", "rad/s", 200.0, noise_sd=0.5),
-            Output(
-                "current", "A", 5.0, noise_sd=0.02, warning_level=4.0, critical_level=5.0
-            ),
+            Output("current", "A", 5.0, noise_sd=0.02, warning_level=4.0, critical_level=5.0),
         ),
         parameters=(
             Parameter("R", "ohm", 2.0),

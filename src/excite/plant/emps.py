@@ -22,9 +22,7 @@ class EMPS(AbstractPlant):
         states=(State("position", "m", scale=0.1), State("velocity", "m/s", scale=0.1)),
         inputs=(Input("force", "N", -300.0, 300.0, amplitude=60.0),),
         outputs=(
-            Output(
-                "position", "m", 0.12, noise_sd=1e-5, warning_level=0.10, critical_level=0.12
-            ),
+            Output("position", "m", 0.12, noise_sd=1e-5, warning_level=0.10, critical_level=0.12),
         ),
         parameters=(
             Parameter("M", "kg", 95.1089),

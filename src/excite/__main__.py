@@ -1,0 +1,5 @@
+"""`python -m excite`."""
+
+from .cli import main
+
+main()

@@ -1,0 +1,70 @@
+"""`excite benchmark`: the table of a study file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from .door import (
+    OUT_FILE,
+    computing,
+    json_option,
+    plot_option,
+    progress_bar,
+    show_json,
+    show_table,
+)
+
+
+@click.command()
+@click.argument("study", type=OUT_FILE, metavar="STUDY.toml")
+@click.option("--episodes", type=click.IntRange(min=1), help="Instead of the study's.")
+@click.option("--seed", type=click.IntRange(min=0), help="Instead of the study's.")
+@click.option("--estimators", metavar="NAME,...", help="Instead of the study's.")
+@click.option("--out", type=OUT_FILE, metavar="FOLDER", help="Leave a run folder.")
+@click.option("--overwrite", is_flag=True, help="Replace the run folder if it exists.")
+@plot_option
+@json_option
+@computing
+def benchmark(
+    study: Path, episodes: int | None, seed: int | None, estimators: str | None,
+    out: Path | None, overwrite: bool, plot: Path | None, as_json: bool,
+) -> None:  # fmt: skip
+    """Compare the methods of STUDY.toml under identical conditions."""
+    from ..benchmark import run_benchmark, write_benchmark
+    from ..records import require_free_run_folder
+    from ..report import (
+        all_cells,
+        benchmark_csv,
+        benchmark_figure,
+        benchmark_markdown,
+        footnotes,
+        save,
+        table_header,
+    )
+    from ..study import read_study
+
+    if out is not None:
+        require_free_run_folder(out, overwrite)
+    chosen = read_study(study).changed(estimators=estimators, episodes=episodes, seed=seed)
+    with progress_bar(chosen.name) as progress:
+        rows = run_benchmark(chosen, progress)
+    settings = chosen.model_dump()
+    title = chosen.title or chosen.name
+    if plot is not None:
+        save(benchmark_figure(rows, title), plot)
+    if out is not None:
+        tables = {
+            "table.md": benchmark_markdown(rows, settings),
+            "table.csv": benchmark_csv(rows),
+        }
+        write_benchmark(chosen, rows, tables, out, overwrite)
+    if as_json:
+        show_json({"rows": rows})
+        return
+    show_table(title, table_header(rows), all_cells(rows, settings["reference"]))
+    for note in footnotes(settings):
+        click.echo(note)
+    if out is not None:
+        click.echo(f"run folder: {out}")

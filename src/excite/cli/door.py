@@ -1,0 +1,143 @@
+"""What every command does at the door: options in, computing prepared, results shown."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import json
+import os
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+
+
+class Assignments(click.ParamType):
+    """NAME=VALUE,NAME=VALUE,... as a dictionary."""
+
+    name = "NAME=VALUE,..."
+
+    def __init__(self, convert: Callable[[str], Any]) -> None:
+        """`convert` reads the text of one value; its ValueError becomes the user's sentence."""
+        self.convert_value = convert
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> dict[str, Any]:
+        """Pairs in the order given."""
+        if isinstance(value, dict):
+            return value
+        result = {}
+        for pair in value.split(","):
+            name, equals, text = (part.strip() for part in pair.partition("="))
+            if not (name and equals and text):
+                self.fail(f"{pair!r} is not of the form NAME=VALUE", param, ctx)
+            try:
+                result[name] = self.convert_value(text)
+            except ValueError:
+                self.fail(f"{text!r} is not a value for {name!r}", param, ctx)
+        return result
+
+
+def _option_value(text: str) -> Any:
+    """A number, true, false or a list of numbers, as TOML and JSON write them."""
+    value = json.loads(text)
+    if not isinstance(value, bool | int | float | list):
+        raise ValueError(text)
+    return value
+
+
+NUMBERS = Assignments(float)
+NAMES = Assignments(str)
+VALUES = Assignments(_option_value)
+OUT_FILE = click.Path(path_type=Path)
+
+
+def merged(pairs: Iterable[dict[str, Any]]) -> dict[str, Any]:
+    """One dictionary from an option that was given several times."""
+    return {name: value for part in pairs for name, value in part.items()}
+
+
+def json_option(command: Callable[..., Any]) -> Callable[..., Any]:
+    """`--json`: one JSON object on stdout and nothing else."""
+    return click.option(
+        "--json", "as_json", is_flag=True, help="Print one JSON object and nothing else."
+    )(command)
+
+
+def plot_option(command: Callable[..., Any]) -> Callable[..., Any]:
+    """`--plot FILE`."""
+    return click.option(
+        "--plot", type=OUT_FILE, metavar="FILE", help="Write a figure (.png, .svg, .pdf)."
+    )(command)
+
+
+def computing(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Prepares JAX before a command: double precision, and a cache of compiled programs."""
+
+    @functools.wraps(command)
+    def wrapped(*args: Any, **kwargs: Any) -> Any:
+        # The compiler's remarks on its own cache are no concern of the user's.
+        os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+        import jax
+
+        jax.config.update("jax_enable_x64", True)
+        jax.config.update("jax_compilation_cache_dir", str(cache_folder()))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+        jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+        plot = kwargs.get("plot")
+        if plot is not None:
+            from ..report import require_plot_path
+
+            require_plot_path(plot)
+        return command(*args, **kwargs)
+
+    return wrapped
+
+
+def cache_folder() -> Path:
+    """Where compiled programs are kept: EXCITE_CACHE, or the user's cache folder."""
+    own = os.environ.get("EXCITE_CACHE")
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(own) if own else Path(base) / "excite"
+
+
+@contextlib.contextmanager
+def progress_bar(what: str) -> Iterator[Callable[[str, int, int], None]]:
+    """A bar on stderr, for a terminal only; calls set its text, what is done and the total."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    console = Console(stderr=True)
+    columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()
+    with Progress(
+        *columns, console=console, transient=True, disable=not console.is_terminal
+    ) as bar:
+        task = bar.add_task(what, total=None)
+
+        def report(text: str, done: int, total: int) -> None:
+            bar.update(task, description=f"{what}: {text}", completed=done, total=total)
+
+        yield report
+
+
+def show_json(value: Any) -> None:
+    """One JSON object on stdout."""
+    from ..records import json_text
+
+    click.echo(json_text(value))
+
+
+def show_table(title: str, header: list[str], rows: Iterable[list[str]]) -> None:
+    """A table on stdout, as wide as its content where it is not a terminal."""
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+    for i, name in enumerate(header):
+        table.add_column(name, justify="left" if i == 0 else "right", overflow="fold")
+    for row in rows:
+        table.add_row(*row)
+    width = None if sys.stdout.isatty() else 200
+    Console(width=width, highlight=False, markup=False).print(table)

@@ -1,0 +1,162 @@
+"""`excite identify`: from recorded experiments to parameters with confidence."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from .door import (
+    NAMES,
+    NUMBERS,
+    OUT_FILE,
+    computing,
+    json_option,
+    merged,
+    plot_option,
+    progress_bar,
+    show_json,
+    show_table,
+)
+
+
+@click.command()
+@click.argument("files", nargs=-1, required=True, type=OUT_FILE, metavar="FILE...")
+@click.option("--plant", required=True, help="Name, or path/to/file.py:ClassName.")
+@click.option(
+    "--estimator",
+    default="nls",
+    show_default=True,
+    metavar="NAME",
+    help="nls, arx-rls (the paper's) or arx-rls-wide (wide start covariance).",
+)
+@click.option(
+    "--initial-state",
+    type=click.Choice(["auto", "free", "known"]),
+    default="auto",
+    show_default=True,
+    help="Estimate initial states, or take the plant's; auto: known where the "
+    "sidecar says that the record starts there.",
+)
+@click.option(
+    "--start",
+    type=NUMBERS,
+    multiple=True,
+    help="Where the search begins; default the nominal parameters.",
+)
+@click.option(
+    "--validate",
+    "validation",
+    type=OUT_FILE,
+    multiple=True,
+    metavar="FILE",
+    help="Held-out record to simulate with the estimate.",
+)
+@click.option(
+    "--column",
+    type=NAMES,
+    multiple=True,
+    help="Columns of the file that have another name: pitch=qm.",
+)
+@click.option(
+    "--scale",
+    type=NUMBERS,
+    multiple=True,
+    help="Factors from the file's units to the plant's: pitch=0.01745.",
+)
+@click.option("--out", type=OUT_FILE, metavar="FOLDER", help="Leave a run folder.")
+@click.option("--overwrite", is_flag=True, help="Replace the run folder if it exists.")
+@plot_option
+@json_option
+@computing
+def identify(
+    files: tuple[Path, ...], plant: str, estimator: str, validation: tuple[Path, ...],
+    out: Path | None, overwrite: bool, plot: Path | None, as_json: bool, **options: Any,
+) -> int:  # fmt: skip
+    """Estimate PLANT's parameters from one or several records (.csv, .mat).
+
+    Several records are fitted together: they share the parameters, each has an initial
+    state of its own.
+    """
+    from ..identification import identify as run
+    from ..identification import write_run
+    from ..records import read_record, require_free_run_folder
+    from ..report import identification_figure, save
+    from ..study import estimator_named, plant_named
+
+    if out is not None:
+        require_free_run_folder(out, overwrite)
+    chosen, method = plant_named(plant), estimator_named(estimator)
+    mapping = merged(options["column"]), merged(options["scale"])
+    records = [read_record(file, chosen.description, *mapping) for file in files]
+    held_out = [read_record(file, chosen.description, *mapping) for file in validation]
+    with progress_bar("identifying"):
+        result = run(
+            chosen,
+            records,
+            method,
+            start=merged(options["start"]),
+            initial_state=options["initial_state"],
+            validation=held_out,
+        )
+    data = {**result.to_dict(), "estimator": estimator}
+    if plot is not None:
+        first = result.fitted[0]
+        save(identification_figure(result.plant, data, first.record, first.simulated), plot)
+    if out is not None:
+        write_run(result, out, overwrite)
+    if as_json:
+        show_json(data)
+    else:
+        _show(result.plant, data, out)
+    return 0 if result.is_usable else 1
+
+
+def _show(description: Any, data: dict[str, Any], out: Path | None) -> None:
+    from ..report import digits_for, number
+
+    show_table(
+        f"{data['plant']}, {data['estimator']}, initial state {data['initial_state']}: "
+        f"{data['status']}",
+        ["symbol", "unit", "estimate", "standard error", "95 % interval", "relative to nominal"],
+        [
+            _row(name, p, number, digits_for(p["estimate"], p["std_error"]))
+            for name, p in data["params"].items()
+        ],
+    )
+    for name, percent in data["fit_percent"].items():
+        whiteness = data["whiteness_p_value"][name]
+        click.echo(
+            f"{name}: fit {number(percent, 4)} %, residual white with p = {number(whiteness)}"
+        )
+    for v in data["validation"]:
+        for name, percent in v["fit_percent"].items():
+            click.echo(f"{v['file']}: held-out {name} fit {number(percent, 4)} %")
+    for sentence in data["verdict"]:
+        click.echo(sentence)
+    if len(description.parameters) > 1:
+        click.echo(f"largest correlation: {_largest_correlation(data)}")
+    if out is not None:
+        click.echo(f"run folder: {out}")
+
+
+def _row(name: str, p: dict[str, Any], number: Any, digits: int) -> list[str]:
+    relative = p["relative_to_nominal"]
+    relative = "–" if relative is None else f"{relative:.4f}"
+    if p["held"]:
+        return [name, p["unit"], f"{number(p['estimate'], 5)} (held)", "–", "–", relative]
+    low, high = p["ci95"]
+    interval = f"{number(low, digits)} to {number(high, digits)}"
+    return [
+        name, p["unit"], number(p["estimate"], digits), number(p["std_error"]), interval, relative,
+    ]  # fmt: skip
+
+
+def _largest_correlation(data: dict[str, Any]) -> str:
+    import numpy as np
+
+    names, table = list(data["params"]), np.array(data["correlation"], float)
+    table = np.nan_to_num(np.triu(table, 1))
+    i, j = np.unravel_index(np.argmax(np.abs(table)), table.shape)
+    return f"{table[i, j]:+.3f} between {names[i]} and {names[j]}"

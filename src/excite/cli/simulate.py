@@ -1,0 +1,185 @@
+"""`excite simulate`: one experiment on a simulated plant."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from .door import (
+    NAMES,
+    NUMBERS,
+    OUT_FILE,
+    VALUES,
+    computing,
+    json_option,
+    merged,
+    plot_option,
+    show_json,
+    show_table,
+)
+
+
+def excitation_options(command: Any) -> Any:
+    """Options that choose an excitation; shared with `information`."""
+    for option in reversed(
+        [
+            click.option("--excitation", default="chirp", show_default=True, metavar="NAME",
+                         help="random, prbs, chirp, multisine or square."),
+            click.option("--set", "settings", type=VALUES, multiple=True,
+                         help="Options of the excitation: amplitude, hold, clock, register, "
+                         "start_frequency, stop_frequency, frequency, logarithmic."),
+            click.option("--steps", type=click.IntRange(2, 10_000_000), metavar="T",
+                         help="Length in samples; default 500, or all of a file."),
+            click.option("--params", type=NUMBERS, multiple=True,
+                         help="True parameters where they are not the nominal ones."),
+            click.option("--noise", type=NUMBERS, multiple=True,
+                         help="Standard deviation of an output's noise, in its unit."),
+            click.option("--resolution", type=NUMBERS, multiple=True,
+                         help="Step of an output's encoder, in its unit."),
+            click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True),
+            click.option("--column", type=NAMES, multiple=True,
+                         help="Columns of the input file that have another name."),
+            click.option("--scale", type=NUMBERS, multiple=True,
+                         help="Factors from the input file's units to the plant's."),
+        ]
+    ):  # fmt: skip
+        command = option(command)
+    return command
+
+
+def prepared(options: dict[str, Any], plant_name: str, file: Path | None) -> dict[str, Any]:
+    """Plant, true parameters, excitation, length and key from the options above."""
+    import jax
+    import jax.numpy as jnp
+
+    from ..excitation import Replay
+    from ..identification import start_params
+    from ..records import read_record
+    from ..study import excitation_named, plant_named, with_sensor
+
+    plant = with_sensor(
+        plant_named(plant_name), merged(options["noise"]), merged(options["resolution"])
+    )
+    record, name, settings = None, options["excitation"], merged(options["settings"])
+    if file is None:
+        excitation = excitation_named(name, settings, plant)
+        steps = options["steps"] or 500
+    else:
+        if settings:
+            raise ValueError("--set belongs to an excitation and does not go with an input file")
+        columns, scales = merged(options["column"]), merged(options["scale"])
+        record = read_record(file, plant.definition, columns, scales, inputs_only=True)
+        plant = plant.changed(dt=record.dt)
+        excitation, name = Replay(jnp.asarray(record.inputs)), "replay"
+        steps = options["steps"] or len(record.inputs) - 1
+        if steps > len(record.inputs):
+            raise ValueError(f"{file} has {len(record.inputs)} inputs, --steps asks for {steps}")
+    return {
+        "plant": plant,
+        "params": start_params(plant, merged(options["params"])),
+        "excitation": excitation,
+        "excitation_name": name,
+        "steps": steps,
+        "key": jax.random.key(options["seed"]),
+        "record": record,
+    }
+
+
+@click.command()
+@click.argument("plant")
+@click.argument("input_file", required=False, type=OUT_FILE)
+@excitation_options
+@click.option("--out", type=OUT_FILE, metavar="FILE", help="Write the record (.csv, .mat).")
+@plot_option
+@json_option
+@computing
+def simulate(
+    plant: str, input_file: Path | None, out: Path | None, plot: Path | None, as_json: bool,
+    **options: Any,
+) -> None:  # fmt: skip
+    """Run one experiment on PLANT and record what its sensor shows.
+
+    The input is an excitation, or replayed from INPUT_FILE (columns: time and the inputs).
+    """
+    from ..excitation import crest_factor
+    from ..records import require_record_path, write_record
+    from ..report import episode_figure, save
+    from ..safety import critical_levels, is_violation, max_abs_output
+    from ..simulation import run_episode
+
+    if out is not None:
+        require_record_path(out)
+    job = prepared(options, plant, input_file)
+    run = run_episode(job["plant"], job["params"], job["excitation"], job["steps"], job["key"])
+    description = job["plant"].description
+    record = _record(run, job, options["seed"])
+    summary = {
+        "plant": description.name,
+        "excitation": job["excitation_name"],
+        "num_steps": job["steps"],
+        "dt": description.dt,
+        "params": record.metadata["params"],
+        "crest_factor": _by_name(description.inputs, crest_factor(run.inputs)),
+        "max_abs_output": _by_name(description.outputs, max_abs_output(run.outputs)),
+        "violation": bool(is_violation(run.outputs, critical_levels(description))),
+        "file": None if out is None else str(out),
+    }
+    if plot is not None:
+        save(episode_figure(description, record), plot)
+    if out is not None:
+        write_record(out, record, description)
+    if as_json:
+        show_json(summary)
+    else:
+        _show(description, summary)
+
+
+def _by_name(parts: Any, values: Any) -> dict[str, float]:
+    return {part.name: float(value) for part, value in zip(parts, values, strict=True)}
+
+
+def _record(run: Any, job: dict[str, Any], seed: int) -> Any:
+    from .. import __version__
+    from ..records import Record
+
+    names = [p.name for p in job["plant"].definition.parameters]
+    return Record.of_episode(
+        run.time,
+        run.inputs,
+        run.measured,
+        {
+            "params": dict(zip(names, map(float, job["params"]), strict=True)),
+            "starts_at_initial_state": True,
+            "provenance": {
+                "excite": __version__,
+                "simulated": True,
+                "excitation": job["excitation_name"],
+                "seed": seed,
+            },
+        },
+    )
+
+
+def _show(description: Any, summary: dict[str, Any]) -> None:
+    from ..description import display_unit
+    from ..report import number
+
+    rows = [
+        [f"crest factor of {name}", number(value), ""]
+        for name, value in summary["crest_factor"].items()
+    ]
+    for part in description.outputs:
+        unit, factor = display_unit(part.unit)
+        value = number(factor * summary["max_abs_output"][part.name])
+        level = part.critical_level
+        limit = "" if level is None else f"critical level {factor * level:g} {unit}"
+        rows.append([f"largest |{part.name}|", f"{value} {unit}", limit])
+    title = (
+        f"{summary['plant']}, {summary['excitation']}, {summary['num_steps']} steps of "
+        f"{summary['dt']:g} s: {'VIOLATION' if summary['violation'] else 'safe'}"
+    )
+    show_table(title, ["", "", ""], rows)
+    if summary["file"]:
+        click.echo(f"record: {summary['file']}")
