@@ -55,7 +55,7 @@ def prepared(options: dict[str, Any], plant_name: str, file: Path | None) -> dic
     import jax.numpy as jnp
 
     from ..excitation import Replay
-    from ..identification import start_params
+    from ..plant import params_from
     from ..records import read_record
     from ..study import excitation_named, plant_named, with_sensor
 
@@ -78,7 +78,7 @@ def prepared(options: dict[str, Any], plant_name: str, file: Path | None) -> dic
             raise ValueError(f"{file} has {len(record.inputs)} inputs, --steps asks for {steps}")
     return {
         "plant": plant,
-        "params": start_params(plant, merged(options["params"])),
+        "params": params_from(plant, merged(options["params"])),
         "excitation": excitation,
         "excitation_name": name,
         "steps": steps,

@@ -114,12 +114,16 @@ def worst_seen(
 
 
 def identifiability(
-    names: tuple[str, ...], information: Float[np.ndarray, "param param"], free: np.ndarray
+    names: tuple[str, ...], covariance: Float[np.ndarray, "param param"], free: np.ndarray
 ) -> str:
-    """How well the worst direction of the free parameters is seen, in words."""
+    """How well the worst direction of the free parameters is seen, in words.
+
+    Args:
+        covariance: in search coordinates.
+    """
     index = np.flatnonzero(free)
-    values, vectors = np.linalg.eigh(information[np.ix_(index, index)])
-    sd, direction = 1 / np.sqrt(values[0]), vectors[:, 0]
+    values, vectors = np.linalg.eigh(covariance[np.ix_(index, index)])
+    sd, direction = np.sqrt(max(values[-1], 0.0)), vectors[:, -1]
     involved = [names[i] for i, v in zip(index, direction, strict=True) if abs(v) > 0.3]
     what = involved[0] if len(involved) == 1 else f"a combination of {' and '.join(involved)}"
     seen = ", ".join(names[i] for i in index)

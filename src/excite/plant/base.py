@@ -16,6 +16,7 @@ import abc
 import dataclasses
 import math
 from collections import namedtuple
+from collections.abc import Mapping
 from functools import cache
 from typing import Any, ClassVar, Self, TypeAlias
 
@@ -171,3 +172,32 @@ class AbstractARXPlant(AbstractPlant):
         self, c_0: Float[Array, ""], c_1: Float[Array, ""], d_0: Float[Array, ""]
     ) -> Params:
         """Physical parameters of y'' + c_1 y' + c_0 y = d_0 u."""
+
+
+def params_from(plant: AbstractPlant, values: Mapping[str, float]) -> Params:
+    """Nominal parameters, but for those given.
+
+    Raises:
+        ValueError: for an unknown name or a value outside the parameter's bounds.
+    """
+    names = names_of(plant.definition.parameters)
+    for name, value in values.items():
+        if name not in names:
+            raise ValueError(
+                f"plant {plant.definition.name!r} has no parameter {name!r}; "
+                f"it has {', '.join(names)}"
+            )
+        p = plant.definition.parameters[names.index(name)]
+        lower = 0.0 if p.positive and p.lower is None else p.lower
+        if not (
+            math.isfinite(value)
+            and (lower is None or value > lower)
+            and (p.upper is None or value < p.upper)
+        ):
+            raise ValueError(
+                f"{name} = {value:g} {p.unit} is not allowed; it must be finite, above "
+                f"{'minus infinity' if lower is None else format(lower, 'g')} and below "
+                f"{'infinity' if p.upper is None else format(p.upper, 'g')}"
+            )
+    given = {name: jnp.asarray(float(value)) for name, value in values.items()}
+    return plant.nominal._replace(**given)

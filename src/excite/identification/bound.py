@@ -1,0 +1,65 @@
+"""How well an experiment can determine each parameter, before it is run."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ..description import names_of
+from ..estimation.diagnosis import identifiability, worst_seen
+from ..information import (
+    a_optimality,
+    cramer_rao_bound,
+    d_optimality,
+    e_optimality,
+    experiment_information,
+    relative_size,
+)
+from ..plant import AbstractPlant, Params
+
+
+def best_possible(
+    plant: AbstractPlant,
+    params: Params,
+    inputs: Float[np.ndarray, "time input"],
+    *,
+    initial_state_known: bool,
+) -> dict[str, Any]:
+    """Least standard deviation of each parameter for an input, as JSON-ready data.
+
+    Raises:
+        ValueError: for a sensor without noise, which sets no bound.
+    """
+    if not np.all(np.asarray(plant.sensor.sd) > 0):
+        raise ValueError("a sensor without noise sets no bound; give every output a noise")
+    state = None if initial_state_known else plant.initial_state
+    information = experiment_information(plant, params, jnp.asarray(inputs), state)
+    size = np.asarray(relative_size(plant, params))
+    sd = np.asarray(cramer_rao_bound(information)) * size
+    names, free = names_of(plant.definition.parameters), np.ones(len(size), bool)
+    unseen = worst_seen(names, np.asarray(information), free)
+        return {
+        "plant": plant.definition.name,
+        "initial_state": "known" if initial_state_known else "free",
+        "params": {
+            p.name: {
+                "value": float(value),
+                "std_error": float(s) if np.isfinite(s) else None,
+                "percent": float(100 * s / abs(value)) if np.isfinite(s) and value else None,
+                "unit": p.unit,
+            }
+            for p, value, s in zip(plant.definition.parameters, params, sd, strict=True)
+        },
+        "log_det_information": float(d_optimality(information)),
+        "a_optimality": float(a_optimality(information)),
+        "e_optimality": float(e_optimality(information)),
+        "information": np.asarray(information),
+        "verdict": [
+            unseen[1]
+            if unseen
+            else identifiability(names, np.linalg.inv(np.asarray(information)), free)
+        ],
+    }

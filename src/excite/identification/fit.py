@@ -1,0 +1,244 @@
+"""From recorded experiments to parameters with confidence: the everyday job."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ..description import PlantDescription, names_of
+from ..estimation import (
+    NLS,
+    AbstractEstimator,
+    Estimate,
+    Experiments,
+    Status,
+    search_slope,
+    stack_experiments,
+)
+from ..estimation.diagnosis import (
+    EXPLAINS_NOTHING,
+    fit_percent,
+    identifiability,
+    ljung_box,
+    robust_covariance,
+    worst_seen,
+)
+from ..plant import AbstractPlant, Params, params_from
+from ..records import Record
+from .base import Fitted, Identification
+
+InitialState = Literal["auto", "free", "known"]
+_WHITE = 0.01  # a residual is called coloured when whiteness is less probable
+
+
+def identify(
+    plant: AbstractPlant,
+    records: Sequence[Record],
+    estimator: AbstractEstimator | None = None,
+    *,
+    start: Mapping[str, float] | None = None,
+    initial_state: InitialState = "auto",
+    validation: Sequence[Record] = (),
+) -> Identification:
+    """Parameters of one plant from one or several records.
+
+    Args:
+        plant: its constants and sensor are taken as known; its dt gives way to the records'.
+        records: all with one sampling time.
+        estimator: default `NLS()`.
+        start: where the search begins, by name; default the nominal parameters.
+        initial_state: "known" (the plant's), "free" (estimated along), or "auto": known
+            where every sidecar says so.
+        validation: records for which only the initial state is fitted.
+
+    Raises:
+        ValueError: for records too short, of different sampling times, or in which no
+            parameter can be seen, and for a start that is not allowed.
+    """
+    estimator = NLS() if estimator is None else estimator
+    known = initial_state == "known" or (
+        initial_state == "auto" and all(_starts_at(record, plant) for record in records)
+    )
+    _check_lengths(plant, [*records, *validation], known)
+    plant = plant.changed(dt=_common_dt([*records, *validation]))
+    experiments = _experiments(plant, records, known)
+    fit = _fit(plant, experiments, estimator, params_from(plant, start or {}))
+    residual = _residuals(plant, records, experiments, fit)
+    fitted = tuple(_fitted(plant.definition, *pair) for pair in zip(records, residual, strict=True))
+    if fit.is_successful and isinstance(estimator, NLS):
+        _require_explanation(fitted)
+    whiteness = {
+        name: min(ljung_box(r[:, i]) for r in residual)
+        for i, name in enumerate(names_of(plant.definition.outputs))
+    }
+    covariance, verdict = _confidence(plant, experiments, estimator, fit, whiteness)
+    names, d = names_of(plant.definition.parameters), plant.description
+    sd = np.where(fit.free, np.sqrt(np.maximum(np.diag(covariance), 0.0)), np.nan)
+    return Identification(
+        plant=d,
+        estimator=estimator.name,
+        status=fit.status,
+        params={n: float(v) for n, v in zip(names, fit.estimate.params, strict=True)},
+        std_error={n: float(v) for n, v in zip(names, sd, strict=True)},
+        held=tuple(n for n, is_free in zip(names, fit.free, strict=True) if not is_free),
+        covariance=covariance,
+        information=np.asarray(fit.estimate.information),
+        whiteness=whiteness,
+        verdict=verdict,
+        fitted=fitted,
+        validation=tuple(_validated(plant, record, fit.estimate.params) for record in validation),
+        initial_state_known=known,
+    )
+
+
+def _starts_at(record: Record, plant: AbstractPlant) -> bool:
+    """Whether the sidecar says that the record starts at this plant's initial state."""
+    states = record.metadata.get("plant", {}).get("states", [])
+    initial = [s.get("initial") for s in states]
+    return record.starts_at_initial_state and initial == plant.initial_state.tolist()
+
+
+def _check_lengths(plant: AbstractPlant, records: Sequence[Record], known: bool) -> None:
+    d = plant.definition
+    unknowns = len(d.parameters) + (0 if known else len(d.states))
+    needed = max(10, -(-3 * unknowns // len(d.outputs)))
+    for record in records:
+        if len(record.time) < needed:
+            raise ValueError(
+                f"{record.source}: {len(record.time)} samples are too short a record; "
+                f"{needed} or more are needed for {unknowns} unknowns"
+            )
+
+
+def _common_dt(records: Sequence[Record]) -> float:
+    first = records[0]
+    for record in records[1:]:
+        if abs(record.dt - first.dt) > 1e-3 * first.dt:
+            raise ValueError(
+                f"{record.source} is sampled every {record.dt:g} s and {first.source} every "
+                f"{first.dt:g} s; records fitted together need one sampling time"
+            )
+    return first.dt
+
+
+def _experiments(plant: AbstractPlant, records: Sequence[Record], known: bool) -> Experiments:
+    inputs = [jnp.asarray(r.inputs[:-1]) for r in records]
+    return stack_experiments(plant, inputs, [jnp.asarray(r.outputs) for r in records], known)
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """An estimate, which parameters were free, and a sentence for each held one."""
+
+    estimate: Estimate
+    free: np.ndarray
+    reasons: tuple[str, ...]
+
+    @property
+    def is_successful(self) -> bool:
+        return int(self.estimate.status) == Status.SUCCESSFUL
+
+    @property
+    def status(self) -> str:
+        if self.is_successful and not self.free.all():
+            return "partly identifiable"
+        return Status(int(self.estimate.status)).sentence
+
+
+def _fit(
+    plant: AbstractPlant, experiments: Experiments, estimator: AbstractEstimator, start: Params
+) -> _Fit:
+    """Fits, and as long as the data cannot see a parameter, holds it and fits again."""
+    names = names_of(plant.definition.parameters)
+    free, reasons = np.ones(len(names), bool), ()
+    while True:
+        estimate = estimator(plant, experiments, start, jnp.asarray(free))
+        if not isinstance(estimator, NLS):  # ARX estimates all parameters or none
+            return _Fit(estimate, free, reasons)
+        unseen = worst_seen(names, np.asarray(estimate.information), free)
+        if unseen is None:
+            return _Fit(estimate, free, reasons)
+        chosen, why = unseen
+        free = free & (np.arange(len(names)) != chosen)
+        if not free.any():
+            raise ValueError(
+                f"no parameter can be seen in the data ({why}); the input must move the "
+                "plant, and the outputs must exceed the noise"
+            )
+        reasons = (*reasons, f"{why}; {names[chosen]} was held at {float(start[chosen]):g}")
+
+
+def _residuals(
+    plant: AbstractPlant, records: Sequence[Record], experiments: Experiments, fit: _Fit
+) -> list[Float[np.ndarray, "sample output"]]:
+    """Measured minus simulated outputs of each record, at its own length."""
+    estimate = fit.estimate
+    if fit.is_successful and not experiments.initial_state_known:
+        # An estimator that knows nothing of initial states (ARX) is judged fairly, too.
+        estimate = _with_initial_state(plant, experiments, estimate.params)
+    residual = np.asarray(estimate.residual)
+    return [residual[i, : len(record.time)] for i, record in enumerate(records)]
+
+
+def _with_initial_state(plant: AbstractPlant, experiments: Experiments, params: Params) -> Estimate:
+    """The best initial states for given parameters."""
+    return NLS()(plant, experiments, params, jnp.zeros(len(params), bool))
+
+
+def _confidence(
+    plant: AbstractPlant,
+    experiments: Experiments,
+    estimator: AbstractEstimator,
+    fit: _Fit,
+    whiteness: Mapping[str, float],
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Covariance of the estimates, and the verdict in words."""
+    covariance = np.asarray(fit.estimate.covariance)
+    if not fit.is_successful:
+        return covariance, fit.reasons
+    names = names_of(plant.definition.parameters)
+    slope = np.asarray(search_slope(plant.definition, fit.estimate.params))
+    remarks = ()
+    coloured = [name for name, p in whiteness.items() if p < _WHITE]
+    if coloured and isinstance(estimator, NLS):
+        S, residual = estimator.sensitivity(plant, experiments, fit.estimate, jnp.asarray(fit.free))
+        robust = robust_covariance(np.asarray(S), np.asarray(residual))
+        covariance = np.outer(slope, slope) * robust[: len(names), : len(names)]
+        remarks = ("the intervals are widened for that; noise or plant differ from the model",)
+    elif coloured:
+        remarks = ("the intervals assume that it is, and are too narrow",)
+    remarks = tuple(
+        f"the residual of {' and '.join(coloured)} is not white: {remark}" for remark in remarks
+    )
+    seen = identifiability(names, covariance / np.outer(slope, slope), fit.free)
+    return covariance, (*fit.reasons, seen, *remarks)
+
+
+def _fitted(description: PlantDescription, record: Record, residual: np.ndarray) -> Fitted:
+    simulated = record.outputs - residual
+    fits = {
+        name: fit_percent(record.outputs[:, i], simulated[:, i])
+        for i, name in enumerate(names_of(description.outputs))
+    }
+    return Fitted(record, simulated, fits)
+
+
+def _require_explanation(fitted: Sequence[Fitted]) -> None:
+    """Raises where the best simulation has nothing to do with the measured outputs."""
+    best = max(np.nan_to_num(percent) for f in fitted for percent in f.fit_percent.values())
+    if best < EXPLAINS_NOTHING:
+        raise ValueError(
+            f"no parameter can be seen in the data: the best simulation fits them by {best:.2g} %; "
+            "are the columns, their signs and units right, and does the plant move beyond noise?"
+        )
+
+
+def _validated(plant: AbstractPlant, record: Record, params: Params) -> Fitted:
+    """A record beside its simulation; only its initial state is fitted."""
+    estimate = _with_initial_state(plant, _experiments(plant, [record], False), params)
+    return _fitted(plant.definition, record, np.asarray(estimate.residual[0]))
