@@ -212,7 +212,6 @@ def identification_figure(
         time, measured, model = _thin(record.time, record.outputs[:, i], simulated[:, i])
         top.plot(time, factor * measured, color=GREY, lw=1.6, label="measured")
         top.plot(time, factor * model, color=BLUE, lw=1, label="simulated")
-        _draw_levels(top, part, measured)
         fit = result["fit_percent"][part.name]
         top.set(ylabel=_label(part), title=f"{part.name}: fit {number(fit, 4)} %")
         below.plot(time, factor * (measured - model), color=ORANGE, lw=0.8)

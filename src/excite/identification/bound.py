@@ -41,7 +41,7 @@ def best_possible(
     sd = np.asarray(cramer_rao_bound(information)) * size
     names, free = names_of(plant.definition.parameters), np.ones(len(size), bool)
     unseen = worst_seen(names, np.asarray(information), free)
-        return {
+    return {
         "plant": plant.definition.name,
         "initial_state": "known" if initial_state_known else "free",
         "params": {
