@@ -8,6 +8,7 @@ the estimator's.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from .description import PlantDescription, display_unit, names_of
-from .estimation import AbstractEstimator, Estimate, Status, stack_experiments
+from .estimation import AbstractEstimator, Status, stack_experiments
 from .excitation import AbstractExcitation
 from .information import cramer_rao_bound, experiment_information, relative_size
 from .plant import AbstractPlant, Params
@@ -95,13 +96,14 @@ def evaluate(
 @eqx.filter_jit
 def estimate_all(
     plant: AbstractPlant, estimator: AbstractEstimator, trajectory: Trajectory
-) -> tuple[Float[Array, "episode param"], Array]:
-    """Estimated parameters and status of every episode; initial states are known."""
+) -> tuple[Float[Array, "episode param"], Float[Array, "episode param"], Array]:
+    """Estimates, standard errors and status of every episode; initial states are known."""
 
-    def one(inputs: Array, measured: Array) -> tuple[Array, Array]:
+    def one(inputs: Array, measured: Array) -> tuple[Array, Array, Array]:
         data = stack_experiments(plant, [inputs], [measured], True)
-        estimate: Estimate = estimator(plant, data)
-        return jnp.stack(estimate.params), estimate.status
+        estimate = estimator(plant, data)
+        variance = jnp.diagonal(estimate.covariance)
+        return jnp.stack(estimate.params), jnp.sqrt(variance), estimate.status
 
     return jax.vmap(one)(trajectory.inputs, trajectory.measured)
 
@@ -112,8 +114,11 @@ class _Outcome:
 
     true: Float[np.ndarray, "episode param"]
     estimated: Float[np.ndarray, "episode param"]
+    std_error: Float[np.ndarray, "episode param"]
     status: np.ndarray
-    episodes: Mapping[str, np.ndarray]
+    is_violation: np.ndarray
+    max_abs_output: Float[np.ndarray, "episode output"]
+    bound: Float[np.ndarray, "episode param"]
 
 
 def run_benchmark(study: Study, progress: Progress = lambda *_: None) -> list[dict[str, Any]]:
@@ -139,26 +144,21 @@ def run_benchmark(study: Study, progress: Progress = lambda *_: None) -> list[di
 
 
 def _outcome(plant: AbstractPlant, estimator: AbstractEstimator, episodes: Episodes) -> _Outcome:
-    estimated, status = estimate_all(plant, estimator, episodes.trajectory)
+    estimated, std_error, status = estimate_all(plant, estimator, episodes.trajectory)
     return _Outcome(
         true=np.stack(episodes.params, axis=1),
         estimated=np.asarray(estimated),
+        std_error=np.asarray(std_error),
         status=np.asarray(status),
-        episodes={
-            "is_violation": np.asarray(episodes.is_violation),
-            "max_abs_output": np.asarray(episodes.max_abs_output),
-            "bound": np.asarray(episodes.bound),
-        },
+        is_violation=np.asarray(episodes.is_violation),
+        max_abs_output=np.asarray(episodes.max_abs_output),
+        bound=np.asarray(episodes.bound),
     )
 
 
 def _joined(parts: list[_Outcome]) -> _Outcome:
-    return _Outcome(
-        true=np.concatenate([p.true for p in parts]),
-        estimated=np.concatenate([p.estimated for p in parts]),
-        status=np.concatenate([p.status for p in parts]),
-        episodes={k: np.concatenate([p.episodes[k] for p in parts]) for k in parts[0].episodes},
-    )
+    names = [field.name for field in dataclasses.fields(_Outcome)]
+    return _Outcome(**{n: np.concatenate([getattr(p, n) for p in parts]) for n in names})
 
 
 def _row(
@@ -166,50 +166,59 @@ def _row(
 ) -> dict[str, Any]:
     """One row of the table; its keys are documented in the README."""
     good = outcome.status == Status.SUCCESSFUL
-    error = 100 * np.abs(outcome.estimated / outcome.true - 1)[good]
-    bound = 100 * outcome.episodes["bound"]
-    violations, count = int(outcome.episodes["is_violation"].sum()), len(good)
+    error = (outcome.estimated / outcome.true - 1)[good]
+    std_error = (outcome.std_error / np.abs(outcome.true))[good]
+    violations, count = int(outcome.is_violation.sum()), len(good)
     watched = watched_output(description)
     unit, factor = display_unit(description.outputs[watched].unit)
-    largest = factor * outcome.episodes["max_abs_output"][:, watched]
-    names = names_of(description.parameters)
+    reasons = [Status(s).name.lower() for s in outcome.status[~good]]
+
+    def by_name(values: Any) -> dict[str, Any]:
+        return dict(zip(names_of(description.parameters), values, strict=True))
+
     return {
         "method": method,
         "estimator": estimator,
         "evaluations": count,
         "failed": int(count - good.sum()),
-        "failures": {
-            Status(s).name.lower(): int(n)
-            for s, n in zip(*np.unique(outcome.status[~good], return_counts=True), strict=True)
-        },
+        "failures": {reason: reasons.count(reason) for reason in sorted(set(reasons))},
         "violations": violations,
         "violation_rate": {"estimate": violations / count, "ci95": wilson(violations, count)},
         "max_abs_output": {
             "output": description.outputs[watched].name,
-            **_mean_sd(largest),
+            **_mean_sd(factor * outcome.max_abs_output[:, watched]),
             "unit": unit,
         },
-        "relative_error_percent": {
-            n: {**_mean_sd(error[:, i]), **_median_rms(error[:, i])} for i, n in enumerate(names)
-        },
-        "cramer_rao_percent": {n: float(bound[:, i].mean()) for i, n in enumerate(names)},
+        "relative_error_percent": by_name(_error(100 * np.abs(e)) for e in error.T),
+        "cramer_rao_percent": by_name(100 * outcome.bound.mean(axis=0)),
+        "rms_over_cramer_rao": by_name(_rms(error) / _rms(outcome.bound[good])),
+        "coverage95_percent": by_name(100 * _fraction(np.abs(error) < 1.959964 * std_error)),
+        "beyond_6_std_errors": int(np.any(np.abs(error) > 6 * std_error, axis=1).sum()),
     }
+
+
+def _rms(values: Float[np.ndarray, "episode param"]) -> Float[np.ndarray, " param"]:
+    return np.sqrt(_fraction(values**2))
+
+
+def _fraction(values: np.ndarray) -> Float[np.ndarray, " param"]:
+    """Mean over episodes; not a number where no episode is left."""
+    return values.mean(axis=0) if len(values) else np.full(values.shape[1], np.nan)
 
 
 def _mean_sd(values: np.ndarray) -> dict[str, float]:
-    nothing = values.size == 0
     return {
-        "mean": math.nan if nothing else float(values.mean()),
-        "sd": math.nan if values.size < 2 else float(values.std(ddof=1)),
+        "mean": float(values.mean()) if values.size else math.nan,
+        "sd": float(values.std(ddof=1)) if values.size > 1 else math.nan,
     }
 
 
-def _median_rms(values: np.ndarray) -> dict[str, float]:
-    nothing = values.size == 0
-    return {
-        "median": math.nan if nothing else float(np.median(values)),
-        "rms": math.nan if nothing else float(np.sqrt(np.mean(values**2))),
-    }
+def _error(values: np.ndarray) -> dict[str, float]:
+    """Mean and standard deviation of errors, and what a few large ones do not move."""
+    if not values.size:
+        return {**_mean_sd(values), "median": math.nan, "rms": math.nan}
+    rms = float(np.sqrt(np.mean(values**2)))
+    return {**_mean_sd(values), "median": float(np.median(values)), "rms": rms}
 
 
 def wilson(successes: int, count: int) -> tuple[float, float]:
