@@ -164,7 +164,7 @@ def _joined(parts: list[_Outcome]) -> _Outcome:
 def _row(
     description: PlantDescription, method: str, estimator: str, outcome: _Outcome
 ) -> dict[str, Any]:
-    """One row of the table; its keys are documented in the README."""
+    """One row of the table; its keys are documented in docs/machine-readable.md."""
     good = outcome.status == Status.SUCCESSFUL
     error = (outcome.estimated / outcome.true - 1)[good]
     std_error = (outcome.std_error / np.abs(outcome.true))[good]
@@ -237,18 +237,21 @@ def wilson(successes: int, count: int) -> tuple[float, float]:
 def write_benchmark(
     study: Study,
     rows: list[dict[str, Any]],
-    tables: Mapping[str, str],
+    shown: Mapping[str, bytes],
     path: Path,
     overwrite: bool = False,
 ) -> None:
-    """Leaves a run folder: the study, its rows as JSON, and ready-made `tables` by file name.
+    """Leaves a run folder: the study, its rows as JSON, and what people look at.
+
+    Args:
+        shown: tables and figures, ready made, by file name.
 
     Raises:
         ValueError: where `path` holds something else, or a run and not `overwrite`.
     """
     with new_run_folder(path, overwrite) as folder:
-        for name, text in tables.items():
-            (folder / name).write_text(text, encoding="utf-8")
+        for name, content in shown.items():
+            (folder / name).write_bytes(content)
         write_json(folder / "table.json", {"rows": rows})
         plant = study.build_plant().description
         write_json(folder / "study.json", study.model_dump())

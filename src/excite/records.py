@@ -56,12 +56,17 @@ class Record:
 
     @classmethod
     def of_episode(
-        cls, time: Any, inputs: Any, outputs: Any, metadata: Mapping[str, Any] | None = None
+        cls,
+        time: Any,
+        inputs: Any,
+        outputs: Any,
+        metadata: Mapping[str, Any] | None = None,
+        source: str = "",
     ) -> Record:
         """A record of T + 1 samples from T inputs; its last row goes on holding the last."""
         inputs = np.asarray(inputs)
         held = np.concatenate([inputs, inputs[-1:]])
-        return cls(np.asarray(time), held, np.asarray(outputs), metadata or {})
+        return cls(np.asarray(time), held, np.asarray(outputs), metadata or {}, source)
 
     @property
     def dt(self) -> float:

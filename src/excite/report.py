@@ -147,10 +147,15 @@ def require_plot_path(path: Path) -> None:
 
 def save(figure: matplotlib.figure.Figure, path: Path) -> None:
     """Writes a figure, whole or not at all."""
+    write_bytes(path, image(figure, path.suffix[1:].lower()))
+
+
+def image(figure: matplotlib.figure.Figure, kind: str) -> bytes:
+    """A figure as the content of a file of this kind: png, svg or pdf."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format=path.suffix[1:].lower(), dpi=150)
+    figure.savefig(buffer, format=kind, dpi=150)
     plt.close(figure)
-    write_bytes(path, buffer.getvalue())
+    return buffer.getvalue()
 
 
 def _figure(rows: int, columns: int = 1, height: float = 2.2, width: float = 8.0) -> tuple:

@@ -40,6 +40,7 @@ def benchmark(
         benchmark_figure,
         benchmark_markdown,
         footnotes,
+        image,
         save,
         table_header,
     )
@@ -55,11 +56,12 @@ def benchmark(
     if plot is not None:
         save(benchmark_figure(rows, title), plot)
     if out is not None:
-        tables = {
-            "table.md": benchmark_markdown(rows, settings),
-            "table.csv": benchmark_csv(rows),
+        shown = {
+            "table.md": benchmark_markdown(rows, settings).encode(),
+            "table.csv": benchmark_csv(rows).encode(),
+            "errors.png": image(benchmark_figure(rows, title), "png"),
         }
-        write_benchmark(chosen, rows, tables, out, overwrite)
+        write_benchmark(chosen, rows, shown, out, overwrite)
     if as_json:
         show_json({"rows": rows})
         return

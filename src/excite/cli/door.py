@@ -129,12 +129,13 @@ def show_json(value: Any) -> None:
 
 
 def show_table(title: str, header: list[str], rows: Iterable[list[str]]) -> None:
-    """A table on stdout, as wide as its content where it is not a terminal."""
+    """A line and a table on stdout, as wide as its content where it is not a terminal."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+    click.echo(title)  # not the table's own title, which is broken to the table's width
+    table = Table(box=SIMPLE_HEAD, pad_edge=False)
     for i, name in enumerate(header):
         table.add_column(name, justify="left" if i == 0 else "right", overflow="fold")
     for row in rows:

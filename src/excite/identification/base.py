@@ -83,7 +83,7 @@ class Identification:
         return {n: fit_percent(measured[:, i], simulated[:, i]) for i, n in enumerate(outputs)}
 
     def to_dict(self) -> dict[str, Any]:
-        """The result as JSON-ready data; its keys are documented in the README."""
+        """The result as JSON-ready data; its keys are documented in docs/machine-readable.md."""
         return {
             "plant": self.plant.name,
             "plant_hash": self.plant.hash,

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from ..description import names_of
 from ..estimation.diagnosis import identifiability, worst_seen
@@ -24,7 +23,7 @@ from ..plant import AbstractPlant, Params
 def best_possible(
     plant: AbstractPlant,
     params: Params,
-    inputs: Float[np.ndarray, "time input"],
+    inputs: Float[Array, "time input"],
     *,
     initial_state_known: bool,
 ) -> dict[str, Any]:
@@ -36,7 +35,7 @@ def best_possible(
     if not np.all(np.asarray(plant.sensor.sd) > 0):
         raise ValueError("a sensor without noise sets no bound; give every output a noise")
     state = None if initial_state_known else plant.initial_state
-    information = experiment_information(plant, params, jnp.asarray(inputs), state)
+    information = experiment_information(plant, params, inputs, state)
     size = np.asarray(relative_size(plant, params))
     sd = np.asarray(cramer_rao_bound(information)) * size
     names, free = names_of(plant.definition.parameters), np.ones(len(size), bool)

@@ -18,7 +18,7 @@ import math
 from collections import namedtuple
 from collections.abc import Mapping
 from functools import cache
-from typing import Any, ClassVar, Self, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -48,7 +48,15 @@ class Sensor(eqx.Module):
         return jnp.sqrt(self.noise_sd**2 + self.resolution**2 / 12)
 
 
-class AbstractPlant(eqx.Module):
+if TYPE_CHECKING:
+    # Equinox tells type checkers that every class has a dataclass's constructor of its own;
+    # all plants inherit the one below.
+    class _Module: ...
+else:
+    _Module = eqx.Module
+
+
+class AbstractPlant(_Module):
     """Base of all plants.
 
     Attributes:

@@ -1,0 +1,104 @@
+"""Commands, options, files and examples that the documentation shows exist and run."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import click
+import pytest
+
+from excite.cli import cli
+from excite.study import ESTIMATORS, EXCITATIONS, PLANTS, read_study
+
+ROOT = Path(__file__).parent.parent
+README = (ROOT / "README.md").read_text()
+PAGES = [ROOT / "README.md", *sorted(ROOT.glob("*/README.md")), *sorted(ROOT.glob("docs/*.md"))]
+
+
+def shell(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """Runs a command with this environment's `excite` first on the path."""
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    return subprocess.run(
+        ["sh", "-ec", command], cwd=folder, env={**os.environ, "PATH": path},
+        capture_output=True, text=True, timeout=300, check=False,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("name", cli.commands)
+def test_every_command_and_option_is_in_the_readme(name: str):
+    row = next(line for line in README.splitlines() if line.startswith(f"| `excite {name}"))
+    for option in cli.commands[name].params:
+        if isinstance(option, click.Option) and option.name not in ("as_json", "plot"):
+            shown = option.opts[0] in row or name == "information"
+            assert shown, f"{option.opts[0]} of {name} is not in the README's table"
+
+
+def test_names_on_the_command_line_are_in_the_readme():
+    for name in (*EXCITATIONS, *ESTIMATORS):
+        assert f"`{name}`" in README
+    for name in PLANTS:
+        assert f"`{name}`" in README
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_links_lead_somewhere(page: Path):
+    for target in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
+        if not target.startswith("http"):
+            assert (page.parent / target).exists(), f"{page}: {target}"
+
+
+def test_every_study_loads_and_stands_in_the_index_with_its_result():
+    index = (ROOT / "studies" / "README.md").read_text()
+    for path in sorted((ROOT / "studies").glob("*.toml")):
+        assert read_study(path).name == path.stem
+        assert f"`{path.name}`" in index
+        assert (ROOT / "results" / path.stem / "table.json").is_file()
+
+
+def test_the_readme_table_holds_the_committed_results():
+    committed = (ROOT / "results" / "baselines" / "table.md").read_text()
+    for line in committed.splitlines():
+        if line.startswith("|") and "arx-rls |" in line:
+            damping = line.split("|")[7].strip()
+            assert damping in README
+
+
+def test_the_quick_start_runs(tmp_path: Path):
+    block = next(b for b in re.findall(r"```sh\n(.*?)```", README, re.S) if "excite plants" in b)
+    run = shell(block, tmp_path)
+    assert run.returncode == 0, run.stderr
+    assert "successful" in run.stdout
+    python = re.findall(r"```python\n(.*?)```", README, re.S)[0]
+    run = subprocess.run(
+        [sys.executable, "-c", python], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert run.returncode == 0, run.stderr
+    assert "J_p" in run.stdout
+
+
+def test_the_commands_before_an_experiment_run(tmp_path: Path):
+    shutil.copytree(ROOT / "examples", tmp_path / "examples")
+    blocks = re.findall(r"```sh\n(.*?)```", README, re.S)
+    before = next(b for b in blocks if "excite information aero2 --" in b)
+    run = shell("excite simulate aero2 --out record.csv\n" + before, tmp_path)
+    assert run.returncode == 0, run.stderr
+    assert (tmp_path / "response.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "examples").glob("0*")), ids=lambda p: p.name)
+def test_examples_run(path: Path, tmp_path: Path):
+    program = sys.executable if path.suffix == ".py" else "sh"
+    run = shell(f"{program} {path}", tmp_path)
+    assert run.returncode == 0, run.stderr
+
+
+def test_the_example_plant_is_short_and_goes_through_in_under_ten_lines_of_shell():
+    plant = (ROOT / "examples" / "flexible_drive.py").read_text()
+    assert len(plant[plant.index("class ") :].splitlines()) <= 40
+    script = (ROOT / "examples" / "01_own_plant.sh").read_text()
+    for command in ("simulate", "information", "identify"):
+        assert f"excite {command} " in script
+    assert len(script.splitlines()) < 10
