@@ -162,6 +162,12 @@ def _read_csv(path: Path) -> dict[str, np.ndarray | list[str]]:
     lines = text.splitlines()
     if not lines:
         raise ValueError(f"{path}: the file is empty")
+    if not text.endswith(("\n", "\r")):
+        # A number cut in half is still a number: only the line's end shows that it is whole.
+        raise ValueError(
+            f"{path}: line {len(lines)} does not end with a line break; is the file truncated? "
+            "(add one if it is complete)"
+        )
     delimiter = next((d for d in (",", ";", "\t") if d in lines[0]), ",")
     rows = list(csv.reader(lines, delimiter=delimiter))
     header = [name.strip() for name in rows[0]]
@@ -249,14 +255,14 @@ def _check_size(values: np.ndarray, part: Input | Output, path: Path) -> None:
         middle, half = (part.upper + part.lower) / 2, (part.upper - part.lower) / 2
         worst = values[np.argmax(np.abs(values - middle))]
         excess, allowed = abs(worst - middle) / half, _TIMES_LIMIT
-        expected = f"the plant's limits are {part.lower:g} to {part.upper:g}"
+        expected = f"the plant's limits are {part.lower:g} to {part.upper:g} {part.unit}"
     else:
         worst = values[np.argmax(np.abs(values))]
         excess, allowed = abs(worst) / part.scale, _TIMES_SCALE
-        expected = f"around {part.scale:g} is usual"
+        expected = f"a usual size is {part.scale:g} {part.unit}"
     if excess > allowed:
         raise ValueError(
-            f"{path}: {part.name!r} reaches {worst:g} {part.unit} and {expected} {part.unit}; "
+            f"{path}: {part.name!r} reaches {worst:g} {part.unit}, {expected}; "
             f"is it in another unit? (a factor is given with --scale {part.name}=FACTOR)"
         )
 

@@ -100,7 +100,7 @@ def with_sensor(
     for what, given in (("noise", noise_sd), ("resolution", resolution)):
         for name, value in given.items():
             if name not in outputs:
-                raise _unknown(f"output of plant {plant.definition.name!r}", name, outputs)
+                raise _unknown(f"{plant.definition.name} output", name, outputs)
             if not (math.isfinite(value) and value >= 0):
                 raise ValueError(f"{what} of {name!r} must be zero or positive: got {value:g}")
             numbers[what][outputs.index(name)] = value
@@ -159,7 +159,7 @@ def _build(kind: type, name: str, options: Mapping[str, Any]) -> Any:
     fields = {f.name: f for f in dataclasses.fields(kind)}
     for option, value in options.items():
         if option not in fields:
-            raise _unknown(f"option of {name!r}", option, fields)
+            raise _unknown(f"{name} option", option, fields)
         expected = {"bool": bool, "int": int}.get(str(fields[option].type), (int, float, list))
         is_wrong = not isinstance(value, expected) or (
             isinstance(value, bool) and expected is not bool
@@ -368,8 +368,8 @@ def _study(content: Mapping[str, Any], where: str) -> Study:
 
 
 def _sentence(error: pydantic.ValidationError) -> str:
-    """The first of pydantic's complaints as one sentence."""
-    first = error.errors()[0]
+    """One of pydantic's complaints as a sentence: a mistyped key before the one it misses."""
+    first = min(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
     location = ".".join(str(part) for part in first["loc"])
     if first["type"] == "extra_forbidden":
         model = {"sensor": SensorSettings, "reference": ReferenceRow}.get(

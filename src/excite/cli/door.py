@@ -6,6 +6,7 @@ import contextlib
 import functools
 import json
 import os
+import re
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -28,7 +29,7 @@ class Assignments(click.ParamType):
         if isinstance(value, dict):
             return value
         result = {}
-        for pair in value.split(","):
+        for pair in re.split(r",(?![^\[]*\])", value):  # not at the commas of a list
             name, equals, text = (part.strip() for part in pair.partition("="))
             if not (name and equals and text):
                 self.fail(f"{pair!r} is not of the form NAME=VALUE", param, ctx)

@@ -38,8 +38,6 @@ def best_possible(
     information = experiment_information(plant, params, inputs, state)
     size = np.asarray(relative_size(plant, params))
     sd = np.asarray(cramer_rao_bound(information)) * size
-    names, free = names_of(plant.definition.parameters), np.ones(len(size), bool)
-    unseen = worst_seen(names, np.asarray(information), free)
     return {
         "plant": plant.definition.name,
         "initial_state": "known" if initial_state_known else "free",
@@ -56,9 +54,17 @@ def best_possible(
         "a_optimality": float(a_optimality(information)),
         "e_optimality": float(e_optimality(information)),
         "information": np.asarray(information),
-        "verdict": [
-            unseen[1]
-            if unseen
-            else identifiability(names, np.linalg.inv(np.asarray(information)), free)
-        ],
+        "verdict": _verdict(names_of(plant.definition.parameters), np.asarray(information)),
     }
+
+
+def _verdict(names: tuple[str, ...], information: np.ndarray) -> list[str]:
+    """What cannot be seen, one sentence each, and how well the rest is."""
+    free, sentences = np.ones(len(names), bool), []
+    while (unseen := worst_seen(names, information, free)) is not None:
+        free[unseen[0]] = False
+        sentences.append(unseen[1])
+    if free.any():
+        block = np.where(np.outer(free, free), information, np.eye(len(names)))
+        sentences.append(identifiability(names, np.linalg.inv(block), free))
+    return sentences
