@@ -201,3 +201,15 @@ def search_slope(description: PlantDescription, params: Params) -> Float[Array, 
     """Derivative of each parameter with respect to its own search coordinate."""
     z = to_search(description, params)
     return jnp.diagonal(jax.jacfwd(lambda z: from_search(description, z))(z))
+
+
+def bound_reached(description: PlantDescription, params: Params) -> tuple[int, float] | None:
+    """Index and bound of the first parameter that ended at one; None where none did."""
+    for i, (p, value) in enumerate(zip(description.parameters, params, strict=True)):
+        for bound, other in ((p.lower, p.upper), (p.upper, p.lower)):
+            if bound is None:
+                continue
+            width = p.scale if other is None else abs(other - bound)
+            if abs(float(value) - bound) < 1e-3 * width:
+                return i, bound
+    return None

@@ -92,11 +92,8 @@ def worst_seen(
     if index.size == 0:
         return None
     block = information[np.ix_(index, index)]
-    if np.all(np.isfinite(block)):
-        values, vectors = np.linalg.eigh(block)
-        value, direction = max(values[0], 0.0), vectors[:, 0]
-    else:
-        value, direction = 0.0, np.ones(index.size)
+    values, vectors = np.linalg.eigh(block)
+    value, direction = max(values[0], 0.0), vectors[:, 0]
     if value * UNSEEN_SD**2 >= 1:
         return None
     chosen = index[np.argmax(np.abs(direction))]

@@ -80,9 +80,10 @@ class NLS(AbstractEstimator):
         """
         problem = _Problem(plant, experiments, estimate.params, free)
         unknowns = problem.with_initial_state(estimate.initial_state)
-        sd = problem.noise_sd(unknowns)
+        residual = problem.residual(unknowns)
+        sd = problem.noise_sd(residual)
         S = -jax.jacfwd(problem.residual)(unknowns) / sd[None, None, :, None]
-        return S, problem.residual(unknowns) / sd[None, None]
+        return S, residual / sd[None, None]
 
     def _search(self, problem: _Problem) -> tuple[Array, Bool[Array, ""]]:
         """Unknowns at the minimum, and whether the last search converged."""
@@ -108,7 +109,7 @@ class NLS(AbstractEstimator):
             )
             if problem.num_outputs > 1:
                 complete = horizon >= samples
-                sd = jnp.where(complete, problem.noise_sd(solution.value), sd)
+                sd = jnp.where(complete, problem.noise_sd(problem.residual(solution.value)), sd)
             return (solution.value, sd), solution.result == optx.RESULTS.successful
 
         start = problem.with_initial_state(problem.experiments.initial_state), problem.assumed_sd
@@ -192,13 +193,13 @@ class _Problem(eqx.Module):
         )
         return residual_of(self.experiments, simulated)
 
-    def noise_sd(self, unknowns: Array) -> Array:
+    def noise_sd(self, residual: Array) -> Array:
         """Standard deviation of each output's residual, for the unknowns spent on it."""
-        count = jnp.sum(self.experiments.valid)
-        spent = (jnp.sum(self.free) + len(unknowns) - len(self.start)) / self.num_outputs
-        squares = jnp.sum(self.residual(unknowns) ** 2, axis=(0, 1))
+        num_states = 0 if self.experiments.initial_state_known else self._state_scales.size
+        spent = jnp.sum(self.free) + num_states * residual.shape[0]
+        count = jnp.sum(self.experiments.valid) - spent / self.num_outputs
+        sd = jnp.sqrt(jnp.sum(residual**2, axis=(0, 1)) / jnp.maximum(count, 1.0))
         scales = jnp.asarray([o.scale for o in self.plant.definition.outputs])
-        sd = jnp.sqrt(squares / jnp.maximum(count - spent, 1.0))
         return jnp.maximum(sd, 1e-9 * scales)  # noise-free data keep a finite weight
 
     def estimate(self, unknowns: Array, converged: Array) -> Estimate:
@@ -206,7 +207,7 @@ class _Problem(eqx.Module):
         num_params = len(self.start)
         residual = self.residual(unknowns)
         S = jax.jacfwd(self.residual)(unknowns).reshape(-1, self.num_outputs, len(unknowns))
-        information = marginal_information(S, self.noise_sd(unknowns), num_params)
+        information = marginal_information(S, self.noise_sd(residual), num_params)
         active = jnp.outer(self.free, self.free)
         information = jnp.where(active, information, 0.0)
         held = jnp.diag(jnp.where(self.free, 0.0, 1.0))
@@ -217,14 +218,15 @@ class _Problem(eqx.Module):
             params=self.plant.Params(*params),
             covariance=in_search * jnp.outer(slope, slope),
             information=information,
-            status=_status(params, in_search, converged),
+            status=_status(params, residual, in_search, converged),
             initial_state=self.initial_state(unknowns),
             residual=residual,
         )
 
 
-def _status(params: Array, covariance: Array, converged: Array) -> Array:
+def _status(params: Array, residual: Array, covariance: Array, converged: Array) -> Array:
+    finite = jnp.all(jnp.isfinite(params)) & jnp.all(jnp.isfinite(residual))
     seen = jnp.all(jnp.isfinite(covariance)) & jnp.all(jnp.diagonal(covariance) >= 0)
     status = jnp.where(converged, Status.SUCCESSFUL, Status.ITERATIONS_EXHAUSTED)
     status = jnp.where(seen, status, Status.ILL_CONDITIONED)
-    return jnp.where(jnp.all(jnp.isfinite(params)), status, Status.NOT_FINITE)
+    return jnp.where(finite, status, Status.NOT_FINITE)

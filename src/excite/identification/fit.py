@@ -17,6 +17,7 @@ from ..estimation import (
     Estimate,
     Experiments,
     Status,
+    bound_reached,
     search_slope,
     stack_experiments,
 )
@@ -68,7 +69,7 @@ def identify(
     plant = plant.changed(dt=_common_dt([*records, *validation]))
     experiments = _experiments(plant, records, known)
     fit = _fit(plant, experiments, estimator, params_from(plant, start or {}))
-    residual = _residuals(plant, records, experiments, fit)
+    residual = _residuals(plant, records, experiments, estimator, fit)
     fitted = tuple(_fitted(plant.definition, *pair) for pair in zip(records, residual, strict=True))
     if fit.is_successful and isinstance(estimator, NLS):
         _require_explanation(fitted)
@@ -153,33 +154,54 @@ class _Fit:
 def _fit(
     plant: AbstractPlant, experiments: Experiments, estimator: AbstractEstimator, start: Params
 ) -> _Fit:
-    """Fits, and as long as the data cannot see a parameter, holds it and fits again."""
+    """Fits; holds what ends at a bound or cannot be seen, and fits again."""
     names = names_of(plant.definition.parameters)
     free, reasons = np.ones(len(names), bool), ()
     while True:
         estimate = estimator(plant, experiments, start, jnp.asarray(free))
-        if not isinstance(estimator, NLS):  # ARX estimates all parameters or none
-            return _Fit(estimate, free, reasons)
-        unseen = worst_seen(names, np.asarray(estimate.information), free)
-        if unseen is None:
-            return _Fit(estimate, free, reasons)
-        chosen, why = unseen
+        fit = _Fit(estimate, free, reasons)
+        # ARX estimates all parameters or none.
+        if not isinstance(estimator, NLS) or estimate.status == Status.NOT_FINITE:
+            return fit
+        held = _to_hold(plant, fit, start)
+        if held is None:
+            return fit
+        chosen, value, why = held
+        start = start._replace(**{names[chosen]: jnp.asarray(value)})
         free = free & (np.arange(len(names)) != chosen)
+        reasons = (*reasons, why)
         if not free.any():
             raise ValueError(
                 f"no parameter can be seen in the data ({why}); the input must move the "
                 "plant, and the outputs must exceed the noise"
             )
-        reasons = (*reasons, f"{why}; {names[chosen]} was held at {float(start[chosen]):g}")
+
+
+def _to_hold(plant: AbstractPlant, fit: _Fit, start: Params) -> tuple[int, float, str] | None:
+    """The parameter to hold next, its value, and why in words; None where all is well."""
+    names = names_of(plant.definition.parameters)
+    reached = bound_reached(plant.definition, fit.estimate.params)
+    if reached is not None and fit.free[reached[0]]:
+        name, value = names[reached[0]], float(fit.estimate.params[reached[0]])
+        return reached[0], value, f"{name} ended at its bound {reached[1]:g} and was held there"
+    unseen = worst_seen(names, np.asarray(fit.estimate.information), fit.free)
+    if unseen is None:
+        return None
+    value = float(start[unseen[0]])
+    return unseen[0], value, f"{unseen[1]}; {names[unseen[0]]} was held at {value:g}"
 
 
 def _residuals(
-    plant: AbstractPlant, records: Sequence[Record], experiments: Experiments, fit: _Fit
+    plant: AbstractPlant,
+    records: Sequence[Record],
+    experiments: Experiments,
+    estimator: AbstractEstimator,
+    fit: _Fit,
 ) -> list[Float[np.ndarray, "sample output"]]:
     """Measured minus simulated outputs of each record, at its own length."""
     estimate = fit.estimate
-    if fit.is_successful and not experiments.initial_state_known:
-        # An estimator that knows nothing of initial states (ARX) is judged fairly, too.
+    knows_state = experiments.initial_state_known or isinstance(estimator, NLS)
+    if fit.is_successful and not knows_state:  # judge ARX fairly, too
         estimate = _with_initial_state(plant, experiments, estimate.params)
     residual = np.asarray(estimate.residual)
     return [residual[i, : len(record.time)] for i, record in enumerate(records)]
