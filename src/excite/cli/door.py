@@ -83,9 +83,7 @@ def computing(command: Callable[..., Any]) -> Callable[..., Any]:
         import jax
 
         jax.config.update("jax_enable_x64", True)
-        jax.config.update("jax_compilation_cache_dir", str(cache_folder()))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
-        jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+        _keep_compiled_programs(jax)
         plot = kwargs.get("plot")
         if plot is not None:
             from ..report import require_plot_path
@@ -94,6 +92,18 @@ def computing(command: Callable[..., Any]) -> Callable[..., Any]:
         return command(*args, **kwargs)
 
     return wrapped
+
+
+def _keep_compiled_programs(jax: Any) -> None:
+    folder = cache_folder()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:  # a home that cannot be written to makes commands slower, not wrong
+        return
+    if os.access(folder, os.W_OK):
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+        jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
 
 
 def cache_folder() -> Path:
