@@ -10,9 +10,8 @@ import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 from peers import pitch_by_samples, pitch_in_one_call, seconds  # noqa: E402
 
-from excite.benchmark import draw_params  # noqa: E402
 from excite.excitation import PRBS  # noqa: E402
-from excite.plant import Aero2  # noqa: E402
+from excite.plant import Aero2, draw_params  # noqa: E402
 from excite.simulation import simulate  # noqa: E402
 
 BATCH, STEPS = 1000, 500

@@ -25,7 +25,7 @@ from .description import PlantDescription, display_unit, names_of
 from .estimation import AbstractEstimator, Status, stack_experiments
 from .excitation import AbstractExcitation
 from .information import cramer_rao_bound, experiment_information, relative_size
-from .plant import AbstractPlant, Params
+from .plant import AbstractPlant, Params, draw_params
 from .records import new_run_folder, write_json
 from .safety import critical_levels, is_violation, max_abs_output, watched_output
 from .simulation import Trajectory, run_episode
@@ -54,15 +54,6 @@ class Episodes(eqx.Module):
     is_violation: Array
     max_abs_output: Float[Array, "episode output"]
     bound: Float[Array, "episode param"]
-
-
-def draw_params(plant: AbstractPlant, key: PRNGKeyArray, spread: float) -> Params:
-    """True parameters of one episode: uniform, nominal value ± spread times its scale."""
-    unit = jax.random.uniform(key, (len(plant.nominal),), float, -1.0, 1.0)
-    scales = [p.scale for p in plant.definition.parameters]
-    return plant.Params(
-        *(n + spread * s * u for n, s, u in zip(plant.nominal, scales, unit, strict=True))
-    )
 
 
 @eqx.filter_jit

@@ -85,7 +85,7 @@ def _scaled(unit: Sequence, plant: AbstractPlant, amplitude: Array | None) -> Se
     return jnp.clip(middle[None] + amplitude[None] * unit, lower[None], upper[None])
 
 
-def _hold(values: Sequence, num_steps: int, samples: int) -> Sequence:
+def _hold(values: Float[Array, "block input"], num_steps: int, samples: int) -> Sequence:
     return jnp.repeat(values, samples, axis=0)[:num_steps]
 
 
@@ -195,7 +195,8 @@ class Chirp(AbstractSignal):
         time = jnp.arange(num_steps) * plant.dt
         if self.logarithmic:
             rate = jnp.log(high / low) / duration
-            cycles = low * jnp.expm1(rate * time) / rate
+            growth = jnp.expm1(rate * time) / jnp.where(rate == 0, 1.0, rate)
+            cycles = low * jnp.where(rate == 0, time, growth)
         else:
             cycles = low * time + (high - low) * time**2 / (2 * duration)
         num_inputs = len(plant.definition.inputs)
@@ -290,4 +291,5 @@ class Replay(AbstractSignal):
 def crest_factor(sequence: Sequence) -> Float[Array, " input"]:
     """Peak over root mean square of each input; infinite for an input that is zero."""
     peak = jnp.max(jnp.abs(sequence), axis=0)
-    return peak / jnp.sqrt(jnp.mean(sequence**2, axis=0))
+    rms = jnp.sqrt(jnp.mean(sequence**2, axis=0))
+    return jnp.where(rms > 0, peak / jnp.where(rms > 0, rms, 1.0), jnp.inf)

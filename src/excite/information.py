@@ -72,30 +72,29 @@ def experiment_information(
     plant: AbstractPlant,
     params: Params,
     inputs: Float[Array, "time input"],
-    initial_state: Float[Array, " state"] | None = None,
+    *,
+    initial_state_known: bool = True,
 ) -> Information:
     """Relative Fisher information of an experiment with these inputs and this plant's sensor.
 
     In logarithms of positive parameters, and of free ones over their scale.
 
     Args:
-        initial_state: where it starts, if that is unknown too and must be estimated
-            along; left out, the plant starts at its known initial state.
+        initial_state_known: False where the initial state must be estimated along; the
+            experiment starts at the plant's in either case.
     """
     require_double_precision()
     theta = jnp.stack([jnp.asarray(p, float) for p in params])
-    start = plant.initial_state if initial_state is None else initial_state
-    num_params = len(theta)
-    size = relative_size(plant, params)
+    size, num_params = relative_size(plant, params), len(theta)
+    num_states = 0 if initial_state_known else len(plant.initial_state)
 
-    def response(unknowns: Array) -> Array:
-        values = theta + size * unknowns[:num_params]
-        state = start + unknowns[num_params:] if initial_state is not None else start
-        return simulate(plant, plant.Params(*values), inputs, state)
+    def response(change: Array) -> Array:
+        values = theta + size * change[:num_params]
+        moved = change[num_params:] if num_states else 0.0
+        return simulate(plant, plant.Params(*values), inputs, plant.initial_state + moved)
 
-    count = num_params + (0 if initial_state is None else len(start))
-    S = sensitivity(response, jnp.zeros(count))
-    if initial_state is None:
+    S = sensitivity(response, jnp.zeros(num_params + num_states))
+    if initial_state_known:
         return fisher_information(S, plant.sensor.sd)
     return marginal_information(S, plant.sensor.sd, num_params)
 
@@ -131,7 +130,8 @@ def cramer_rao_bound(information: Information) -> Float[Array, " param"]:
     # Scaling to a unit diagonal first: parameters may differ by many orders of magnitude.
     size = jnp.sqrt(jnp.diagonal(information))
     safe = jnp.where(size > 0, size, 1.0)
-    correlation = information / jnp.outer(safe, safe)
-    variance = jnp.diagonal(jnp.linalg.inv(correlation)) / safe**2
-    seen = (size > 0) & (variance > 0) & jnp.isfinite(variance)
-    return jnp.sqrt(jnp.where(seen, variance, jnp.inf))
+    values, vectors = jnp.linalg.eigh(information / jnp.outer(safe, safe))
+    unseen = values < 10 * len(size) * jnp.finfo(values.dtype).eps
+    variance = jnp.sum(vectors**2 / jnp.where(unseen, 1.0, values)[None], axis=1) / safe**2
+    lost = jnp.any(unseen[None] & (jnp.abs(vectors) > 1e-6), axis=1)
+    return jnp.where(lost | (size == 0), jnp.inf, jnp.sqrt(variance))

@@ -123,7 +123,8 @@ def read_record(
                 f"{path}: {part.name!r} has {len(parts[part.name])} samples, 'time' {len(time)}"
             )
         _check_finite(parts[part.name], part.name, path)
-        _check_size(parts[part.name], part, path)
+        if scales.get(part.name) != 1:  # a factor of one says that the unit is right
+            _check_size(parts[part.name], part, path)
     chosen = [parts[n] for n in names_of(outputs)]
     return Record(
         time=time,
@@ -147,11 +148,16 @@ def _require_record_ending(path: Path) -> None:
         raise ValueError(f"{path}: experiment files end in .csv or .mat")
 
 
-def require_record_path(path: Path) -> None:
-    """Raises ValueError, before anything is computed, where no record can be written."""
+def require_record_path(path: Path, overwrite: bool) -> None:
+    """Raises ValueError, before anything is computed, where no record may be written."""
     _require_record_ending(path)
     if not path.parent.is_dir():
         raise ValueError(f"{path}: the folder {path.parent} does not exist")
+    sidecar = path.with_suffix(".json")
+    if sidecar.is_file() and not _read_sidecar(path):
+        raise ValueError(f"{sidecar} is no sidecar of a record and would be lost; rename one")
+    if path.exists() and not overwrite:
+        raise ValueError(f"{path} exists; choose another name or add --overwrite")
 
 
 def _read_csv(path: Path) -> dict[str, np.ndarray | list[str]]:
@@ -263,7 +269,7 @@ def _check_size(values: np.ndarray, part: Input | Output, path: Path) -> None:
     if excess > allowed:
         raise ValueError(
             f"{path}: {part.name!r} reaches {worst:g} {part.unit}, {expected}; "
-            f"is it in another unit? (a factor is given with --scale {part.name}=FACTOR)"
+            f"is it in another unit? (--scale {part.name}=FACTOR; 1 says that the unit is right)"
         )
 
 
@@ -289,7 +295,7 @@ def write_record(
         ValueError: for another ending, or a folder that does not exist.
     """
     path = Path(path)
-    require_record_path(path)
+    require_record_path(path, overwrite=True)
     columns = dict(
         zip(
             description.columns,
@@ -302,11 +308,12 @@ def write_record(
         scipy.io.savemat(buffer, {name: values[:, None] for name, values in columns.items()})
     else:
         buffer.write(csv_text(columns).encode())
+    # What an earlier sidecar says of the record's origin outlives later uses of it.
     sidecar = {
-        **record.metadata,
-        "kind": RECORD_KIND,
         "plant": description.to_dict(),
         "plant_hash": description.hash,
+        **record.metadata,
+        "kind": RECORD_KIND,
         "dt": record.dt,
     }
     # The sidecar first: a record without one would be read as one of unknown start.

@@ -293,10 +293,10 @@ def information_figure(
         axes[i, 0].set(ylabel=_label(part))
     axes[len(inputs) - 1, 0].set(xlabel="time [s]")
     axis, finite = axes[-1, 0], {n: v for n, v in percent.items() if v is not None}
-    axis.barh(list(finite), list(finite.values()), color=BLUE)
+    axis.plot(list(finite.values()), list(finite), "o", color=BLUE, ms=8)
     for i, value in enumerate(finite.values()):
         axis.annotate(
-            f"{number(value)} %", (value, i), (4, 0), textcoords="offset points", va="center"
+            f"{number(value)} %", (value, i), (8, 0), textcoords="offset points", va="center"
         )
     axis.set(
         xlabel="least standard deviation (Cramér-Rao) [%]", xscale="log" if finite else "linear"

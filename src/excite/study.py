@@ -16,6 +16,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
+import jax
 import jax.numpy as jnp
 import pydantic
 import tomlkit
@@ -50,7 +51,7 @@ EXCITATIONS: Mapping[str, type[AbstractExcitation]] = {
 }
 ESTIMATORS: Mapping[str, AbstractEstimator] = {
     "arx-rls": ARX(),
-    "arx-rls-wide": ARX(start_covariance=1e8),
+    "arx-rls-wide": ARX(start_covariance=1e8, name="arx-rls-wide"),
     "nls": NLS(),
 }
 
@@ -82,9 +83,27 @@ def plant_named(name: str) -> AbstractPlant:
     if not (isinstance(plant_class, type) and issubclass(plant_class, AbstractPlant)):
         raise ValueError(f"{path} has no plant class {class_name!r}")
     try:
-        return plant_class()
+        plant = plant_class()
     except TypeError as error:  # an abstract method is missing
         raise ValueError(f"{class_name} in {path} is not a complete plant: {error}") from None
+    _check_plant(plant, f"{class_name} in {path}")
+    return plant
+
+
+def _check_plant(plant: AbstractPlant, where: str) -> None:
+    """Raises ValueError where the functions of a user's plant do not fit its description."""
+    d = plant.definition
+    state, inputs = plant.initial_state, jnp.zeros(len(d.inputs))
+    for name, arguments, count in (
+        ("derivative", (state, inputs, plant.nominal), len(d.states)),
+        ("output", (state, plant.nominal), len(d.outputs)),
+    ):
+        try:
+            shape = jnp.shape(jax.eval_shape(getattr(plant, name), *arguments))
+        except Exception as error:
+            raise ValueError(f"{name} of {where} fails: {type(error).__name__}: {error}") from error
+        if shape != (count,):
+            raise ValueError(f"{name} of {where} returns shape {shape}; ({count},) is needed")
 
 
 def with_sensor(
@@ -131,7 +150,7 @@ def excitation_named(
     """
     if name not in EXCITATIONS:
         raise _unknown("excitation", name, EXCITATIONS)
-    excitation = _build(EXCITATIONS[name], name, options)
+    excitation = _build(EXCITATIONS[name](), name, options)
     _check_excitation(excitation, plant)
     return excitation
 
@@ -147,16 +166,17 @@ def estimator_named(name: str, options: Mapping[str, Any] | None = None) -> Abst
     default = ESTIMATORS[name]
     if not options:
         return default
-    estimator = _build(type(default), name, options)
     for option, value in options.items():
-        if not isinstance(value, list) and not float(value) > 0:
+        if option in ("start_covariance", "forgetting_factor") and not float(value) > 0:
             raise ValueError(f"{option} of {name!r} must be positive: got {value!r}")
-    return estimator
+    if float(options.get("forgetting_factor", 1.0)) > 1:
+        raise ValueError(f"forgetting_factor of {name!r} must be at most 1")
+    return _build(default, name, options)
 
 
-def _build(kind: type, name: str, options: Mapping[str, Any]) -> Any:
-    """`kind(**options)` with names and types checked."""
-    fields = {f.name: f for f in dataclasses.fields(kind)}
+def _build(default: Any, name: str, options: Mapping[str, Any]) -> Any:
+    """`default` with other options, their names and types checked."""
+    fields = {f.name: f for f in dataclasses.fields(default) if f.name != "name"}
     for option, value in options.items():
         if option not in fields:
             raise _unknown(f"{name} option", option, fields)
@@ -169,7 +189,7 @@ def _build(kind: type, name: str, options: Mapping[str, Any]) -> Any:
         ):
             word = {bool: "true or false", int: "a whole number"}.get(expected, "a number")  # pyright: ignore[reportArgumentType, reportCallIssue]
             raise ValueError(f"{option} of {name!r} must be {word}: got {value!r}")
-    return kind(**options)
+    return dataclasses.replace(default, **options)
 
 
 def _check_excitation(excitation: Any, plant: AbstractPlant) -> None:
@@ -257,7 +277,8 @@ class Study(_Settings):
         episodes: evaluation episodes of each method, each with a plant of its own.
         num_steps: T, steps of an episode.
         seed: of plants, noise and excitations.
-        spread: parameters are uniform in nominal value times 1 ± spread.
+        spread: parameters are uniform in nominal value ± spread times their scale (by
+            default the nominal value itself).
         sensor: by output, where it differs from the plant's.
         methods, estimators: by the name that tables show.
         inferred: settings that the source of the study does not state, in words.
@@ -347,6 +368,8 @@ def read_study(path: Path) -> Study:
     except tomlkit.exceptions.ParseError as error:
         raise ValueError(f"{path}: not valid TOML: {error}") from None
     study = _study(content, str(path))
+    if ":" in study.plant and (path.parent / study.plant.rpartition(":")[0]).is_file():
+        study = study.changed(plant=str(path.parent / study.plant))  # relative to the study
     try:
         plant = study.build_plant()
         study.build_methods(plant)

@@ -15,6 +15,7 @@ import click
 from .. import __version__
 from .benchmark import benchmark
 from .doctor import doctor
+from .door import RunFailedError
 from .identify import identify
 from .information import information
 from .plants import plants
@@ -50,9 +51,12 @@ def main() -> None:
         _fail(error.format_message(), 2, debug)
     except (click.Abort, KeyboardInterrupt):
         _fail("interrupted; nothing was written", 130, debug)
-    except (ValueError, OSError) as error:
-        _fail(str(error), 2, debug)
-    except Exception as error:  # a defect of ours, not the user's
+    except RunFailedError as error:
+        _fail(str(error), 1, debug)
+    except Exception as error:
+        # Sentences for the user are plain ValueErrors; its subclasses come from libraries.
+        if type(error) is ValueError or isinstance(error, OSError):
+            _fail(str(error), 2, debug)
         _fail(f"failed: {type(error).__name__}: {error} (--debug shows where)", 1, debug)
     sys.exit(code if isinstance(code, int) else 0)
 

@@ -15,6 +15,10 @@ from typing import Any
 import click
 
 
+class RunFailedError(Exception):
+    """A run that failed through no mistake in its options: exit code 1."""
+
+
 class Assignments(click.ParamType):
     """NAME=VALUE,NAME=VALUE,... as a dictionary."""
 

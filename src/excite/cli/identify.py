@@ -79,6 +79,7 @@ def identify(
     Several records are fitted together: they share the parameters, each has an initial
     state of its own.
     """
+    from ..estimation import NLS
     from ..identification import identify as run
     from ..identification import write_run
     from ..records import read_record, require_free_run_folder
@@ -88,6 +89,8 @@ def identify(
     if out is not None:
         require_free_run_folder(out, overwrite)
     chosen, method = plant_named(plant), estimator_named(estimator)
+    if options["start"] and not isinstance(method, NLS):
+        raise ValueError(f"{estimator} does not search and takes no --start")
     mapping = merged(options["column"]), merged(options["scale"])
     records = [read_record(file, chosen.description, *mapping) for file in files]
     held_out = [read_record(file, chosen.description, *mapping) for file in validation]
@@ -100,7 +103,7 @@ def identify(
             initial_state=options["initial_state"],
             validation=held_out,
         )
-    data = {**result.to_dict(), "estimator": estimator}
+    data = result.to_dict()
     if plot is not None:
         first = result.fitted[0]
         save(identification_figure(result.plant, data, first.record, first.simulated), plot)

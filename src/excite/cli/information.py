@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from .door import OUT_FILE, computing, json_option, plot_option, show_json, show_table
+from .door import OUT_FILE, computing, json_option, plot_option, progress_bar, show_json, show_table
 from .simulate import excitation_options, prepared
 
 
@@ -32,26 +32,28 @@ def information(
 
     For an excitation, or for the recorded or designed input in INPUT_FILE.
     """
-    import jax
     import numpy as np
 
     from ..identification import best_possible
     from ..records import Record
     from ..report import information_figure, save
+    from ..simulation import run_episode
 
     job = prepared(options, plant, input_file)
     chosen, record = job["plant"], job["record"]
     if initial_state is None:
         elsewhere = record is not None and not record.starts_at_initial_state
         initial_state = "free" if elsewhere else "known"
-    excitation_key = jax.random.split(job["key"])[0]
-    inputs = job["excitation"].sequence(chosen, job["steps"], excitation_key)
     known = initial_state == "known"
-    result = best_possible(chosen, job["params"], inputs, initial_state_known=known)
+    with progress_bar("information"):
+        inputs = run_episode(
+            chosen, job["params"], job["excitation"], job["steps"], job["key"]
+        ).inputs
+        result = best_possible(chosen, job["params"], inputs, initial_state_known=known)
     if plot is not None:
         time = np.arange(len(inputs) + 1) * float(chosen.dt)
         drawn = Record.of_episode(time, inputs, np.empty((len(time), 0)))
-        percent = {n: p["percent"] for n, p in result["params"].items()}
+        percent = {n: p["cramer_rao_percent"] for n, p in result["params"].items()}
         save(information_figure(chosen.description, drawn, percent), plot)
     if as_json:
         show_json({**result, "excitation": job["excitation_name"], "num_steps": job["steps"]})
@@ -67,7 +69,13 @@ def _show(description: Any, result: dict[str, Any], job: dict[str, Any]) -> None
         f"initial state {result['initial_state']}: best possible standard deviation",
         ["symbol", "unit", "value", "standard deviation", "percent"],
         [
-            [n, p["unit"], number(p["value"], 5), number(p["std_error"]), number(p["percent"])]
+            [
+                n,
+                p["unit"],
+                number(p["value"], 5),
+                number(p["cramer_rao_bound"]),
+                number(p["cramer_rao_percent"]),
+            ]
             for n, p in result["params"].items()
         ],
     )

@@ -55,9 +55,10 @@ def _describe(d: Any, text: str) -> None:
     click.echo(inspect.cleandoc(text) + "\n")
     show_table(
         f"{d.name}: parameters",
-        ["name", "unit", "nominal", "kind", "target"],
+        ["name", "unit", "nominal", "kind", "bounds", "target"],
         [
             [p.name, p.unit, f"{p.nominal:g}", "positive" if p.positive else "free",
+             " to ".join("–" if b is None else f"{b:g}" for b in (p.lower, p.upper)),
              "yes" if p.target else "no"]
             for p in d.parameters
         ],

@@ -12,10 +12,12 @@ from .door import (
     NUMBERS,
     OUT_FILE,
     VALUES,
+    RunFailedError,
     computing,
     json_option,
     merged,
     plot_option,
+    progress_bar,
     show_json,
     show_table,
 )
@@ -25,8 +27,8 @@ def excitation_options(command: Any) -> Any:
     """Options that choose an excitation; shared with `information`."""
     for option in reversed(
         [
-            click.option("--excitation", default="chirp", show_default=True, metavar="NAME",
-                         help="random, prbs, chirp, multisine or square."),
+            click.option("--excitation", metavar="NAME",
+                         help="random, prbs, chirp, multisine or square; default chirp."),
             click.option("--set", "settings", type=VALUES, multiple=True,
                          help="Options of the excitation: amplitude, hold, clock, register, "
                          "start_frequency, stop_frequency, frequency, logarithmic."),
@@ -63,14 +65,16 @@ def prepared(options: dict[str, Any], plant_name: str, file: Path | None) -> dic
         plant_named(plant_name), merged(options["noise"]), merged(options["resolution"])
     )
     record, name, settings = None, options["excitation"], merged(options["settings"])
+    if file is not None and (settings or name):
+        raise ValueError("an input file takes the place of --excitation and --set")
     if file is None:
+        name = name or "chirp"
         excitation = excitation_named(name, settings, plant)
         steps = options["steps"] or 500
     else:
-        if settings:
-            raise ValueError("--set belongs to an excitation and does not go with an input file")
         columns, scales = merged(options["column"]), merged(options["scale"])
         record = read_record(file, plant.definition, columns, scales, inputs_only=True)
+        _require_playable(record, plant)
         plant = plant.changed(dt=record.dt)
         excitation, name = Replay(jnp.asarray(record.inputs)), "replay"
         steps = options["steps"] or len(record.inputs) - 1
@@ -87,22 +91,35 @@ def prepared(options: dict[str, Any], plant_name: str, file: Path | None) -> dic
     }
 
 
+def _require_playable(record: Any, plant: Any) -> None:
+    """A record with inputs beyond the limits would be clipped into another experiment."""
+    for part, values in zip(plant.definition.inputs, record.inputs.T, strict=True):
+        if values.min() < part.lower - 1e-9 or values.max() > part.upper + 1e-9:
+            raise ValueError(
+                f"{record.source}: {part.name!r} runs from {values.min():g} to {values.max():g} "
+                f"{part.unit}; the plant's limits are {part.lower:g} to {part.upper:g} {part.unit}"
+            )
+
+
 @click.command()
 @click.argument("plant")
 @click.argument("input_file", required=False, type=OUT_FILE)
 @excitation_options
 @click.option("--out", type=OUT_FILE, metavar="FILE", help="Write the record (.csv, .mat).")
+@click.option("--overwrite", is_flag=True, help="Replace the record if it exists.")
 @plot_option
 @json_option
 @computing
 def simulate(
-    plant: str, input_file: Path | None, out: Path | None, plot: Path | None, as_json: bool,
-    **options: Any,
+    plant: str, input_file: Path | None, out: Path | None, overwrite: bool, plot: Path | None,
+    as_json: bool, **options: Any,
 ) -> None:  # fmt: skip
     """Run one experiment on PLANT and record what its sensor shows.
 
     The input is an excitation, or replayed from INPUT_FILE (columns: time and the inputs).
     """
+    import numpy as np
+
     from ..excitation import crest_factor
     from ..records import require_record_path, write_record
     from ..report import episode_figure, save
@@ -110,9 +127,15 @@ def simulate(
     from ..simulation import run_episode
 
     if out is not None:
-        require_record_path(out)
+        require_record_path(out, overwrite)
     job = prepared(options, plant, input_file)
-    run = run_episode(job["plant"], job["params"], job["excitation"], job["steps"], job["key"])
+    with progress_bar("simulating"):
+        run = run_episode(job["plant"], job["params"], job["excitation"], job["steps"], job["key"])
+    if not np.all(np.isfinite(run.outputs)):
+        raise RunFailedError(
+            "the simulation left the finite numbers: these parameters make the plant too fast "
+            "for its integration step, or unstable"
+        )
     description = job["plant"].description
     record = _record(run, job, options["seed"])
     summary = {
@@ -123,7 +146,7 @@ def simulate(
         "params": record.metadata["params"],
         "crest_factor": _by_name(description.inputs, crest_factor(run.inputs)),
         "max_abs_output": _by_name(description.outputs, max_abs_output(run.outputs)),
-        "violation": bool(is_violation(run.outputs, critical_levels(description))),
+        "is_violation": bool(is_violation(run.outputs, critical_levels(description))),
         "file": None if out is None else str(out),
     }
     if plot is not None:
@@ -178,7 +201,7 @@ def _show(description: Any, summary: dict[str, Any]) -> None:
         rows.append([f"largest |{part.name}|", f"{value} {unit}", limit])
     title = (
         f"{summary['plant']}, {summary['excitation']}, {summary['num_steps']} steps of "
-        f"{summary['dt']:g} s: {'VIOLATION' if summary['violation'] else 'safe'}"
+        f"{summary['dt']:g} s: {'VIOLATION' if summary['is_violation'] else 'safe'}"
     )
     show_table(title, ["", "", ""], rows)
     if summary["file"]:

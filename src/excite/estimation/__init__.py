@@ -6,6 +6,5 @@ from .base import Estimate as Estimate
 from .base import Experiments as Experiments
 from .base import Status as Status
 from .base import bound_reached as bound_reached
-from .base import search_slope as search_slope
 from .base import stack_experiments as stack_experiments
 from .nls import NLS as NLS

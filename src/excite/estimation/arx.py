@@ -12,9 +12,10 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..information import require_double_precision
+from ..information import relative_size, require_double_precision
 from ..plant import AbstractARXPlant, AbstractPlant, Params
 from .base import (
     AbstractEstimator,
@@ -52,9 +53,9 @@ class ARX(AbstractEstimator):
         forgetting_factor: weight of a sample one step older.
     """
 
-    name = "arx-rls"
     start_covariance: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1000.0)
     forgetting_factor: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1.0)
+    name: str = eqx.field(static=True, default="arx-rls")
 
     def init(self) -> RLSState:
         """Zero coefficients, covariance P_0."""
@@ -120,7 +121,7 @@ class ARX(AbstractEstimator):
         status = jnp.where(_is_ill_conditioned(regressors, valid), Status.ILL_CONDITIONED, status)
         slope = jax.jacfwd(lambda c: jnp.stack(physical_params(plant, c)[0]))(memory.coefficients)
         covariance = variance * slope @ memory.covariance @ slope.T
-        size = jnp.stack(params)
+        size = relative_size(plant, params)
         simulated = simulate_experiments(plant, params, experiments, experiments.initial_state)
         return Estimate(
             params=params,
@@ -179,5 +180,8 @@ def physical_params(
     """The plant's parameters for ARX coefficients, and a status."""
     c_0, c_1, d_0, status = transfer_function(coefficients, plant.dt)
     params = plant.from_transfer_function(c_0, c_1, d_0)
-    finite = jnp.all(jnp.isfinite(jnp.stack(params)))
+    values = jnp.stack(params)
+    positive = np.array([p.positive for p in plant.definition.parameters])
+    status = jnp.where(jnp.any(positive & (values <= 0)), Status.UNPHYSICAL, status)
+    finite = jnp.all(jnp.isfinite(values))
     return params, jnp.where(finite, status, Status.NOT_FINITE)

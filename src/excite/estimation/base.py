@@ -9,7 +9,6 @@ from __future__ import annotations
 import abc
 import enum
 from collections.abc import Sequence
-from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -38,7 +37,7 @@ class Status(enum.IntEnum):
             Status.SUCCESSFUL: "successful",
             Status.ILL_CONDITIONED: "the data do not determine all parameters",
             Status.UNPHYSICAL: "the ARX model has no physical counterpart "
-            "(a pole is negative real or not inside the unit circle)",
+            "(a pole is negative real or not inside the unit circle, or a parameter negative)",
             Status.NOT_FINITE: "the estimate is not finite",
             Status.ITERATIONS_EXHAUSTED: "the search did not converge",
         }[self]
@@ -90,8 +89,8 @@ class Estimate(eqx.Module):
     Attributes:
         params: estimated parameters.
         covariance: of `params` (held parameters: zero rows).
-        information: inverse covariance in search coordinates, where parameters are
-            comparable: logarithms of positive ones, free ones over their scale.
+        information: inverse covariance of relative changes: logarithms of positive
+            parameters, free ones over their scale.
         status: a `Status`.
         initial_state: known or estimated.
         residual: measured minus simulated outputs, zero where padded.
@@ -108,7 +107,7 @@ class Estimate(eqx.Module):
 class AbstractEstimator(eqx.Module):
     """Base of all estimators; `name` is its word on the command line."""
 
-    name: ClassVar[str]
+    name: eqx.AbstractVar[str]
 
     @abc.abstractmethod
     def __call__(
@@ -133,7 +132,7 @@ def simulate_experiments(
     params: Params,
     experiments: Experiments,
     initial_state: Float[Array, "experiment state"],
-) -> Float[Array, "experiment time+1 output"]:
+) -> Float[Array, "experiment sample output"]:
     """Noise-free outputs of all experiments for one set of parameters."""
     return jax.vmap(simulate, in_axes=(None, None, 0, 0))(
         plant, params, experiments.inputs, initial_state
@@ -141,75 +140,79 @@ def simulate_experiments(
 
 
 def residual_of(
-    experiments: Experiments, simulated: Float[Array, "experiment time+1 output"]
-) -> Float[Array, "experiment time+1 output"]:
+    experiments: Experiments, simulated: Float[Array, "experiment sample output"]
+) -> Float[Array, "experiment sample output"]:
     """Measured minus simulated outputs, zero where padded."""
     return jnp.where(experiments.valid[..., None], experiments.measured - simulated, 0.0)
 
 
-_WIDE = 1e6  # of one-sided bounds: the other side lies this factor (or many scales) away
+class _Bounds:
+    """Bounds of all parameters in units of relative change: logarithms, or over the scale."""
 
+    def __init__(self, description: PlantDescription) -> None:
+        parts = description.parameters
+        self.positive = np.array([p.positive for p in parts])
+        self.scale = np.array([1.0 if p.positive else p.scale for p in parts])
 
-def _coordinate_bounds(description: PlantDescription) -> tuple[np.ndarray, ...]:
-    """Scale, lower and upper bound of each parameter before the bounded transformation."""
-    scale, lower, upper = [], [], []
-    for p in description.parameters:
-        unit, centre = (1.0, np.log(p.nominal)) if p.positive else (p.scale, p.nominal)
-        far = np.log(_WIDE) if p.positive else _WIDE * unit
+        def relative(value: float | None, positive: bool, scale: float) -> float:
+            if value is None:
+                return np.nan
+            return float(np.log(value)) if positive else value / scale
 
-        def coordinate(bound: float, positive: bool = p.positive) -> float:
-            return float(np.log(bound)) if positive else bound
+        pairs = list(zip(parts, self.scale, strict=True))
+        lower = np.array([relative(p.lower, p.positive, scale) for p, scale in pairs])
+        upper = np.array([relative(p.upper, p.positive, scale) for p, scale in pairs])
+        self.has_lower, self.has_upper = np.isfinite(lower), np.isfinite(upper)
+        self.both = self.has_lower & self.has_upper
+        self.lower, self.upper = np.nan_to_num(lower), np.nan_to_num(upper)
+        self.width = np.where(self.both, self.upper - self.lower, 1.0)
 
-        unbounded = p.lower is None and p.upper is None
-        scale.append(unit)
-        lower.append(
-            -np.inf if unbounded else centre - far if p.lower is None else coordinate(p.lower)
-        )
-        upper.append(
-            np.inf if unbounded else centre + far if p.upper is None else coordinate(p.upper)
-        )
-    return np.array(scale), np.array(lower), np.array(upper)
+    def relative(self, values: Array) -> Array:
+        """Logarithms of positive parameters, free ones over their scale."""
+        logarithm = jnp.log(jnp.where(self.positive, values, 1.0))
+        return jnp.where(self.positive, logarithm, values / self.scale)
 
 
 def to_search(description: PlantDescription, params: Params) -> Float[Array, " param"]:
     """Search coordinates: log of positive parameters, free ones over their scale.
 
-    A bounded parameter passes through a logistic function as well, so that the search
-    never leaves its bounds.
+    A bounded parameter passes through a logistic function as well (a soft ramp, where it
+    has one bound only), so that the search never leaves its bounds.
     """
-    scale, lower, upper = _coordinate_bounds(description)
-    positive = np.array([p.positive for p in description.parameters])
-    values = jnp.stack([jnp.asarray(p, float) for p in params])
-    c = jnp.where(positive, jnp.log(jnp.where(positive, values, 1.0)), values)
-    bounded = np.isfinite(lower)
-    low, width = np.where(bounded, lower, 0.0), np.where(bounded, upper - lower, 1.0)
-    fraction = jnp.where(bounded, (c - low) / width, 0.5)
-    return jnp.where(bounded, width / 4 * jnp.log(fraction / (1 - fraction)), c) / scale
+    b = _Bounds(description)
+    c = b.relative(jnp.stack([jnp.asarray(p, float) for p in params]))
+    fraction = jnp.where(b.both, (c - b.lower) / b.width, 0.5)
+    between = b.width / 4 * (jnp.log(fraction) - jnp.log1p(-fraction))
+    above = jnp.where(b.has_lower, c - b.lower, 1.0)
+    below = jnp.where(b.has_upper, b.upper - c, 1.0)
+    one_sided = jnp.where(b.has_lower, _inverse_ramp(above), -_inverse_ramp(below))
+    bounded = jnp.where(b.both, between, one_sided)
+    return jnp.where(b.has_lower | b.has_upper, bounded, c)
+
+
+def _inverse_ramp(value: Array) -> Array:
+    """Inverse of log(1 + exp(x)), the soft ramp."""
+    return value + jnp.log(-jnp.expm1(-value))
 
 
 def from_search(description: PlantDescription, z: Float[Array, " param"]) -> Array:
     """Parameters, as a vector, at search coordinates `z`; the inverse of `to_search`."""
-    scale, lower, upper = _coordinate_bounds(description)
-    positive = np.array([p.positive for p in description.parameters])
-    bounded = np.isfinite(lower)
-    low, width = np.where(bounded, lower, 0.0), np.where(bounded, upper - lower, 1.0)
-    c = jnp.where(bounded, low + width * jax.nn.sigmoid(4 * z * scale / width), z * scale)
-    return jnp.where(positive, jnp.exp(jnp.where(positive, c, 0.0)), c)
-
-
-def search_slope(description: PlantDescription, params: Params) -> Float[Array, " param"]:
-    """Derivative of each parameter with respect to its own search coordinate."""
-    z = to_search(description, params)
-    return jnp.diagonal(jax.jacfwd(lambda z: from_search(description, z))(z))
+    b = _Bounds(description)
+    between = b.lower + b.width * jax.nn.sigmoid(4 * z / b.width)
+    one_sided = jnp.where(b.has_lower, b.lower + jax.nn.softplus(z), b.upper - jax.nn.softplus(-z))
+    bounded = jnp.where(b.both, between, one_sided)
+    c = jnp.where(b.has_lower | b.has_upper, bounded, z)
+    return jnp.where(b.positive, jnp.exp(jnp.where(b.positive, c, 0.0)), c * b.scale)
 
 
 def bound_reached(description: PlantDescription, params: Params) -> tuple[int, float] | None:
     """Index and bound of the first parameter that ended at one; None where none did."""
-    for i, (p, value) in enumerate(zip(description.parameters, params, strict=True)):
-        for bound, other in ((p.lower, p.upper), (p.upper, p.lower)):
-            if bound is None:
-                continue
-            width = p.scale if other is None else abs(other - bound)
-            if abs(float(value) - bound) < 1e-3 * width:
-                return i, bound
+    b = _Bounds(description)
+    c = np.asarray(b.relative(jnp.stack([jnp.asarray(p, float) for p in params])))
+    for i, p in enumerate(description.parameters):
+        margin = 1e-3 * b.width[i]
+        if p.lower is not None and c[i] - b.lower[i] < margin:
+            return i, p.lower
+        if p.upper is not None and b.upper[i] - c[i] < margin:
+            return i, p.upper
     return None

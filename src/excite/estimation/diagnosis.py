@@ -10,11 +10,8 @@ import scipy.special
 from jaxtyping import Float
 
 UNSEEN_SD = 0.5
-"""A direction in search coordinates (relative, for positive parameters) known no better
-than this is not seen by the data: its 95 % interval reaches from nothing to the double."""
-
-EXPLAINS_NOTHING = 5.0
-"""Fit in percent below which a simulation has nothing to do with the data."""
+"""A direction of relative changes known no better than this is not seen by the data: its
+95 % interval reaches from nothing to the double."""
 
 
 def fit_percent(
@@ -27,21 +24,38 @@ def fit_percent(
     return float(100 * (1 - np.linalg.norm(measured - simulated) / spread))
 
 
-def ljung_box(residual: Float[np.ndarray, " sample"], num_lags: int = 25) -> float:
-    """p-value of the hypothesis that a residual is white.
+def ljung_box(*residuals: Float[np.ndarray, " _sample"], num_lags: int = 25) -> float:
+    """p-value of the hypothesis that the residuals of one or several records are white.
 
     G. Ljung and G. Box, "On a measure of lack of fit in time series models", Biometrika
-    65, 1978. A residual of exact zeros is not a number.
+    65, 1978; statistics and degrees of freedom of several records add up. Not a number for
+    residuals of zeros.
     """
-    n = residual.size
-    num_lags = min(num_lags, n // 5)
-    centred = residual - residual.mean()
-    power = float(centred @ centred)
-    if power == 0 or num_lags < 1:
-        return float("nan")
-    lags = np.arange(1, num_lags + 1)
-    r = np.array([centred[lag:] @ centred[:-lag] for lag in lags]) / power
-    return float(scipy.special.chdtrc(num_lags, n * (n + 2) * np.sum(r**2 / (n - lags))))
+    statistic, degrees = 0.0, 0
+    for residual in residuals:
+        n, centred = residual.size, residual - residual.mean()
+        lags, power = np.arange(1, min(num_lags, n // 5) + 1), float(centred @ centred)
+        if power == 0:
+            continue
+        r = np.array([centred[lag:] @ centred[:-lag] for lag in lags]) / power
+        statistic += float(n * (n + 2) * np.sum(r**2 / (n - lags)))
+        degrees += len(lags)
+    return float(scipy.special.chdtrc(degrees, statistic)) if degrees else float("nan")
+
+
+def chance_of_fit(
+    measured: Float[np.ndarray, " sample"], residual: Float[np.ndarray, " sample"], unknowns: int
+) -> float:
+    """Probability that a fit this good is chance: an F-test against a constant output."""
+    total = float(np.sum((measured - measured.mean()) ** 2))
+    left, degrees = float(np.sum(residual**2)), measured.size - unknowns
+    if total <= left:
+        return 1.0
+    if left == 0:
+        return 0.0
+    return float(
+        scipy.special.fdtrc(unknowns, degrees, (total - left) / unknowns / (left / degrees))
+    )
 
 
 def correlation(covariance: Float[np.ndarray, "param param"]) -> Float[np.ndarray, "param param"]:
@@ -68,16 +82,25 @@ def robust_covariance(
     size[size == 0] = 1.0
     inverse = np.linalg.pinv(H / np.outer(size, size), hermitian=True) / np.outer(size, size)
     scores = np.einsum("etou,eto->etu", sensitivity, residual)
-    flat = residual.reshape(-1, residual.shape[1])
+    length = residual.shape[1]
     rho = np.sum(residual[:, 1:] * residual[:, :-1]) / max(np.sum(residual**2), 1e-300)
-    rho = min(abs(rho), 1 - 1 / flat.shape[1])
+    rho = min(abs(rho), 1 - 1 / length)
     alpha = (2 * rho / (1 - rho**2)) ** 2
-    width = int(np.clip(1.1447 * (alpha * flat.shape[1]) ** (1 / 3), 1, flat.shape[1] // 3))
+    width = int(np.clip(1.1447 * (alpha * length) ** (1 / 3), 1, length // 3))
     # Sums over every window of `width` samples: their squares are Bartlett's estimate.
     padded = np.pad(scores, ((0, 0), (width, width - 1), (0, 0))).cumsum(axis=1)
     sums = padded[:, width:] - padded[:, :-width]
     V = np.einsum("etu,etv->uv", sums, sums) / width
     return inverse @ V @ inverse
+
+
+def widened(
+    white: Float[np.ndarray, "param param"], robust: Float[np.ndarray, "param param"]
+) -> Float[np.ndarray, "param param"]:
+    """The covariance for white noise, with each variance raised to the robust one if larger."""
+    variance, safe = np.diag(white), np.where(np.diag(white) > 0, np.diag(white), 1.0)
+    factor = np.sqrt(np.where(variance > 0, np.maximum(np.diag(robust) / safe, 1.0), 1.0))
+    return white * np.outer(factor, factor)
 
 
 def worst_seen(
@@ -92,11 +115,14 @@ def worst_seen(
     if index.size == 0:
         return None
     block = information[np.ix_(index, index)]
-    values, vectors = np.linalg.eigh(block)
-    value, direction = max(values[0], 0.0), vectors[:, 0]
+    if np.all(np.isfinite(block)):
+        values, vectors = np.linalg.eigh(block)
+        value, direction = max(values[0], 0.0), vectors[:, 0]
+    else:
+        value, direction = 0.0, np.ones(index.size)
     if value * UNSEEN_SD**2 >= 1:
         return None
-    chosen = index[np.argmax(np.abs(direction))]
+    chosen = int(index[np.argmax(np.abs(direction))])
     involved = [names[i] for i, v in zip(index, direction, strict=True) if abs(v) > 0.3]
     if len(involved) == 1:
         return chosen, f"the data cannot see {names[chosen]}"
@@ -116,7 +142,7 @@ def identifiability(
     """How well the worst direction of the free parameters is seen, in words.
 
     Args:
-        covariance: in search coordinates.
+        covariance: of relative changes.
     """
     index = np.flatnonzero(free)
     values, vectors = np.linalg.eigh(covariance[np.ix_(index, index)])

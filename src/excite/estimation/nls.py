@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
-from ..information import marginal_information, require_double_precision
+from ..information import marginal_information, relative_size, require_double_precision
 from ..plant import AbstractPlant, Params
 from .base import (
     AbstractEstimator,
@@ -28,7 +28,6 @@ from .base import (
     Status,
     from_search,
     residual_of,
-    search_slope,
     simulate_experiments,
     to_search,
 )
@@ -44,10 +43,10 @@ class NLS(AbstractEstimator):
         max_steps: of each search.
     """
 
-    name = "nls"
     horizons: tuple[float, ...] = eqx.field(static=True, default=(0.08, 0.16, 0.32, 0.6, 1.0))
     tolerance: float = eqx.field(static=True, default=1e-5)
     max_steps: int = eqx.field(static=True, default=200)
+    name: str = eqx.field(static=True, default="nls")
 
     @eqx.filter_jit
     def __call__(
@@ -71,19 +70,17 @@ class NLS(AbstractEstimator):
         estimate: Estimate,
         free: Bool[Array, " param"] | None = None,
     ) -> tuple[
-        Float[Array, "experiment time output unknown"], Float[Array, "experiment time output"]
+        Float[Array, "experiment sample output unknown"], Float[Array, "experiment sample output"]
     ]:
         """Sensitivity and residual at an estimate, over the noise's standard deviation.
 
-        The unknowns are the parameters in search coordinates, then the initial states if
-        they were estimated.
+        The unknowns are relative changes of the parameters, then the initial states if they
+        were estimated.
         """
         problem = _Problem(plant, experiments, estimate.params, free)
-        unknowns = problem.with_initial_state(estimate.initial_state)
-        residual = problem.residual(unknowns)
-        sd = problem.noise_sd(residual)
-        S = -jax.jacfwd(problem.residual)(unknowns) / sd[None, None, :, None]
-        return S, residual / sd[None, None]
+        sd = problem.noise_sd(estimate.residual)
+        S = problem.sensitivity(estimate.params, estimate.initial_state)
+        return S / sd[None, None, :, None], estimate.residual / sd[None, None]
 
     def _search(self, problem: _Problem) -> tuple[Array, Bool[Array, ""]]:
         """Unknowns at the minimum, and whether the last search converged."""
@@ -202,24 +199,41 @@ class _Problem(eqx.Module):
         scales = jnp.asarray([o.scale for o in self.plant.definition.outputs])
         return jnp.maximum(sd, 1e-9 * scales)  # noise-free data keep a finite weight
 
+    def sensitivity(self, params: Params, initial_state: Array) -> Array:
+        """Derivative of the outputs by relative changes of parameters, then initial states."""
+        size = jnp.where(self.free, relative_size(self.plant, params), 0.0)
+        states = initial_state.size if not self.experiments.initial_state_known else 0
+
+        def response(change: Array) -> Array:
+            values = jnp.stack(params) + size * change[: len(size)]
+            moved = change[len(size) :].reshape(initial_state.shape) if states else 0.0
+            simulated = simulate_experiments(
+                self.plant,
+                self.plant.Params(*values),
+                self.experiments,
+                initial_state + moved * self._state_scales[None],
+            )
+            return -residual_of(self.experiments, simulated)
+
+        return jax.jacfwd(response)(jnp.zeros(len(size) + states))
+
     def estimate(self, unknowns: Array, converged: Array) -> Estimate:
         """The estimate at the end of the search, its covariance from the noise found."""
-        num_params = len(self.start)
-        residual = self.residual(unknowns)
-        S = jax.jacfwd(self.residual)(unknowns).reshape(-1, self.num_outputs, len(unknowns))
-        information = marginal_information(S, self.noise_sd(residual), num_params)
-        active = jnp.outer(self.free, self.free)
-        information = jnp.where(active, information, 0.0)
+        params = self.plant.Params(*self.params(unknowns))
+        initial_state, residual = self.initial_state(unknowns), self.residual(unknowns)
+        S = self.sensitivity(params, initial_state)
+        S = S.reshape(-1, *S.shape[2:])  # experiments one after the other
+        information = marginal_information(S, self.noise_sd(residual), len(self.start))
         held = jnp.diag(jnp.where(self.free, 0.0, 1.0))
-        in_search = jnp.where(active, jnp.linalg.inv(information + held), 0.0)
-        params = self.params(unknowns)
-        slope = search_slope(self.plant.definition, self.plant.Params(*params))
+        active = jnp.outer(self.free, self.free)
+        relative = jnp.where(active, jnp.linalg.inv(information + held), 0.0)
+        size = relative_size(self.plant, params)
         return Estimate(
-            params=self.plant.Params(*params),
-            covariance=in_search * jnp.outer(slope, slope),
-            information=information,
-            status=_status(params, residual, in_search, converged),
-            initial_state=self.initial_state(unknowns),
+            params=params,
+            covariance=relative * jnp.outer(size, size),
+            information=jnp.where(active, information, 0.0),
+            status=_status(jnp.stack(params), residual, relative, converged),
+            initial_state=initial_state,
             residual=residual,
         )
 

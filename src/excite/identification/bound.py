@@ -34,8 +34,9 @@ def best_possible(
     """
     if not np.all(np.asarray(plant.sensor.sd) > 0):
         raise ValueError("a sensor without noise sets no bound; give every output a noise")
-    state = None if initial_state_known else plant.initial_state
-    information = experiment_information(plant, params, inputs, state)
+    information = experiment_information(
+        plant, params, inputs, initial_state_known=initial_state_known
+    )
     size = np.asarray(relative_size(plant, params))
     sd = np.asarray(cramer_rao_bound(information)) * size
     return {
@@ -44,8 +45,10 @@ def best_possible(
         "params": {
             p.name: {
                 "value": float(value),
-                "std_error": float(s) if np.isfinite(s) else None,
-                "percent": float(100 * s / abs(value)) if np.isfinite(s) and value else None,
+                "cramer_rao_bound": float(s) if np.isfinite(s) else None,
+                "cramer_rao_percent": float(100 * s / abs(value))
+                if np.isfinite(s) and value
+                else None,
                 "unit": p.unit,
             }
             for p, value, s in zip(plant.definition.parameters, params, sd, strict=True)

@@ -18,23 +18,29 @@ from ..estimation import (
     Experiments,
     Status,
     bound_reached,
-    search_slope,
     stack_experiments,
 )
 from ..estimation.diagnosis import (
-    EXPLAINS_NOTHING,
+    chance_of_fit,
     fit_percent,
     identifiability,
     ljung_box,
     robust_covariance,
+    widened,
     worst_seen,
 )
+from ..information import relative_size
 from ..plant import AbstractPlant, Params, params_from
-from ..records import Record
+from ..records import Record, json_ready
 from .base import Fitted, Identification
 
 InitialState = Literal["auto", "free", "known"]
 _WHITE = 0.01  # a residual is called coloured when whiteness is less probable
+_NOTHING_SEEN = (
+    "no parameter can be seen in the data; are columns, signs and units right, and does the "
+    "input move the plant beyond the noise?"
+)
+_BY_CHANCE = 1e-3  # a fit that chance would reach more often explains nothing
 
 
 def identify(
@@ -66,18 +72,19 @@ def identify(
         initial_state == "auto" and all(_starts_at(record, plant) for record in records)
     )
     _check_lengths(plant, [*records, *validation], known)
-    plant = plant.changed(dt=_common_dt([*records, *validation]))
+    plant = plant.changed(dt=_common_dt(plant, [*records, *validation]))
     experiments = _experiments(plant, records, known)
     fit = _fit(plant, experiments, estimator, params_from(plant, start or {}))
     residual = _residuals(plant, records, experiments, estimator, fit)
     fitted = tuple(_fitted(plant.definition, *pair) for pair in zip(records, residual, strict=True))
     if fit.is_successful and isinstance(estimator, NLS):
-        _require_explanation(fitted)
+        _require_explanation(records, residual, int(fit.free.sum()))
     whiteness = {
-        name: min(ljung_box(r[:, i]) for r in residual)
+        name: _whiteness([r[:, i] for r in residual], plant.definition.outputs[i].scale)
         for i, name in enumerate(names_of(plant.definition.outputs))
     }
     covariance, verdict = _confidence(plant, experiments, estimator, fit, whiteness)
+    verdict += tuple(s for record in [*records, *validation] for s in _other_plant(record, plant))
     names, d = names_of(plant.definition.parameters), plant.description
     sd = np.where(fit.free, np.sqrt(np.maximum(np.diag(covariance), 0.0)), np.nan)
     return Identification(
@@ -104,6 +111,17 @@ def _starts_at(record: Record, plant: AbstractPlant) -> bool:
     return record.starts_at_initial_state and initial == plant.initial_state.tolist()
 
 
+def _other_plant(record: Record, plant: AbstractPlant) -> tuple[str, ...]:
+    """A sentence where the sidecar says that the record is of a plant with other constants."""
+    made_with, own = record.metadata.get("plant", {}), json_ready(plant.description.to_dict())
+    if all(made_with.get(key, own[key]) == own[key] for key in ("name", "constants")):
+        return ()
+    return (
+        f"{record.source} is of plant {made_with.get('name')!r} with other known constants "
+        f"than {own['name']!r}, according to its sidecar",
+    )
+
+
 def _check_lengths(plant: AbstractPlant, records: Sequence[Record], known: bool) -> None:
     d = plant.definition
     unknowns = len(d.parameters) + (0 if known else len(d.states))
@@ -116,15 +134,16 @@ def _check_lengths(plant: AbstractPlant, records: Sequence[Record], known: bool)
             )
 
 
-def _common_dt(records: Sequence[Record]) -> float:
-    first = records[0]
+def _common_dt(plant: AbstractPlant, records: Sequence[Record]) -> float:
+    """The records' sampling time [s], freed of rounding: it enters the plant's hash."""
+    first, own = records[0], float(plant.dt)
     for record in records[1:]:
         if abs(record.dt - first.dt) > 1e-3 * first.dt:
             raise ValueError(
                 f"{record.source} is sampled every {record.dt:g} s and {first.source} every "
                 f"{first.dt:g} s; records fitted together need one sampling time"
             )
-    return first.dt
+    return own if abs(first.dt - own) < 1e-6 * own else float(f"{first.dt:.6g}")
 
 
 def _experiments(plant: AbstractPlant, records: Sequence[Record], known: bool) -> Experiments:
@@ -148,7 +167,7 @@ class _Fit:
     def status(self) -> str:
         if self.is_successful and not self.free.all():
             return "partly identifiable"
-        return Status(int(self.estimate.status)).sentence
+        return Status(int(self.estimate.status)).name.lower().replace("_", " ")
 
 
 def _fit(
@@ -171,10 +190,7 @@ def _fit(
         free = free & (np.arange(len(names)) != chosen)
         reasons = (*reasons, why)
         if not free.any():
-            raise ValueError(
-                f"no parameter can be seen in the data ({why}); the input must move the "
-                "plant, and the outputs must exceed the noise"
-            )
+            raise ValueError(_NOTHING_SEEN)
 
 
 def _to_hold(plant: AbstractPlant, fit: _Fit, start: Params) -> tuple[int, float, str] | None:
@@ -188,7 +204,8 @@ def _to_hold(plant: AbstractPlant, fit: _Fit, start: Params) -> tuple[int, float
     if unseen is None:
         return None
     value = float(start[unseen[0]])
-    return unseen[0], value, f"{unseen[1]}; {names[unseen[0]]} was held at {value:g}"
+    why = f"{unseen[1]}; {names[unseen[0]]} was held at {value:g}"
+    return unseen[0], value, why + (", and the rest holds for that" if "apart" in why else "")
 
 
 def _residuals(
@@ -222,22 +239,23 @@ def _confidence(
     """Covariance of the estimates, and the verdict in words."""
     covariance = np.asarray(fit.estimate.covariance)
     if not fit.is_successful:
-        return covariance, fit.reasons
+        return covariance, (*fit.reasons, Status(int(fit.estimate.status)).sentence)
     names = names_of(plant.definition.parameters)
-    slope = np.asarray(search_slope(plant.definition, fit.estimate.params))
+    size = np.asarray(relative_size(plant, fit.estimate.params))
     remarks = ()
     coloured = [name for name, p in whiteness.items() if p < _WHITE]
     if coloured and isinstance(estimator, NLS):
         S, residual = estimator.sensitivity(plant, experiments, fit.estimate, jnp.asarray(fit.free))
         robust = robust_covariance(np.asarray(S), np.asarray(residual))
-        covariance = np.outer(slope, slope) * robust[: len(names), : len(names)]
-        remarks = ("the intervals are widened for that; noise or plant differ from the model",)
+        robust = np.outer(size, size) * robust[: len(names), : len(names)]
+        covariance = widened(covariance, robust)
+        remarks = ("the intervals allow for that; noise or plant differ from the model",)
     elif coloured:
         remarks = ("the intervals assume that it is, and are too narrow",)
     remarks = tuple(
         f"the residual of {' and '.join(coloured)} is not white: {remark}" for remark in remarks
     )
-    seen = identifiability(names, covariance / np.outer(slope, slope), fit.free)
+    seen = identifiability(names, covariance / np.outer(size, size), fit.free)
     return covariance, (*fit.reasons, seen, *remarks)
 
 
@@ -250,14 +268,22 @@ def _fitted(description: PlantDescription, record: Record, residual: np.ndarray)
     return Fitted(record, simulated, fits)
 
 
-def _require_explanation(fitted: Sequence[Fitted]) -> None:
-    """Raises where the best simulation has nothing to do with the measured outputs."""
-    best = max(np.nan_to_num(percent) for f in fitted for percent in f.fit_percent.values())
-    if best < EXPLAINS_NOTHING:
-        raise ValueError(
-            f"no parameter can be seen in the data: the best simulation fits them by {best:.2g} %; "
-            "are the columns, their signs and units right, and does the plant move beyond noise?"
-        )
+def _whiteness(residuals: list[np.ndarray], scale: float) -> float:
+    """p-value of white residuals; not a number where only rounding is left of them."""
+    return ljung_box(*(r for r in residuals if np.abs(r).max() > 1e-8 * scale))
+
+
+def _require_explanation(
+    records: Sequence[Record], residual: Sequence[np.ndarray], unknowns: int
+) -> None:
+    """Raises where the best simulation follows the outputs no better than chance does."""
+    chances = [
+        chance_of_fit(record.outputs[:, i], r[:, i], unknowns)
+        for record, r in zip(records, residual, strict=True)
+        for i in range(r.shape[1])
+    ]
+    if min(chances) > _BY_CHANCE:
+        raise ValueError(_NOTHING_SEEN)
 
 
 def _validated(plant: AbstractPlant, record: Record, params: Params) -> Fitted:

@@ -5,6 +5,7 @@ from .base import AbstractARXPlant as AbstractARXPlant
 from .base import AbstractPlant as AbstractPlant
 from .base import Params as Params
 from .base import Sensor as Sensor
+from .base import draw_params as draw_params
 from .base import params_from as params_from
 from .cart_pole import CartPole as CartPole
 from .dc_motor import DCMotor as DCMotor

@@ -21,8 +21,9 @@ from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeAlias
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..description import PlantDescription, names_of
 
@@ -107,9 +108,12 @@ class AbstractPlant(_Module):
             jnp.asarray([o.resolution for o in d.outputs]),
         )
         at_rest = [s.initial for s in d.states]
-        self.initial_state = jnp.asarray(at_rest if initial_state is None else initial_state)
+        self.initial_state = jnp.asarray(at_rest if initial_state is None else initial_state, float)
         self.dt = jnp.asarray(d.dt if dt is None else dt, float)
-        self.substeps = math.ceil(float(self.dt) * d.substeps / d.dt - 1e-6)
+        # Without a dt of its own a plant can be built of traced numbers.
+        self.substeps = (
+            d.substeps if dt is None else math.ceil(float(dt) * d.substeps / d.dt - 1e-6)
+        )
 
     @abc.abstractmethod
     def derivative(
@@ -163,9 +167,16 @@ class AbstractPlant(_Module):
         return jnp.asarray([i.lower for i in inputs]), jnp.asarray([i.upper for i in inputs])
 
     def changed(self, **numbers: Any) -> Self:
-        """The same plant with another `dt`, `sensor`, `initial_state` or constants."""
-        own = {"sensor": self.sensor, "initial_state": self.initial_state, "dt": self.dt}
-        return type(self)(**{**own, **self.constants._asdict(), **numbers})
+        """The same plant with another `dt`, `sensor`, `initial_state` or constants.
+
+        All but `dt` may be traced numbers.
+        """
+        own = {"sensor": self.sensor, "initial_state": self.initial_state}
+        plant = type(self)(**{**own, **self.constants._asdict(), **numbers})
+        if "dt" not in numbers:
+            plant = eqx.tree_at(lambda p: p.dt, plant, self.dt)
+            object.__setattr__(plant, "substeps", self.substeps)
+        return plant
 
 
 class AbstractARXPlant(AbstractPlant):
@@ -209,3 +220,12 @@ def params_from(plant: AbstractPlant, values: Mapping[str, float]) -> Params:
             )
     given = {name: jnp.asarray(float(value)) for name, value in values.items()}
     return plant.nominal._replace(**given)
+
+
+def draw_params(plant: AbstractPlant, key: PRNGKeyArray, spread: float) -> Params:
+    """Random parameters, each uniform in its nominal value ± `spread` times its scale."""
+    unit = jax.random.uniform(key, (len(plant.nominal),), float, -1.0, 1.0)
+    scales = [p.scale for p in plant.definition.parameters]
+    return plant.Params(
+        *(n + spread * s * u for n, s, u in zip(plant.nominal, scales, unit, strict=True))
+    )
