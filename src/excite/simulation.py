@@ -27,10 +27,10 @@ class Trajectory(eqx.Module):
         outputs: true outputs.
     """
 
-    time: Float[Array, " time+1"]
+    time: Float[Array, " sample"]
     inputs: Float[Array, "time input"]
-    measured: Float[Array, "time+1 output"]
-    outputs: Float[Array, "time+1 output"]
+    measured: Float[Array, "sample output"]
+    outputs: Float[Array, "sample output"]
 
 
 def step(
