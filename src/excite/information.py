@@ -48,7 +48,7 @@ def fisher_information(
 
 
 def marginal_information(
-    sensitivity: Float[Array, "time output param"],
+    sensitivity: Float[Array, "time output unknown"],
     noise_sd: Float[Array, " output"],
     num_params: int,
 ) -> Information:

@@ -55,7 +55,7 @@ class ARX(AbstractEstimator):
 
     start_covariance: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1000.0)
     forgetting_factor: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1.0)
-    name: str = eqx.field(static=True, default="arx-rls")
+    name: str = eqx.field(static=True, default="arx-rls", kw_only=True)
 
     def init(self) -> RLSState:
         """Zero coefficients, covariance P_0."""
@@ -68,9 +68,11 @@ class ARX(AbstractEstimator):
         P, lam = state.covariance, self.forgetting_factor
         gain = P @ regressor / (lam + regressor @ P @ regressor)
         innovation = output - regressor @ state.coefficients
+        # Joseph's form: the covariance stays symmetric and positive, however small.
+        rest = jnp.eye(4) - jnp.outer(gain, regressor)
         return RLSState(
             coefficients=state.coefficients + gain * innovation,
-            covariance=(P - jnp.outer(gain, P @ regressor)) / lam,
+            covariance=(rest @ P @ rest.T + lam * jnp.outer(gain, gain)) / lam,
         )
 
     def batch(

@@ -55,8 +55,8 @@ class Experiments(eqx.Module):
     """
 
     inputs: Float[Array, "experiment time input"]
-    measured: Float[Array, "experiment time+1 output"]
-    valid: Bool[Array, "experiment time+1"]
+    measured: Float[Array, "experiment sample output"]
+    valid: Bool[Array, "experiment sample"]
     initial_state: Float[Array, "experiment state"]
     initial_state_known: bool = eqx.field(static=True)
 
@@ -101,7 +101,7 @@ class Estimate(eqx.Module):
     information: Float[Array, "param param"]
     status: Int[Array, ""]
     initial_state: Float[Array, "experiment state"]
-    residual: Float[Array, "experiment time+1 output"]
+    residual: Float[Array, "experiment sample output"]
 
 
 class AbstractEstimator(eqx.Module):

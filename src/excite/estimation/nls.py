@@ -46,7 +46,7 @@ class NLS(AbstractEstimator):
     horizons: tuple[float, ...] = eqx.field(static=True, default=(0.08, 0.16, 0.32, 0.6, 1.0))
     tolerance: float = eqx.field(static=True, default=1e-5)
     max_steps: int = eqx.field(static=True, default=200)
-    name: str = eqx.field(static=True, default="nls")
+    name: str = eqx.field(static=True, default="nls", kw_only=True)
 
     @eqx.filter_jit
     def __call__(
