@@ -24,9 +24,9 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from .description import PlantDescription, display_unit, names_of
 from .estimation import AbstractEstimator, Status, stack_experiments
 from .excitation import AbstractExcitation
+from .files import new_run_folder, write_json
 from .information import cramer_rao_bound, experiment_information, relative_size
 from .plant import AbstractPlant, Params, draw_params
-from .records import new_run_folder, write_json
 from .safety import critical_levels, is_violation, max_abs_output, watched_output
 from .simulation import Trajectory, run_episode
 from .study import Study

@@ -40,10 +40,9 @@ class _Named:
         )
         for field in fields(self):  # pyright: ignore[reportArgumentType]
             value = getattr(self, field.name)
-            # 1 and 1.0 are the same number and must give the same hash.
-            if isinstance(value, int) and not isinstance(value, bool):
-                object.__setattr__(self, field.name, float(value))
-            elif isinstance(value, float):
+            if isinstance(value, int | float) and not isinstance(value, bool):
+                # 1 and 1.0, 0 and -0 are the same number and must give the same hash.
+                object.__setattr__(self, field.name, float(value) + 0.0)
                 _require(
                     math.isfinite(value),
                     f"{field.name} of {self.name!r} is {value}; a finite number is needed "
@@ -254,7 +253,7 @@ class PlantDescription:
         try:
             parts = {k: tuple(kind(**entry) for entry in data[k]) for k, kind in kinds.items()}
             rest = {k: v for k, v in data.items() if k != "format" and k not in kinds}
-            return cls(**{**rest, **parts})
+            return cls(**{**rest, **parts, "band": tuple(data["band"])})
         except (KeyError, TypeError) as error:
             raise ValueError(f"plant description is incomplete or malformed: {error}") from None
 

@@ -4,22 +4,15 @@ An experiment file is CSV or MAT with the columns `time`, the plant's inputs and
 outputs, in SI units: row k holds the outputs measured at time[k] and the inputs held from
 time[k] to time[k + 1]. A JSON file of the same name beside it (the sidecar) says which
 plant it was, which parameters, and how the experiment began.
-
-Everything is written under another name first and then renamed: a file is either
-complete or not there.
 """
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import io
 import json
-import math
 import os
-import shutil
-import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -29,6 +22,7 @@ import scipy.io
 from jaxtyping import Float
 
 from .description import Input, Output, PlantDescription, names_of
+from .files import csv_text, write_bytes, write_json
 
 RECORD_KIND = "excite record"
 _UNEVEN = 0.05  # of the sampling time: more than printing it with few digits explains
@@ -175,7 +169,10 @@ def _read_csv(path: Path) -> dict[str, np.ndarray | list[str]]:
             "(add one if it is complete)"
         )
     delimiter = next((d for d in (",", ";", "\t") if d in lines[0]), ",")
-    rows = list(csv.reader(lines, delimiter=delimiter))
+    try:
+        rows = list(csv.reader(lines, delimiter=delimiter))
+    except csv.Error as error:
+        raise ValueError(f"{path}: cannot be read as CSV text ({error})") from None
     header = [name.strip() for name in rows[0]]
     if len(set(header)) < len(header):
         raise ValueError(f"{path}: the header names a column twice: {', '.join(header)}")
@@ -282,8 +279,14 @@ def _read_sidecar(path: Path) -> Mapping[str, Any]:
         content = json.loads(sidecar.read_text(encoding="utf-8"))
     except (ValueError, OSError) as error:
         raise ValueError(f"{sidecar}: cannot be read as JSON ({error})") from None
-    ours = isinstance(content, dict) and content.get("kind") == RECORD_KIND
-    return content if ours else {}
+    if not (isinstance(content, dict) and content.get("kind") == RECORD_KIND):
+        return {}
+    if "plant" in content:
+        try:
+            PlantDescription.from_dict(content["plant"])
+        except (ValueError, AttributeError) as error:
+            raise ValueError(f"{sidecar}: {error}") from None
+    return content
 
 
 def write_record(
@@ -316,92 +319,8 @@ def write_record(
         "kind": RECORD_KIND,
         "dt": record.dt,
     }
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder; choose another name")
     # The sidecar first: a record without one would be read as one of unknown start.
     write_json(path.with_suffix(".json"), sidecar)
     write_bytes(path, buffer.getvalue())
-
-
-def csv_text(columns: Mapping[str, Any]) -> str:
-    """Columns of numbers as CSV text; every number is read back exactly."""
-    buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(columns)
-    rows = zip(*(np.asarray(v, float).tolist() for v in columns.values()), strict=True)
-    writer.writerows([repr(value) for value in row] for row in rows)
-    return buffer.getvalue()
-
-
-def json_ready(value: Any) -> Any:
-    """A copy with plain types only; a number that is not finite becomes None."""
-    if isinstance(value, Mapping):
-        return {str(k): json_ready(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [json_ready(v) for v in value]
-    if isinstance(value, np.ndarray | np.generic) or hasattr(value, "__array__"):
-        return json_ready(np.asarray(value).tolist())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return value
-
-
-def json_text(value: Any) -> str:
-    """`value` as one JSON object."""
-    return json.dumps(json_ready(value), indent=2, ensure_ascii=False, allow_nan=False)
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Writes `value` as JSON, whole or not at all."""
-    write_bytes(path, (json_text(value) + "\n").encode())
-
-
-def write_bytes(path: Path, content: bytes) -> None:
-    """Writes a file, whole or not at all.
-
-    Raises:
-        ValueError: where the folder does not exist or cannot be written.
-    """
-    if not path.parent.is_dir():
-        raise ValueError(f"{path}: the folder {path.parent} does not exist")
-    try:
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be written ({error.strerror})") from None
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-        os.chmod(name, 0o644)  # mkstemp makes files that nobody else may read
-        os.replace(name, path)
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be written ({error.strerror})") from None
-    finally:
-        Path(name).unlink(missing_ok=True)
-
-
-def require_free_run_folder(path: Path, overwrite: bool) -> None:
-    """Raises ValueError where a run folder at `path` would hide or lose something."""
-    if not path.exists() or (path.is_dir() and not any(path.iterdir())):
-        return
-    if not (path / "run.json").is_file():
-        raise ValueError(f"{path} exists and is no run folder; choose another name")
-    if not overwrite:
-        raise ValueError(f"{path} holds a run; choose another name or add --overwrite")
-
-
-@contextlib.contextmanager
-def new_run_folder(path: Path, overwrite: bool = False) -> Iterator[Path]:
-    """A folder to fill, which appears at `path` only when everything in it is written."""
-    require_free_run_folder(path, overwrite)
-    path = path.absolute()
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        unfinished = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be written ({error.strerror})") from None
-    try:
-        yield unfinished
-        unfinished.chmod(0o755)
-        if path.exists():
-            shutil.rmtree(path)
-        unfinished.rename(path)
-    finally:
-        shutil.rmtree(unfinished, ignore_errors=True)

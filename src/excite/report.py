@@ -6,6 +6,7 @@ line of this room computes an experiment.
 
 from __future__ import annotations
 
+import csv
 import io
 import math
 from collections.abc import Mapping, Sequence
@@ -18,7 +19,8 @@ import numpy as np
 from jaxtyping import Float
 
 from .description import Input, Output, PlantDescription, display_unit
-from .records import Record, csv_text, write_bytes
+from .files import csv_text, write_bytes
+from .records import Record
 
 # Distinguishable with any colour vision (M. Okabe and K. Ito, 2008).
 BLUE, ORANGE, GREEN, RED, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#767676"
@@ -64,11 +66,11 @@ def table_cells(row: Mapping[str, Any]) -> list[str]:
     return [*cells, _mean_sd(largest["mean"], largest["sd"]), count, failed]
 
 
-def reference_cells(method: str, reference: Mapping[str, Any]) -> list[str]:
-    """A published row in the columns of `table_header`."""
-    cells = [method, "as published"]
-    for mean, sd in reference["relative_error_percent"].values():
-        cells += [_mean_sd(mean, sd), "–"]
+def reference_cells(row: Mapping[str, Any], reference: Mapping[str, Any]) -> list[str]:
+    """A published row in the columns of the method's own `row`."""
+    cells = [row["method"], "as published"]
+    for name in row["relative_error_percent"]:
+        cells += [_mean_sd(*reference["relative_error_percent"][name]), "–"]
     return [*cells, _mean_sd(*reference["max_abs_output"]), reference["violations"], "–"]
 
 
@@ -85,7 +87,7 @@ def all_cells(
         cells.append(table_cells(row))
         is_last = i + 1 == len(rows) or rows[i + 1]["method"] != row["method"]
         if is_last and row["method"] in reference:
-            cells.append(reference_cells(row["method"], reference[row["method"]]))
+            cells.append(reference_cells(row, reference[row["method"]]))
     return cells
 
 
@@ -129,12 +131,12 @@ def benchmark_csv(rows: Sequence[Mapping[str, Any]]) -> str:
                 row["relative_error_percent"][name][part] for row in rows
             ]
         columns[f"{name}_cramer_rao_percent"] = [row["cramer_rao_percent"][name] for row in rows]
-    numbers = csv_text(columns).splitlines()
-    labels = [
-        ",".join(pair)
-        for pair in zip(["method", *text["method"]], ["estimator", *text["estimator"]], strict=True)
-    ]
-    return "\n".join(",".join(pair) for pair in zip(labels, numbers, strict=True)) + "\n"
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    numbers = csv.reader(csv_text(columns).splitlines())
+    labels = [["method", "estimator"], *zip(text["method"], text["estimator"], strict=True)]
+    writer.writerows([*pair, *values] for pair, values in zip(labels, numbers, strict=True))
+    return buffer.getvalue()
 
 
 def require_plot_path(path: Path) -> None:
@@ -235,7 +237,7 @@ def _draw_intervals(axis: Any, params: Mapping[str, Mapping[str, Any]]) -> None:
         if error is None or not math.isfinite(error):
             axis.text(0, i, f"{name} held", color=GREY, va="center", ha="center")
             continue
-        half = 100 * 1.96 * error / abs(value)
+        half = 100 * 1.96 * error / (abs(value) or math.nan)
         axis.errorbar(0, i, xerr=half, color=BLUE, fmt="o", capsize=4, ms=4)
         text = f"{number(value, digits_for(value, error))} {p['unit']}"
         axis.annotate(text, (0, i), (0, 7), textcoords="offset points", ha="center", fontsize=8)

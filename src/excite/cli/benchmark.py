@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -20,7 +21,7 @@ from .door import (
 @click.command()
 @click.argument("study", type=OUT_FILE, metavar="STUDY.toml")
 @click.option("--episodes", type=click.IntRange(min=1), help="Instead of the study's.")
-@click.option("--seed", type=click.IntRange(min=0), help="Instead of the study's.")
+@click.option("--seed", type=click.IntRange(0, 2**63 - 1), help="Instead of the study's.")
 @click.option("--estimators", metavar="NAME,...", help="Instead of the study's.")
 @click.option("--out", type=OUT_FILE, metavar="FOLDER", help="Leave a run folder.")
 @click.option("--overwrite", is_flag=True, help="Replace the run folder if it exists.")
@@ -28,12 +29,11 @@ from .door import (
 @json_option
 @computing
 def benchmark(
-    study: Path, episodes: int | None, seed: int | None, estimators: str | None,
-    out: Path | None, overwrite: bool, plot: Path | None, as_json: bool,
-) -> None:  # fmt: skip
+    study: Path, out: Path | None, plot: Path | None, as_json: bool, **options: Any
+) -> None:
     """Compare the methods of STUDY.toml under identical conditions."""
     from ..benchmark import run_benchmark, write_benchmark
-    from ..records import require_free_run_folder
+    from ..files import require_free_run_folder
     from ..report import (
         all_cells,
         benchmark_csv,
@@ -46,9 +46,10 @@ def benchmark(
     )
     from ..study import read_study
 
+    overwrite = options.pop("overwrite")
     if out is not None:
         require_free_run_folder(out, overwrite)
-    chosen = read_study(study).changed(estimators=estimators, episodes=episodes, seed=seed)
+    chosen = read_study(study).changed(**options)
     with progress_bar(chosen.name) as progress:
         rows = run_benchmark(chosen, progress)
     settings = chosen.model_dump()

@@ -138,7 +138,7 @@ def progress_bar(what: str) -> Iterator[Callable[[str, int, int], None]]:
 
 def show_json(value: Any) -> None:
     """One JSON object on stdout."""
-    from ..records import json_text
+    from ..files import json_text
 
     click.echo(json_text(value))
 

@@ -71,29 +71,29 @@ from .door import (
 @json_option
 @computing
 def identify(
-    files: tuple[Path, ...], plant: str, estimator: str, validation: tuple[Path, ...],
-    out: Path | None, overwrite: bool, plot: Path | None, as_json: bool, **options: Any,
-) -> int:  # fmt: skip
+    files: tuple[Path, ...], out: Path | None, plot: Path | None, as_json: bool, **options: Any
+) -> int:
     """Estimate PLANT's parameters from one or several records (.csv, .mat).
 
     Several records are fitted together: they share the parameters, each has an initial
     state of its own.
     """
     from ..estimation import NLS
+    from ..files import require_free_run_folder
     from ..identification import identify as run
     from ..identification import write_run
-    from ..records import read_record, require_free_run_folder
+    from ..names import estimator_named, plant_named
+    from ..records import read_record
     from ..report import identification_figure, save
-    from ..study import estimator_named, plant_named
 
     if out is not None:
-        require_free_run_folder(out, overwrite)
-    chosen, method = plant_named(plant), estimator_named(estimator)
+        require_free_run_folder(out, options["overwrite"])
+    chosen, method = plant_named(options["plant"]), estimator_named(options["estimator"])
     if options["start"] and not isinstance(method, NLS):
-        raise ValueError(f"{estimator} does not search and takes no --start")
+        raise ValueError(f"{method.name} does not search and takes no --start")
     mapping = merged(options["column"]), merged(options["scale"])
     records = [read_record(file, chosen.description, *mapping) for file in files]
-    held_out = [read_record(file, chosen.description, *mapping) for file in validation]
+    held_out = [read_record(file, chosen.description, *mapping) for file in options["validation"]]
     with progress_bar("identifying"):
         result = run(
             chosen,
@@ -108,7 +108,7 @@ def identify(
         first = result.fitted[0]
         save(identification_figure(result.plant, data, first.record, first.simulated), plot)
     if out is not None:
-        write_run(result, out, overwrite)
+        write_run(result, out, options["overwrite"])
     if as_json:
         show_json(data)
     else:

@@ -20,7 +20,7 @@ def plants(plant: str | None, as_json: bool, plot: Path | None) -> None:
 
     --plot draws PLANT's nominal response to every classical excitation.
     """
-    from ..study import PLANTS, plant_named
+    from ..names import PLANTS, plant_named
 
     if plant is None and plot is not None:
         raise ValueError("--plot needs a PLANT")
@@ -93,10 +93,10 @@ def _describe(d: Any, text: str) -> None:
 def _plot(plant: Any, path: Path) -> None:
     import jax
 
+    from ..names import EXCITATIONS
     from ..records import Record
     from ..report import episodes_figure, save
     from ..simulation import run_episode
-    from ..study import EXCITATIONS
 
     responses = {}
     for name, kind in EXCITATIONS.items():

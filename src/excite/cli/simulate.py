@@ -40,7 +40,7 @@ def excitation_options(command: Any) -> Any:
                          help="Standard deviation of an output's noise, in its unit."),
             click.option("--resolution", type=NUMBERS, multiple=True,
                          help="Step of an output's encoder, in its unit."),
-            click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True),
+            click.option("--seed", type=click.IntRange(0, 2**63 - 1), default=0, show_default=True),
             click.option("--column", type=NAMES, multiple=True,
                          help="Columns of the input file that have another name."),
             click.option("--scale", type=NUMBERS, multiple=True,
@@ -57,9 +57,9 @@ def prepared(options: dict[str, Any], plant_name: str, file: Path | None) -> dic
     import jax.numpy as jnp
 
     from ..excitation import Replay
+    from ..names import excitation_named, plant_named, with_sensor
     from ..plant import params_from
     from ..records import read_record
-    from ..study import excitation_named, plant_named, with_sensor
 
     plant = with_sensor(
         plant_named(plant_name), merged(options["noise"]), merged(options["resolution"])
@@ -111,8 +111,8 @@ def _require_playable(record: Any, plant: Any) -> None:
 @json_option
 @computing
 def simulate(
-    plant: str, input_file: Path | None, out: Path | None, overwrite: bool, plot: Path | None,
-    as_json: bool, **options: Any,
+    plant: str, input_file: Path | None, out: Path | None, plot: Path | None, as_json: bool,
+    **options: Any,
 ) -> None:  # fmt: skip
     """Run one experiment on PLANT and record what its sensor shows.
 
@@ -127,7 +127,7 @@ def simulate(
     from ..simulation import run_episode
 
     if out is not None:
-        require_record_path(out, overwrite)
+        require_record_path(out, options["overwrite"])
     job = prepared(options, plant, input_file)
     with progress_bar("simulating"):
         run = run_episode(job["plant"], job["params"], job["excitation"], job["steps"], job["key"])

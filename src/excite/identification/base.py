@@ -12,7 +12,8 @@ from jaxtyping import Float
 
 from ..description import PlantDescription, names_of
 from ..estimation.diagnosis import correlation, fit_percent
-from ..records import Record, csv_text, new_run_folder, write_json, write_record
+from ..files import csv_text, new_run_folder, write_json
+from ..records import Record, write_record
 
 
 @dataclass(frozen=True)

@@ -29,9 +29,10 @@ from ..estimation.diagnosis import (
     widened,
     worst_seen,
 )
+from ..files import json_ready
 from ..information import relative_size
 from ..plant import AbstractPlant, Params, params_from
-from ..records import Record, json_ready
+from ..records import Record
 from .base import Fitted, Identification
 
 InitialState = Literal["auto", "free", "known"]

@@ -1,0 +1,112 @@
+"""Files and folders that are written whole or not at all; JSON and CSV as text.
+
+Everything is written under another name first and then renamed, so that a reader, or a
+run that is interrupted, never leaves or meets half of anything.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import io
+import json
+import math
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+
+def csv_text(columns: Mapping[str, Any]) -> str:
+    """Columns of numbers as CSV text; every number is read back exactly."""
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow(columns)
+    rows = zip(*(np.asarray(v, float).tolist() for v in columns.values()), strict=True)
+    writer.writerows([repr(value) for value in row] for row in rows)
+    return buffer.getvalue()
+
+
+def json_ready(value: Any) -> Any:
+    """A copy with plain types only; a number that is not finite becomes None."""
+    if isinstance(value, Mapping):
+        return {str(k): json_ready(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [json_ready(v) for v in value]
+    if isinstance(value, np.ndarray | np.generic) or hasattr(value, "__array__"):
+        return json_ready(np.asarray(value).tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value
+
+
+def json_text(value: Any) -> str:
+    """`value` as one JSON object."""
+    return json.dumps(json_ready(value), indent=2, ensure_ascii=False, allow_nan=False)
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Writes `value` as JSON, whole or not at all."""
+    write_bytes(path, (json_text(value) + "\n").encode())
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Writes a file, whole or not at all.
+
+    Raises:
+        ValueError: where the folder does not exist or cannot be written.
+    """
+    if not path.parent.is_dir():
+        raise ValueError(f"{path}: the folder {path.parent} does not exist")
+    try:
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be written ({error.strerror})") from None
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+        os.chmod(name, 0o644)  # mkstemp makes files that nobody else may read
+        os.replace(name, path)
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be written ({error.strerror})") from None
+    finally:
+        Path(name).unlink(missing_ok=True)
+
+
+def require_free_run_folder(path: Path, overwrite: bool) -> None:
+    """Raises ValueError where a run folder at `path` would hide or lose something."""
+    for parent in path.absolute().parents:
+        if parent.exists():
+            if not parent.is_dir():
+                raise ValueError(f"{path}: {parent} is a file, not a folder")
+            break
+    if not path.exists() or (path.is_dir() and not any(path.iterdir())):
+        return
+    if not (path / "run.json").is_file():
+        raise ValueError(f"{path} exists and is no run folder; choose another name")
+    if not overwrite:
+        raise ValueError(f"{path} holds a run; choose another name or add --overwrite")
+
+
+@contextlib.contextmanager
+def new_run_folder(path: Path, overwrite: bool = False) -> Iterator[Path]:
+    """A folder to fill, which appears at `path` only when everything in it is written."""
+    require_free_run_folder(path, overwrite)
+    path = path.absolute()
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        unfinished = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be written ({error.strerror})") from None
+    try:
+        yield unfinished
+        unfinished.chmod(0o755)
+        if path.exists():
+            shutil.rmtree(path)
+        unfinished.rename(path)
+    finally:
+        shutil.rmtree(unfinished, ignore_errors=True)
