@@ -116,7 +116,7 @@ class Output(_Named):
             f"noise_sd and resolution of output {self.name!r} must not be negative",
         )
         _require(
-            (self.warning_level or 0.1) > 0 and (self.critical_level or 1.0) > 0,
+            all(v is None or v > 0 for v in (self.warning_level, self.critical_level)),
             f"the levels of output {self.name!r} are magnitudes and must be positive",
         )
         if self.warning_level is not None and self.critical_level is not None:

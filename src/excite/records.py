@@ -162,17 +162,16 @@ def _read_csv(path: Path) -> dict[str, np.ndarray | list[str]]:
     lines = text.splitlines()
     if not lines:
         raise ValueError(f"{path}: the file is empty")
+    try:
+        rows = list(csv.reader(lines, delimiter=_delimiter(lines[0])))
+    except csv.Error as error:
+        raise ValueError(f"{path}: cannot be read as CSV text ({error})") from None
     if not text.endswith(("\n", "\r")):
         # A number cut in half is still a number: only the line's end shows that it is whole.
         raise ValueError(
             f"{path}: line {len(lines)} does not end with a line break; is the file truncated? "
             "(add one if it is complete)"
         )
-    delimiter = next((d for d in (",", ";", "\t") if d in lines[0]), ",")
-    try:
-        rows = list(csv.reader(lines, delimiter=delimiter))
-    except csv.Error as error:
-        raise ValueError(f"{path}: cannot be read as CSV text ({error})") from None
     header = [name.strip() for name in rows[0]]
     if len(set(header)) < len(header):
         raise ValueError(f"{path}: the header names a column twice: {', '.join(header)}")
@@ -184,6 +183,10 @@ def _read_csv(path: Path) -> dict[str, np.ndarray | list[str]]:
                 f"{len(header)}; is the file truncated?"
             )
     return {name: [row[i].strip() for _, row in body] for i, name in enumerate(header)}
+
+
+def _delimiter(header: str) -> str:
+    return next((d for d in (",", ";", "\t") if d in header), ",")
 
 
 def _read_mat(path: Path) -> dict[str, np.ndarray | list[str]]:
@@ -281,10 +284,13 @@ def _read_sidecar(path: Path) -> Mapping[str, Any]:
         raise ValueError(f"{sidecar}: cannot be read as JSON ({error})") from None
     if not (isinstance(content, dict) and content.get("kind") == RECORD_KIND):
         return {}
-    if "plant" in content:
+    plant = content.get("plant", {})
+    if not isinstance(plant, dict):
+        raise ValueError(f"{sidecar}: 'plant' is no plant description")
+    if plant:
         try:
-            PlantDescription.from_dict(content["plant"])
-        except (ValueError, AttributeError) as error:
+            PlantDescription.from_dict(plant)
+        except ValueError as error:
             raise ValueError(f"{sidecar}: {error}") from None
     return content
 
