@@ -11,7 +11,8 @@ import click
 import pytest
 
 from excite.cli import cli
-from excite.study import ESTIMATORS, EXCITATIONS, PLANTS, read_study
+from excite.names import ESTIMATORS, EXCITATIONS, PLANTS
+from excite.study import read_study
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()

@@ -19,7 +19,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Key, PRNGKeyArray
 
 from .description import PlantDescription, display_unit, names_of
 from .estimation import AbstractEstimator, Status, stack_experiments
@@ -52,8 +52,8 @@ class Episodes(eqx.Module):
     params: Params
     trajectory: Trajectory
     is_violation: Array
-    max_abs_output: Float[Array, "episode output"]
-    bound: Float[Array, "episode param"]
+    max_abs_output: Float[Array, "*episode output"]
+    bound: Float[Array, "*episode param"]
 
 
 @eqx.filter_jit
@@ -62,7 +62,7 @@ def evaluate(
     excitation: AbstractExcitation,
     num_steps: int,
     spread: float,
-    keys: PRNGKeyArray,
+    keys: Key[Array, " episode"],
 ) -> Episodes:
     """One episode a key. The plant and the noise of a key are the same for any excitation."""
 

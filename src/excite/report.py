@@ -70,7 +70,8 @@ def reference_cells(row: Mapping[str, Any], reference: Mapping[str, Any]) -> lis
     """A published row in the columns of the method's own `row`."""
     cells = [row["method"], "as published"]
     for name in row["relative_error_percent"]:
-        cells += [_mean_sd(*reference["relative_error_percent"][name]), "–"]
+        published = reference["relative_error_percent"].get(name)
+        cells += ["–" if published is None else _mean_sd(*published), "–"]
     return [*cells, _mean_sd(*reference["max_abs_output"]), reference["violations"], "–"]
 
 

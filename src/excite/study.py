@@ -139,11 +139,9 @@ class Study(_Settings):
         for method, row in self.reference.items():
             if method not in self.methods:
                 raise unknown("method in reference", method, self.methods)
-            for name in (*row.relative_error_percent, *parameters):
+            for name in row.relative_error_percent:
                 if name not in parameters:
                     raise unknown(f"parameter in reference.{method}", name, parameters)
-                if name not in row.relative_error_percent:
-                    raise ValueError(f"reference.{method} lacks the parameter {name!r}")
 
     def changed(self, estimators: str | None = None, **values: Any) -> Study:
         """The same study with other settings; None leaves a setting as it is.

@@ -187,7 +187,7 @@ def _fit(
         if held is None:
             return fit
         chosen, value, why = held
-        start = start._replace(**{names[chosen]: jnp.asarray(value)})
+        start = start._replace(**{names[chosen]: jnp.asarray(value, float)})
         free = free & (np.arange(len(names)) != chosen)
         reasons = (*reasons, why)
         if not free.any():

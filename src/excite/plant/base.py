@@ -218,7 +218,7 @@ def params_from(plant: AbstractPlant, values: Mapping[str, float]) -> Params:
                 f"{'minus infinity' if lower is None else format(lower, 'g')} and below "
                 f"{'infinity' if p.upper is None else format(p.upper, 'g')}"
             )
-    given = {name: jnp.asarray(float(value)) for name, value in values.items()}
+    given = {name: jnp.asarray(value, float) for name, value in values.items()}
     return plant.nominal._replace(**given)
 
 

@@ -1,0 +1,327 @@
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+from documented import documented
+
+from excite import benchmark
+from excite.benchmark import (
+    Episodes,
+    evaluate,
+    run_benchmark,
+    wilson,
+    write_benchmark,
+)
+from excite.estimation import Status
+from excite.excitation import PRBS, Chirp, Random
+from excite.files import json_ready
+from excite.identification import best_possible
+from excite.plant import EMPS, Aero2, draw_params
+from excite.study import Study, read_study
+
+ROOT = Path(__file__).parent.parent
+PARAMETERS = ("J_p", "K_pu", "D_p")
+PLANT = Aero2()
+
+
+def tiny(**settings: Any) -> Study:
+    """Two methods, a handful of short episodes, the paper's estimator with a wide start."""
+    study: dict[str, Any] = {
+        "name": "tiny",
+        "plant": "aero2",
+        "episodes": 8,
+        "num_steps": 60,
+        "seed": 5,
+        "methods": {"random": {"excitation": "random"}, "prbs": {"excitation": "prbs", "clock": 5}},
+        "estimators": {"arx-rls-wide": {"kind": "arx-rls", "start_covariance": 1e8}},
+    }
+    return Study.model_validate({**study, **settings})
+
+
+@pytest.fixture(scope="module")
+def rows() -> list[dict[str, Any]]:
+    return run_benchmark(tiny())
+
+
+# Rows
+
+
+def test_rows_are_methods_in_order_each_with_all_estimators(rows):
+    assert [(r["method"], r["estimator"]) for r in rows] == [
+        ("random", "arx-rls-wide"), ("prbs", "arx-rls-wide"),
+    ]  # fmt: skip
+
+
+def test_a_row_has_the_keys_that_are_documented(rows):
+    for row in rows:
+        assert set(row) == documented("benchmark")
+        assert set(row) >= {
+            "method", "estimator", "evaluations", "failed", "violations", "max_abs_output",
+            "relative_error_percent", "cramer_rao_percent",
+        }  # fmt: skip
+        assert set(row["max_abs_output"]) == {"output", "mean", "sd", "unit"}
+        assert row["max_abs_output"]["unit"] == "deg"
+        for key in (
+            "relative_error_percent", "cramer_rao_percent", "rms_over_cramer_rao",
+            "coverage95_percent",
+        ):  # fmt: skip
+            assert tuple(row[key]) == PARAMETERS
+        for error in row["relative_error_percent"].values():
+            assert set(error) == {"mean", "sd", "median", "rms"}
+
+
+def test_a_row_is_plain_json(rows):
+    assert json.loads(json.dumps(json_ready(rows), allow_nan=False)) == json_ready(rows)
+
+
+def test_counts_add_up(rows):
+    for row in rows:
+        assert row["evaluations"] == 8
+        assert row["failed"] == sum(row["failures"].values())
+        assert row["violation_rate"]["estimate"] == row["violations"] / 8
+
+
+def test_a_run_in_chunks_is_the_run_in_one(rows, monkeypatch):
+    monkeypatch.setattr(benchmark, "CHUNK", 4)
+    reports = []
+    study = tiny(methods={"random": {"excitation": "random"}})
+    chunked = run_benchmark(study, lambda *report: reports.append(report))
+    assert reports == [("random", 0, 2), ("random", 1, 2), ("done", 2, 2)]
+
+    def assert_equal(a: Any, b: Any) -> None:
+        if isinstance(a, dict):
+            assert a.keys() == b.keys()
+            for key in a:
+                assert_equal(a[key], b[key])
+        elif isinstance(a, float):
+            assert a == pytest.approx(float(b), rel=1e-6, nan_ok=True)
+        else:
+            assert a == b
+
+    (row,) = chunked
+    assert_equal(json_ready(rows[0]), json_ready(row))
+
+
+def test_a_study_runs_twice_to_the_same_rows_and_its_seed_changes_them(rows):
+    assert json_ready(run_benchmark(tiny())) == json_ready(rows)
+    other = run_benchmark(tiny(seed=6))
+    assert other[0]["max_abs_output"]["mean"] != rows[0]["max_abs_output"]["mean"]
+
+
+def test_a_sensor_without_noise_is_refused_because_nothing_bounds_it():
+    with pytest.raises(ValueError, match="without noise has no Cramér-Rao bound"):
+        run_benchmark(tiny(sensor={"pitch": {"noise_sd": 0.0}}))
+
+
+# Identical conditions
+
+
+@pytest.fixture(scope="module")
+def episodes() -> dict[str, Episodes]:
+    """The same keys under three excitations."""
+    keys = jax.random.split(jax.random.key(5), 8)
+    methods = {"random": Random(), "prbs": PRBS(clock=5), "chirp": Chirp()}
+    return {name: evaluate(PLANT, m, 60, 0.3, keys) for name, m in methods.items()}
+
+
+@pytest.mark.parametrize("other", ["prbs", "chirp"])
+def test_every_method_sees_the_same_plants_and_noise(other, episodes):
+    a, b = episodes["random"], episodes[other]
+    np.testing.assert_array_equal(a.params, b.params)
+    noise = [np.asarray(e.trajectory.measured - e.trajectory.outputs) for e in (a, b)]
+    np.testing.assert_allclose(noise[0], noise[1], atol=1e-12)
+    assert np.std(noise[0]) == pytest.approx(2e-4, rel=0.1)
+    assert np.max(np.abs(a.trajectory.inputs - b.trajectory.inputs)) > 1
+
+
+def test_every_episode_has_a_plant_and_noise_of_its_own(episodes):
+    e = episodes["random"]
+    noise = np.asarray(e.trajectory.measured - e.trajectory.outputs)[..., 0]
+    assert np.max(np.abs(np.corrcoef(noise) - np.eye(8))) < 0.5
+    assert all(len(set(np.asarray(p).tolist())) == 8 for p in e.params)
+    inputs = np.asarray(e.trajectory.inputs)[..., 0]
+    assert np.max(np.abs(np.corrcoef(inputs) - np.eye(8))) < 0.5
+
+
+def test_the_bound_of_an_episode_is_that_of_its_own_input_and_plant(episodes):
+    e = episodes["prbs"]
+    params = PLANT.Params(*(p[3] for p in e.params))
+    inputs = e.trajectory.inputs[3]
+    bound = best_possible(PLANT, params, inputs, initial_state_known=True)
+    expected = [p["cramer_rao_percent"] / 100 for p in bound["params"].values()]
+    np.testing.assert_allclose(e.bound[3], expected, rtol=1e-8)
+
+
+def test_violations_are_judged_by_true_outputs(episodes):
+    level = math.radians(40)
+    for e in episodes.values():
+        largest = np.abs(np.asarray(e.trajectory.outputs)).max(axis=1)
+        np.testing.assert_array_equal(e.max_abs_output, largest)
+        np.testing.assert_array_equal(e.is_violation, largest[:, 0] >= level)
+
+
+@pytest.mark.parametrize("plant", [Aero2(), EMPS()], ids=lambda p: p.definition.name)
+@pytest.mark.parametrize("spread", [0.0, 0.3])
+def test_parameters_are_uniform_within_the_spread(plant, spread):
+    draw = jax.vmap(lambda key: jnp.stack(draw_params(plant, key, spread)))
+    drawn = np.asarray(draw(jax.random.split(jax.random.key(0), 2000)))
+    nominal = np.array([p.nominal for p in plant.definition.parameters])
+    unit = (drawn - nominal) / np.abs(nominal)
+    if spread == 0:
+        np.testing.assert_allclose(unit, 0, atol=1e-15)
+        return
+    for column in unit.T:
+        assert scipy.stats.kstest(column, "uniform", (-spread, 2 * spread)).pvalue > 0.01
+    assert np.max(np.abs(np.corrcoef(unit.T) - np.eye(len(nominal)))) < 0.08
+
+
+# Statistics
+
+
+@pytest.mark.parametrize(
+    ("successes", "count"), [(0, 100), (2, 100), (20, 1000), (500, 1000), (7, 7), (0, 1), (1, 3)]
+)
+def test_the_interval_of_a_rate_is_wilsons(successes, count):
+    expected = scipy.stats.binomtest(successes, count).proportion_ci(method="wilson")
+    low, high = wilson(successes, count)
+    assert low == pytest.approx(expected.low, abs=1e-6)
+    assert high == pytest.approx(expected.high, abs=1e-6)
+    assert 0 <= low <= successes / count <= high <= 1
+
+
+def outcome(status: list[Status], estimated: list[list[float]]) -> Any:
+    """Episodes of a plant whose parameters are 2, 4 and 5, with standard errors of 10 %."""
+    true = np.tile([2.0, 4.0, 5.0], (len(status), 1))
+    return benchmark._Outcome(
+        true=true,
+        estimated=np.array(estimated),
+        std_error=0.1 * true,
+        status=np.array([int(s) for s in status]),
+        is_violation=np.arange(len(status)) == 0,
+        max_abs_output=np.full((len(status), 1), math.radians(10)),
+        bound=np.full((len(status), 3), 0.05),
+    )
+
+
+GOOD, BAD = [2.2, 3.6, 5.0], [math.nan, math.inf, -1e9]
+
+
+def test_means_are_over_the_estimates_that_did_not_fail():
+    status = [Status.SUCCESSFUL, Status.UNPHYSICAL, Status.SUCCESSFUL, Status.NOT_FINITE]
+    mixed = outcome(status, [GOOD, BAD, [1.4, 4.0, 5.5], BAD])
+    row = benchmark._row(PLANT.description, "m", "e", mixed)
+    assert (row["evaluations"], row["failed"]) == (4, 2)
+    assert row["failures"] == {"not_finite": 1, "unphysical": 1}
+    errors = {"J_p": [10, 30], "K_pu": [10, 0], "D_p": [0, 10]}
+    for name, (a, b) in errors.items():
+        error = row["relative_error_percent"][name]
+        assert error["mean"] == pytest.approx((a + b) / 2)
+        assert error["sd"] == pytest.approx(abs(a - b) / math.sqrt(2))
+        assert error["median"] == pytest.approx((a + b) / 2)
+        assert error["rms"] == pytest.approx(math.hypot(a, b) / math.sqrt(2))
+        assert row["rms_over_cramer_rao"][name] == pytest.approx(error["rms"] / 5)
+    assert row["coverage95_percent"] == {"J_p": 50, "K_pu": 100, "D_p": 100}
+    assert row["beyond_6_std_errors"] == 0
+
+
+def test_violations_and_outputs_are_those_of_all_episodes():
+    status = [Status.UNPHYSICAL, Status.SUCCESSFUL]
+    row = benchmark._row(PLANT.description, "m", "e", outcome(status, [BAD, GOOD]))
+    assert row["violations"] == 1
+    assert row["violation_rate"] == {"estimate": 0.5, "ci95": wilson(1, 2)}
+    assert row["max_abs_output"]["mean"] == pytest.approx(10)
+    assert row["max_abs_output"]["sd"] == pytest.approx(0, abs=1e-12)
+
+
+def test_an_estimate_far_outside_its_own_interval_is_counted():
+    status = [Status.SUCCESSFUL] * 3
+    wrong = outcome(status, [GOOD, [2.0, 4.0, 8.1], [4.0, 0.1, 5.0]])
+    row = benchmark._row(PLANT.description, "m", "e", wrong)
+    assert row["beyond_6_std_errors"] == 2
+
+
+def test_where_every_estimate_failed_there_is_no_mean():
+    row = benchmark._row(PLANT.description, "m", "e", outcome([Status.UNPHYSICAL] * 2, [BAD, BAD]))
+    assert (row["evaluations"], row["failed"]) == (2, 2)
+    plain = json_ready(row)
+    for name in PARAMETERS:
+        assert set(plain["relative_error_percent"][name].values()) == {None}
+        assert plain["rms_over_cramer_rao"][name] is None
+        assert plain["coverage95_percent"][name] is None
+        assert plain["cramer_rao_percent"][name] == pytest.approx(5)
+    assert row["violations"] == 1
+
+
+# The run folder
+
+
+def test_a_run_folder_holds_study_and_rows(rows, tmp_path):
+    study = tiny()
+    write_benchmark(study, rows, {"table.md": b"shown"}, tmp_path / "run")
+    folder = tmp_path / "run"
+    assert {f.name for f in folder.iterdir()} == {
+        "table.json", "table.md", "study.json", "run.json",
+    }  # fmt: skip
+    assert json.loads((folder / "table.json").read_text()) == {"rows": json_ready(rows)}
+    assert (folder / "table.md").read_bytes() == b"shown"
+    assert Study.model_validate(json.loads((folder / "study.json").read_text())) == study
+
+
+# The paper's baselines
+
+
+@pytest.fixture(scope="module")
+def baselines() -> tuple[Study, dict[tuple[str, str], dict[str, Any]]]:
+    study = read_study(ROOT / "studies" / "baselines.toml")
+    study = study.changed(estimators="arx-rls,nls", episodes=200)
+    return study, {(r["method"], r["estimator"]): r for r in run_benchmark(study)}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["random", "prbs", "chirp"])
+def test_the_papers_rows_are_reproduced(method, baselines):
+    study, table = baselines
+    row, published = table[method, "arx-rls"], study.reference[method]
+    assert row["failed"] == 0
+    for name in ("K_pu", "D_p"):
+        mean, _ = published.relative_error_percent[name]
+        assert row["relative_error_percent"][name]["mean"] == pytest.approx(mean, rel=0.25)
+    factor = (
+        row["relative_error_percent"]["J_p"]["mean"] / published.relative_error_percent["J_p"][0]
+    )
+    assert 0.5 < factor < 2
+    assert row["max_abs_output"]["mean"] == pytest.approx(published.max_abs_output[0], abs=1.5)
+    low, high = row["violation_rate"]["ci95"]
+    violations, count = map(int, published.violations.split("/"))
+    assert low <= violations / count <= high
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["random", "prbs", "chirp"])
+def test_nonlinear_least_squares_reaches_the_bound(method, baselines):
+    row = baselines[1][method, "nls"]
+    assert row["failed"] == 0
+    assert row["beyond_6_std_errors"] == 0
+    for name in PARAMETERS:
+        assert 0.85 < row["rms_over_cramer_rao"][name] < 1.15
+        assert 90 <= row["coverage95_percent"][name] <= 99
+        # Of a normal error with the bound's standard deviation, the mean magnitude.
+        attainable = math.sqrt(2 / math.pi) * row["cramer_rao_percent"][name]
+        assert row["relative_error_percent"][name]["mean"] == pytest.approx(attainable, rel=0.2)
+
+
+@pytest.mark.slow
+def test_a_signal_that_tells_more_has_the_smaller_bound(baselines):
+    table = baselines[1]
+    for name in PARAMETERS:
+        bounds = [table[m, "nls"]["cramer_rao_percent"][name] for m in ("random", "prbs", "chirp")]
+        assert bounds == sorted(bounds, reverse=True)
+        assert bounds == [
+            table[m, "arx-rls"]["cramer_rao_percent"][name] for m in ("random", "prbs", "chirp")
+        ]

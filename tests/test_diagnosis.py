@@ -1,0 +1,305 @@
+import numpy as np
+import pytest
+import scipy.stats
+from experiments import autoregressive
+
+from excite.estimation.diagnosis import (
+    UNSEEN_SD,
+    chance_of_fit,
+    correlation,
+    fit_percent,
+    identifiability,
+    ljung_box,
+    robust_covariance,
+    widened,
+    worst_seen,
+)
+
+# Fit
+
+
+Y = np.sin(np.arange(40.0)) + 0.3
+
+
+def test_fit_is_100_for_equality_and_0_for_the_mean():
+    assert fit_percent(Y, Y) == 100
+    assert fit_percent(Y, np.full_like(Y, Y.mean())) == pytest.approx(0, abs=1e-12)
+    assert fit_percent(Y, 3 * Y) < 0
+
+
+@pytest.mark.parametrize(("gain", "offset"), [(2.5, 0.0), (-1.0, 4.0), (1e-6, -3e-6)])
+def test_fit_does_not_depend_on_unit_or_origin(gain, offset):
+    model = Y + 0.1 * np.cos(3 * Y)
+    expected = fit_percent(Y, model)
+    assert 0 < expected < 100
+    assert fit_percent(gain * Y + offset, gain * model + offset) == pytest.approx(expected)
+
+
+def test_fit_falls_in_proportion_to_the_misfit():
+    misfit = np.cos(7 * Y)
+    lost = [100 - fit_percent(Y, Y + size * misfit) for size in (0.01, 0.02, 0.04)]
+    np.testing.assert_allclose(lost, lost[0] * np.array([1, 2, 4]))
+
+
+def test_fit_of_an_output_that_never_moves_is_no_number():
+    assert np.isnan(fit_percent(np.ones(10), np.zeros(10)))
+
+
+# Whiteness
+
+
+@pytest.mark.parametrize(("n", "num_lags"), [(300, 25), (60, 25), (500, 5)])
+def test_ljung_box_is_the_published_formula(n, num_lags):
+    e = np.random.default_rng(n).normal(size=n) + 0.2
+    lags = min(num_lags, n // 5)
+    centred = e - e.mean()
+    r = np.correlate(centred, centred, "full")[n - 1 :] / np.sum(centred**2)
+    Q = n * (n + 2) * sum(r[k] ** 2 / (n - k) for k in range(1, lags + 1))
+    assert ljung_box(e, num_lags=num_lags) == pytest.approx(scipy.stats.chi2.sf(Q, lags), rel=1e-9)
+
+
+def test_ljung_box_of_white_noise_is_uniform():
+    noise = np.random.default_rng(1).normal(size=(400, 500))
+    p = np.array([ljung_box(e) for e in noise])
+    assert scipy.stats.kstest(p, "uniform").pvalue > 0.01
+    assert scipy.stats.binomtest(int(np.sum(p < 0.05)), p.size, 0.05).pvalue > 0.01
+
+
+def test_ljung_box_rejects_noise_that_remembers():
+    noise = autoregressive(np.random.default_rng(2), (50, 500), 0.4)
+    assert max(ljung_box(e) for e in noise) < 0.01
+
+
+def test_ljung_box_does_not_depend_on_unit_or_origin():
+    e = autoregressive(np.random.default_rng(3), (300,), 0.1)
+    assert ljung_box(5e-4 * e + 3e-4) == pytest.approx(ljung_box(e), rel=1e-6)
+
+
+def test_ljung_box_of_several_records_adds_their_evidence():
+    noise = np.random.default_rng(11).normal(size=(200, 3, 120))
+    p = np.array([ljung_box(*records) for records in noise])
+    assert scipy.stats.kstest(p, "uniform").pvalue > 0.01
+    weak = autoregressive(np.random.default_rng(12), (8, 150), 0.25)
+    assert ljung_box(*weak) < 0.01 < np.median([ljung_box(e) for e in weak])
+    assert ljung_box(weak[0], np.zeros(50)) == ljung_box(weak[0])
+
+
+@pytest.mark.parametrize("residual", [np.zeros(100), np.full(100, 0.25), np.array([1.0, -1, 1])])
+def test_ljung_box_of_nothing_is_no_number(residual):
+    assert np.isnan(ljung_box(residual))
+
+
+# Chance
+
+
+def test_the_chance_of_a_fit_to_noise_is_uniform():
+    """A regression on noise explains something, and no more often than chance says."""
+    rng = np.random.default_rng(13)
+    X = np.column_stack([np.ones(80), rng.normal(size=(80, 3))])
+    chances = []
+    for y in rng.normal(size=(400, 80)):
+        residual = y - X @ np.linalg.lstsq(X, y)[0]
+        chances.append(chance_of_fit(y, residual, 3))
+    # The test counts one degree of freedom more than there is: the mean is fitted, too.
+    assert scipy.stats.kstest(chances, "uniform").pvalue > 0.01
+
+
+def test_a_fit_that_explains_much_is_no_chance_and_one_that_does_not_is():
+    rng = np.random.default_rng(14)
+    noise = rng.normal(size=200)
+    assert chance_of_fit(Y, 0.1 * Y, 3) < 1e-20
+    assert chance_of_fit(Y, np.zeros_like(Y), 3) == 0
+    assert chance_of_fit(noise, noise, 3) > 0.5
+    assert chance_of_fit(noise, 3 * noise, 3) == 1
+    assert chance_of_fit(np.ones(20), np.zeros(20), 3) == 1
+
+
+# Correlation
+
+
+def test_correlation_undoes_the_units():
+    table = np.array([[1, 0.5, -0.2], [0.5, 1, 0.1], [-0.2, 0.1, 1]])
+    sd = np.array([1e-3, 1.0, 250.0])
+    np.testing.assert_allclose(correlation(table * np.outer(sd, sd)), table, rtol=1e-12)
+
+
+def test_correlation_of_a_held_parameter_is_no_number():
+    result = correlation(np.diag([4.0, 0.0]))
+    assert result[0, 0] == 1
+    assert np.isnan(result[1]).all()
+    assert np.isnan(result[:, 1]).all()
+
+
+# What the data cannot see
+
+
+NAMES = ("a", "b", "c")
+ALL = np.ones(3, bool)
+
+
+def information_of(directions: list[list[float]], sd: list[float]) -> np.ndarray:
+    """Information whose (orthogonal) directions are known to these standard deviations."""
+    V = np.array(directions, float)
+    V /= np.linalg.norm(V, axis=1, keepdims=True)
+    return V.T @ np.diag(1 / np.array(sd) ** 2) @ V
+
+
+def test_when_all_is_seen_nothing_is_held():
+    assert worst_seen(NAMES, information_of(np.eye(3).tolist(), [0.01, 0.4, 0.1]), ALL) is None
+
+
+@pytest.mark.parametrize(("factor", "is_seen"), [(0.98, True), (1.02, False)])
+def test_a_direction_is_seen_when_its_standard_deviation_is_below_the_limit(factor, is_seen):
+    information = information_of(np.eye(3).tolist(), [0.01, factor * UNSEEN_SD, 0.01])
+    assert (worst_seen(NAMES, information, ALL) is None) == is_seen
+
+
+@pytest.mark.parametrize("index", [0, 1, 2])
+def test_one_unseen_parameter_is_named(index):
+    information = 1e4 * np.eye(3)
+    information[index, index] = 0.0
+    found = worst_seen(NAMES, information, ALL)
+    assert found is not None
+    assert found == (index, f"the data cannot see {NAMES[index]}")
+
+
+def test_an_unseen_combination_is_named_with_its_exponents():
+    # The data see a b and c: a may grow as b falls.
+    information = information_of([[1, 1, 0], [0, 0, 1], [1, -1, 0]], [0.01, 0.01, 1e6])
+    found = worst_seen(NAMES, information, ALL)
+    assert found is not None
+    index, why = found
+    assert NAMES[index] in ("a", "b")
+    assert "cannot tell a and b apart" in why
+    exponents = dict(part.split("^") for part in why.split(": ")[1].split(" could")[0].split())
+    assert sorted(exponents) == ["a", "b"]
+    assert float(exponents["a"]) == pytest.approx(-float(exponents["b"]))
+
+
+def test_of_a_combination_the_largest_part_is_held():
+    information = information_of([[1, 2, 0], [0, 0, 1], [2, -1, 0]], [0.01, 0.01, 1e6])
+    found = worst_seen(NAMES, information, ALL)
+    assert found is not None
+    assert found[0] == 0
+
+
+def test_held_parameters_are_left_out():
+    information = np.diag([1e4, 0.0, 1e4])
+    assert worst_seen(NAMES, information, np.array([True, False, True])) is None
+    found = worst_seen(NAMES, np.diag([0.0, 0.0, 1e-3]), np.array([False, False, True]))
+    assert found is not None
+    assert found[0] == 2
+    assert worst_seen(NAMES, np.zeros((3, 3)), np.zeros(3, bool)) is None
+
+
+@pytest.mark.parametrize("value", [0.0, np.nan, np.inf])
+def test_where_nothing_is_seen_one_parameter_after_the_other_is_held(value):
+    free, held = ALL.copy(), []
+    while (found := worst_seen(NAMES, np.full((3, 3), value), free)) is not None:
+        held.append(int(found[0]))
+        free[found[0]] = False
+    assert sorted(held) == [0, 1, 2]
+
+
+def test_rounding_below_zero_counts_as_unseen():
+    found = worst_seen(NAMES, np.diag([1e4, -1e-9, 1e4]), ALL)
+    assert found is not None
+    assert found[0] == 1
+
+
+def test_identifiability_names_the_worst_direction_and_its_size():
+    sentence = identifiability(NAMES, np.diag([1e-4, 0.04, 1e-6]), ALL)
+    assert sentence == "the data see all of a, b, c; worst is b, to 20 %"
+    pair = np.array([[0.01, -0.0099, 0], [-0.0099, 0.01, 0], [0, 0, 1e-4]])
+    assert "a combination of a and b, to 14 %" in identifiability(NAMES, pair, ALL)
+    held = identifiability(NAMES, np.diag([1e-4, 9.0, 1e-6]), np.array([True, False, True]))
+    assert held == "the data see all of a, c; worst is a, to 1 %"
+
+
+# Robust covariance
+
+
+N = 2000
+TIME = np.arange(N) / N
+REGRESSORS = np.column_stack([np.ones(N), np.sin(6 * TIME), np.cos(9 * TIME + 0.4)])
+
+
+def white_covariance(X: np.ndarray, residual: np.ndarray) -> np.ndarray:
+    return np.linalg.inv(X.T @ X) * np.mean(residual**2)
+
+
+def regressions(rho: float, count: int = 300) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """True standard deviation of regression coefficients, and both kinds of standard error."""
+    noise = autoregressive(np.random.default_rng(5), (count, N), rho)
+    inverse = np.linalg.pinv(REGRESSORS)
+    estimates = noise @ inverse.T
+    residuals = noise - estimates @ REGRESSORS.T
+    S = REGRESSORS[None, :, None, :]
+    robust = [np.diag(robust_covariance(S, r[None, :, None])) for r in residuals]
+    white = [np.diag(white_covariance(REGRESSORS, r)) for r in residuals]
+    true = np.sqrt(np.mean(estimates**2, axis=0))
+    return true, np.sqrt(np.mean(robust, axis=0)), np.sqrt(np.mean(white, axis=0))
+
+
+def test_robust_standard_errors_hold_for_noise_that_remembers():
+    true, robust, white = regressions(0.9)
+    assert np.all(np.abs(robust / true - 1) < 0.25)
+    assert np.all(true > 2 * white)  # what they repair
+
+
+def test_robust_standard_errors_of_white_noise_are_the_usual_ones():
+    true, robust, white = regressions(0.0)
+    np.testing.assert_allclose(robust, white, rtol=0.05)
+    np.testing.assert_allclose(robust, true, rtol=0.1)
+
+
+def test_robust_covariance_is_bartletts_sum_over_lags():
+    rng = np.random.default_rng(6)
+    S = rng.normal(size=(1, 400, 1, 2))
+    residual = autoregressive(rng, (1, 1, 400), 0.7).swapaxes(1, 2)
+    rho = np.sum(residual[:, 1:] * residual[:, :-1]) / np.sum(residual**2)
+    width = int(1.1447 * ((2 * rho / (1 - rho**2)) ** 2 * 400) ** (1 / 3))
+    assert width > 5
+    scores = S[0, :, 0] * residual[0]
+    V = scores.T @ scores
+    for lag in range(1, width):
+        gamma = scores[lag:].T @ scores[:-lag]
+        V += (1 - lag / width) * (gamma + gamma.T)
+    H = np.linalg.inv(S[0, :, 0].T @ S[0, :, 0])
+    np.testing.assert_allclose(robust_covariance(S, residual), H @ V @ H, rtol=1e-9)
+
+
+def test_experiments_side_by_side_share_their_information():
+    rng = np.random.default_rng(7)
+    S = rng.normal(size=(1, 300, 2, 2))
+    residual = rng.normal(size=(1, 300, 2))
+    one = robust_covariance(S, residual)
+    two = robust_covariance(np.concatenate([S, S]), np.concatenate([residual, residual]))
+    np.testing.assert_allclose(two, one / 2, rtol=1e-9)
+
+
+def test_robust_covariance_follows_the_units_of_the_unknowns():
+    rng = np.random.default_rng(8)
+    S, residual = rng.normal(size=(2, 200, 1, 3)), rng.normal(size=(2, 200, 1))
+    units = np.array([1e-4, 1.0, 3e5])
+    expected = robust_covariance(S, residual) * np.outer(units, units)
+    np.testing.assert_allclose(robust_covariance(S / units, residual), expected, rtol=1e-8)
+
+
+def test_an_unknown_without_influence_gets_no_covariance():
+    rng = np.random.default_rng(9)
+    S, residual = rng.normal(size=(1, 200, 1, 3)), rng.normal(size=(1, 200, 1))
+    S[..., 1] = 0.0
+    covariance = robust_covariance(S, residual)
+    assert np.all(covariance[1] == 0)
+    assert np.all(covariance[:, 1] == 0)
+    rest = robust_covariance(S[..., [0, 2]], residual)
+    np.testing.assert_allclose(covariance[np.ix_([0, 2], [0, 2])], rest, rtol=1e-9)
+
+
+def test_intervals_are_widened_and_never_narrowed():
+    white = np.array([[4.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
+    result = widened(white, np.diag([1.0, 9.0, 5.0]))
+    np.testing.assert_allclose(np.diag(result), [4, 9, 0])
+    np.testing.assert_allclose(correlation(result)[0, 1], correlation(white)[0, 1])
+    np.testing.assert_array_equal(widened(white, np.zeros((3, 3))), white)

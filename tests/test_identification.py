@@ -1,0 +1,516 @@
+import contextlib
+import dataclasses
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.monitoring
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.io
+from documented import documented
+from experiments import NUM_STEPS, autoregressive, record_of, spread_params
+
+from excite.description import Input, Output, Parameter, PlantDescription, State
+from excite.estimation import ARX
+from excite.excitation import PRBS, Random, Replay
+from excite.files import json_ready
+from excite.identification import Identification, best_possible, identify, write_run
+from excite.plant import EMPS, AbstractPlant, Aero2, DCMotor
+from excite.records import Record, read_record, write_record
+
+ROOT = Path(__file__).parent.parent
+PLANT = Aero2()
+TRUE = spread_params(PLANT)
+TRUTH = {name: float(value) for name, value in TRUE._asdict().items()}
+REST = Replay(jnp.zeros((NUM_STEPS, 1)))
+
+
+def free_decay(pitch: float = 0.4) -> Record:
+    """The plant let go from an angle, without input and without a sidecar."""
+    lifted = PLANT.changed(initial_state=jnp.array([pitch, 0.0]))
+    return record_of(lifted, REST, params=TRUE, sidecar=False)
+
+
+def assert_within_sd(result: Identification, truth: Any, times: float = 4.0) -> None:
+    """Every free parameter lies within so many standard errors of the truth."""
+    for name in result.params.keys() - set(result.held):
+        assert abs(result.params[name] - truth[name]) < times * result.std_error[name], name
+
+
+@pytest.fixture(scope="module")
+def chirp() -> Record:
+    return record_of(PLANT, params=TRUE)
+
+
+@pytest.fixture(scope="module")
+def foreign() -> Record:
+    """Another experiment, of which nothing is known but the numbers."""
+    return dataclasses.replace(
+        record_of(PLANT, PRBS(clock=5), params=TRUE, seed=1, sidecar=False), source="foreign.csv"
+    )
+
+
+@pytest.fixture(scope="module")
+def result(chirp, foreign) -> Identification:
+    return identify(PLANT, [chirp], validation=[foreign])
+
+
+# A good record
+
+
+def test_parameters_lie_within_their_standard_errors(result):
+    assert result.status == "successful"
+    assert result.is_usable
+    assert result.held == ()
+    assert_within_sd(result, TRUTH)
+
+
+def test_standard_errors_are_those_of_the_bound(result, chirp):
+    bound = best_possible(PLANT, TRUE, jnp.asarray(chirp.inputs[:-1]), initial_state_known=True)
+    for name, error in result.std_error.items():
+        assert error == pytest.approx(bound["params"][name]["cramer_rao_bound"], rel=0.15)
+
+
+def test_intervals_are_196_standard_errors_to_both_sides(result):
+    for name, (low, high) in ((n, result.ci95(n)) for n in result.params):
+        assert (low + high) / 2 == pytest.approx(result.params[name], rel=1e-12)
+        assert (high - low) / result.std_error[name] == pytest.approx(2 * 1.959964, rel=1e-6)
+
+
+def test_fit_is_that_of_the_simulated_output(result, chirp):
+    (fitted,) = result.fitted
+    y = chirp.outputs[:, 0]
+    misfit = np.linalg.norm(y - fitted.simulated[:, 0]) / np.linalg.norm(y - y.mean())
+    assert result.fit()["pitch"] == pytest.approx(100 * (1 - misfit), rel=1e-12)
+    assert fitted.fit_percent["pitch"] == pytest.approx(result.fit()["pitch"])
+    assert result.fit()["pitch"] > 99
+
+
+def test_a_residual_of_sensor_noise_is_white_and_the_verdict_is_one_sentence(result):
+    assert result.whiteness["pitch"] > 0.01
+    assert len(result.verdict) == 1
+    assert result.verdict[0].startswith("the data see all of J_p, K_pu, D_p; worst is ")
+
+
+def test_held_out_data_are_simulated_with_the_estimate(result, foreign):
+    (validated,) = result.validation
+    assert validated.record is foreign
+    assert validated.fit_percent["pitch"] > 99
+    assert np.std(foreign.outputs - validated.simulated) == pytest.approx(2e-4, rel=0.3)
+
+
+def test_held_out_data_change_no_estimate(result, chirp):
+    assert identify(PLANT, [chirp]).params == result.params
+
+
+def test_the_start_changes_no_estimate(result, chirp):
+    moved = identify(PLANT, [chirp], start={"J_p": 0.018, "K_pu": 0.016, "D_p": 0.002})
+    for name, value in moved.params.items():
+        assert abs(value - result.params[name]) < 0.02 * result.std_error[name]
+
+
+# Initial states
+
+
+def test_the_initial_state_is_known_where_the_sidecar_says_so(chirp, foreign, tmp_path):
+    write_record(tmp_path / "ours.csv", chirp, PLANT.description)
+    ours = read_record(tmp_path / "ours.csv", PLANT.description)
+    assert identify(PLANT, [ours]).initial_state_known
+    assert not identify(PLANT, [foreign]).initial_state_known
+    assert not identify(PLANT, [ours], initial_state="free").initial_state_known
+    assert identify(PLANT, [foreign], initial_state="known").initial_state_known
+
+
+def test_a_sidecar_of_another_initial_state_leaves_it_free():
+    lifted = PLANT.changed(initial_state=jnp.array([0.2, 0.0]))
+    record = record_of(lifted, params=TRUE)
+    assert record.starts_at_initial_state
+    result = identify(PLANT, [record])
+    assert not result.initial_state_known
+    assert_within_sd(result, TRUTH)
+
+
+def test_a_free_initial_state_costs_accuracy(result, chirp):
+    free = identify(PLANT, [chirp], initial_state="free")
+    assert_within_sd(free, TRUTH)
+    assert free.std_error["J_p"] > 1.1 * result.std_error["J_p"]
+
+
+# Several records
+
+
+def test_records_fitted_together_share_their_information(chirp, foreign):
+    short = dataclasses.replace(
+        foreign, time=foreign.time[:151], inputs=foreign.inputs[:151], outputs=foreign.outputs[:151]
+    )
+    together = identify(PLANT, [chirp, short], initial_state="known")
+    assert_within_sd(together, TRUTH)
+    parts = [
+        best_possible(PLANT, TRUE, jnp.asarray(r.inputs[:-1]), initial_state_known=True)[
+            "information"
+        ]
+        for r in (chirp, short)
+    ]
+    np.testing.assert_allclose(together.information, sum(parts), rtol=0.3)
+    assert [len(f.simulated) for f in together.fitted] == [NUM_STEPS + 1, 151]
+    assert together.fit()["pitch"] > 99
+
+
+def test_each_record_has_an_initial_state_of_its_own(foreign):
+    result = identify(PLANT, [free_decay(), foreign])
+    assert result.held == ()
+    assert_within_sd(result, TRUTH)
+    assert min(f.fit_percent["pitch"] for f in result.fitted) > 99
+
+
+def test_one_record_from_elsewhere_frees_all_initial_states(chirp, foreign):
+    assert not identify(PLANT, [chirp, foreign]).initial_state_known
+
+
+# What the data cannot see
+
+
+@pytest.fixture(scope="module")
+def decay() -> Identification:
+    return identify(PLANT, [free_decay()], start={"K_pu": 0.03})
+
+
+def test_a_free_decay_holds_the_input_gain_and_fits_the_rest(decay):
+    assert decay.status == "partly identifiable"
+    assert decay.is_usable
+    assert decay.held == ("K_pu",)
+    assert decay.params["K_pu"] == pytest.approx(0.03, rel=1e-9)
+    assert np.isnan(decay.std_error["K_pu"])
+    assert_within_sd(decay, TRUTH)
+    assert decay.fit()["pitch"] > 99
+
+
+def test_a_sentence_names_the_held_parameter_and_where_it_was_held(decay):
+    assert decay.verdict[0] == "the data cannot see K_pu; K_pu was held at 0.03"
+    assert decay.verdict[1].startswith("the data see all of J_p, D_p; worst is ")
+
+
+def test_a_held_parameter_is_null_in_json_but_for_its_value(decay):
+    entry = json_ready(decay.to_dict())["params"]["K_pu"]
+    assert entry["estimate"] == pytest.approx(0.03)
+    assert entry["held"] is True
+    assert entry["std_error"] is None
+    assert entry["ci95"] == [None, None]
+
+
+def noise_only(record: Record) -> Record:
+    noise = 2e-4 * np.random.default_rng(0).normal(size=record.outputs.shape)
+    return dataclasses.replace(record, outputs=noise)
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda r: noise_only(dataclasses.replace(r, inputs=0 * r.inputs)),
+        lambda r: dataclasses.replace(r, inputs=0 * r.inputs, outputs=0 * r.outputs),
+        lambda r: dataclasses.replace(r, outputs=0 * r.outputs),
+        noise_only,
+    ],
+    ids=["noise at rest", "nothing", "no response", "noise for a response"],
+)
+def test_data_in_which_no_parameter_can_be_seen_are_refused(spoil, foreign):
+    with pytest.raises(ValueError, match="no parameter can be seen in the data") as error:
+        identify(PLANT, [spoil(foreign)])
+    assert "\n" not in str(error.value)
+
+
+def test_a_record_of_a_plant_with_other_constants_is_remarked(chirp):
+    result = identify(PLANT.changed(m=1.2), [dataclasses.replace(chirp, source="chirp.csv")])
+    assert any("chirp.csv" in s and "other known constants" in s for s in result.verdict)
+
+
+def test_an_input_of_the_wrong_sign_gives_no_usable_result(foreign):
+    result = None
+    with contextlib.suppress(ValueError):
+        result = identify(PLANT, [dataclasses.replace(foreign, inputs=-foreign.inputs)])
+    assert result is None or not result.is_usable
+
+
+# Bad input
+
+
+def part(record: Record, rows: slice) -> Record:
+    return dataclasses.replace(
+        record,
+        time=record.time[rows],
+        inputs=record.inputs[rows],
+        outputs=record.outputs[rows],
+        source="part.csv",
+    )
+
+
+def test_too_short_a_record_is_refused_with_what_is_needed(chirp, foreign):
+    short = part(foreign, slice(12))
+    with pytest.raises(ValueError, match=r"part\.csv: 12 samples .* 15 or more .* 5 unknowns"):
+        identify(PLANT, [short])
+    with pytest.raises(ValueError, match=r"part\.csv: 8 samples .* 10 or more .* 3 unknowns"):
+        identify(PLANT, [part(chirp, slice(8))], initial_state="known")
+    with pytest.raises(ValueError, match=r"part\.csv: 12 samples"):
+        identify(PLANT, [foreign], validation=[short])
+
+
+@pytest.mark.parametrize("role", ["fitted", "validation"])
+def test_records_of_different_sampling_times_are_refused(role, chirp, foreign):
+    slow = part(foreign, slice(None, None, 2))
+    records = [chirp, slow] if role == "fitted" else [chirp]
+    with pytest.raises(ValueError, match=r"part\.csv is sampled every 0\.2 s .* every 0\.1 s"):
+        identify(PLANT, records, validation=[slow] if role == "validation" else [])
+
+
+@pytest.mark.parametrize(
+    ("start", "words"),
+    [
+        ({"J_q": 0.02}, "no parameter 'J_q'; it has J_p, K_pu, D_p"),
+        ({"J_p": -0.02}, "J_p = -0.02 kg m² is not allowed; it must be finite, above 0"),
+        ({"D_p": float("nan")}, "D_p = nan .* is not allowed"),
+        ({"D_p": float("inf")}, "D_p = inf .* is not allowed"),
+    ],
+)
+def test_a_start_that_is_not_allowed_is_refused(start, words, chirp):
+    with pytest.raises(ValueError, match=words):
+        identify(PLANT, [chirp], start=start)
+
+
+def test_arx_needs_a_plant_with_a_mapping():
+    d = DCMotor.definition
+    record = Record(0.001 * np.arange(30), np.ones((30, 1)), np.ones((30, len(d.outputs))))
+    with pytest.raises(ValueError, match=r"'dc_motor' has no mapping .* use the estimator 'nls'"):
+        identify(DCMotor(), [record], ARX())
+
+
+# One compilation, and bounds
+
+
+class Tank(AbstractPlant):
+    """A level that follows an inflow; quick to compile."""
+
+    definition = PlantDescription(
+        name="tank",
+        states=(State("level", "m"),),
+        inputs=(Input("flow", "m³/s", 0.0, 1.0),),
+        outputs=(Output("level_m", "m", 1.0, noise_sd=0.001),),
+        parameters=(Parameter("area", "m²", 2.0, upper=2.5), Parameter("leak", "m²/s", 0.3)),
+        dt=0.5,
+        band=(0.01, 0.5),
+    )
+
+    def derivative(self, state, input, params):
+        return (input - params.leak * state) / params.area
+
+    def output(self, state, params):
+        return state
+
+
+def tank_record(area: float, seed: int = 0) -> Record:
+    plant = Tank()
+    params = plant.Params(jnp.array(area), jnp.array(0.4))
+    return record_of(plant, Random(hold=5), params=params, seed=seed)
+
+
+@pytest.fixture
+def compilations() -> Iterator[list[str]]:
+    """Grows with every program that is compiled."""
+    names: list[str] = []
+
+    def listen(event: str, duration_secs: float, **_: object) -> None:
+        del duration_secs
+        if event.endswith("backend_compile_duration"):
+            names.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    yield names
+    jax.monitoring.unregister_event_duration_listener(listen)
+
+
+def test_another_start_or_record_compiles_nothing(compilations):
+    identify(Tank(), [tank_record(2.2)])
+    record = tank_record(2.1, seed=1)
+    count = len(compilations)
+    assert count > 0
+    for start in ({}, {"area": 1.5}, {"area": 2.4, "leak": 0.2}):
+        assert identify(Tank(), [record], start=start).status == "successful"
+    assert len(compilations) == count
+
+
+def test_a_parameter_that_ends_at_its_bound_is_held_there_and_named():
+    result = identify(Tank(), [tank_record(3.5)])
+    assert result.held == ("area",)
+    assert result.params["area"] == pytest.approx(2.5, rel=1e-2)
+    assert result.status == "partly identifiable"
+    assert "area ended at its bound 2.5 and was held there" in result.verdict
+
+
+# Other estimators, other noise
+
+
+def test_arx_goes_the_same_way(chirp):
+    quiet = dataclasses.replace(
+        chirp,
+        outputs=np.asarray(
+            record_of(
+                PLANT.changed(sensor=dataclasses.replace(PLANT.sensor, noise_sd=jnp.zeros(1))),
+                params=TRUE,
+            ).outputs
+        ),
+    )
+    result = identify(PLANT, [quiet], ARX(start_covariance=1e12))
+    assert result.estimator == "arx-rls"
+    assert result.status == "successful"
+    for name, value in result.params.items():
+        assert value == pytest.approx(TRUTH[name], rel=0.05)
+    assert result.fit()["pitch"] > 95
+
+
+def test_arx_that_cannot_say_is_no_usable_result():
+    result = identify(PLANT, [free_decay()], ARX())
+    assert not result.is_usable
+    assert result.status == "ill conditioned"
+    assert result.verdict == ("the data do not determine all parameters",)
+    json.dumps(json_ready(result.to_dict()), allow_nan=False)
+
+
+def test_coloured_noise_is_said_and_widens_the_intervals(foreign):
+    usual = identify(PLANT, [foreign])
+    noise = 2e-3 * autoregressive(np.random.default_rng(4), (1, NUM_STEPS + 1), 0.9).T
+    result = identify(PLANT, [dataclasses.replace(foreign, outputs=foreign.outputs + noise)])
+    assert result.whiteness["pitch"] < 0.01
+    assert "the residual of pitch is not white: the intervals allow for" in result.verdict[-1]
+    assert_within_sd(result, TRUTH)
+    ratio = {n: result.std_error[n] / usual.std_error[n] for n in TRUTH}
+    size = np.std(noise) / 2e-4
+    assert max(ratio.values()) > 1.5 * size  # more than the noise's size explains
+
+
+# What is shown and left on disk
+
+
+def test_the_dictionary_has_the_keys_that_are_documented(result, decay):
+    for r in (result, decay):
+        d = r.to_dict()
+        assert set(d) == documented("identify")
+        assert set(d) >= {"plant", "estimator", "status", "params", "fit_percent", "validation"}
+        assert list(d["params"]) == ["J_p", "K_pu", "D_p"]
+        for p in d["params"].values():
+            assert set(p) == {
+                "estimate", "std_error", "ci95", "unit", "relative_to_nominal", "held",
+            }  # fmt: skip
+
+
+def test_the_dictionary_says_what_the_result_says(result):
+    d = json_ready(result.to_dict())
+    assert (d["plant"], d["estimator"], d["status"]) == ("aero2", "nls", "successful")
+    for name, entry in d["params"].items():
+        assert entry["estimate"] == result.params[name]
+        assert entry["std_error"] == result.std_error[name]
+        assert entry["ci95"] == list(result.ci95(name))
+        nominal = getattr(PLANT.nominal, name)
+        assert entry["relative_to_nominal"] == pytest.approx(result.params[name] / float(nominal))
+    assert d["params"]["D_p"]["unit"] == "N m s/rad"
+    assert d["fit_percent"] == {"pitch": result.fit()["pitch"]}
+    validated = result.validation[0].fit_percent["pitch"]
+    assert d["validation"] == [{"file": "foreign.csv", "fit_percent": {"pitch": validated}}]
+    correlation = np.array(d["correlation"])
+    np.testing.assert_allclose(np.diag(correlation), 1)
+    np.testing.assert_allclose(correlation, correlation.T)
+    assert np.all(np.abs(correlation) < 1 + 1e-12)
+
+
+def columns_of(path: Path) -> np.ndarray:
+    return np.loadtxt(path, delimiter=",", skiprows=1)
+
+
+def test_a_run_folder_holds_what_was_found(result, chirp, tmp_path):
+    write_run(result, tmp_path / "run")
+    folder = tmp_path / "run"
+    assert {f.name for f in folder.iterdir()} == {
+        "record.csv", "record.json", "simulated.csv", "residual.csv", "estimate.json",
+        "information.json", "run.json",
+    }  # fmt: skip
+    record = read_record(folder / "record.csv", result.plant)
+    for name in ("time", "inputs", "outputs"):
+        np.testing.assert_array_equal(getattr(record, name), getattr(chirp, name))
+    assert record.starts_at_initial_state
+    simulated, residual = columns_of(folder / "simulated.csv"), columns_of(folder / "residual.csv")
+    np.testing.assert_array_equal(simulated[:, 0], chirp.time)
+    np.testing.assert_array_equal(simulated[:, 1:], result.fitted[0].simulated)
+    np.testing.assert_array_equal(residual[:, 1:], chirp.outputs - result.fitted[0].simulated)
+    assert (folder / "residual.csv").read_text().startswith("time,pitch\n")
+    assert json.loads((folder / "estimate.json").read_text()) == json_ready(result.to_dict())
+    information = json.loads((folder / "information.json").read_text())
+    assert information["parameters"] == ["J_p", "K_pu", "D_p"]
+    np.testing.assert_array_equal(information["information"], result.information)
+    np.testing.assert_array_equal(information["covariance"], result.covariance)
+    run = json.loads((folder / "run.json").read_text())
+    assert PlantDescription.from_dict(run["plant"]) == result.plant
+
+
+def test_a_run_folder_of_several_records_numbers_them(foreign, tmp_path):
+    result = identify(PLANT, [free_decay(), foreign])
+    write_run(result, tmp_path / "run")
+    for i, f in enumerate(result.fitted, 1):
+        record = read_record(tmp_path / "run" / f"record_{i}.csv", result.plant)
+        np.testing.assert_array_equal(record.outputs, f.record.outputs)
+        np.testing.assert_array_equal(
+            columns_of(tmp_path / "run" / f"simulated_{i}.csv")[:, 1:], f.simulated
+        )
+
+
+def test_a_run_folder_is_identified_to_the_same_result(result, tmp_path):
+    write_run(result, tmp_path / "run")
+    again = identify(PLANT, [read_record(tmp_path / "run" / "record.csv", PLANT.description)])
+    assert again.params == result.params
+
+
+def test_covariance_and_information_belong_together(result):
+    """In search coordinates (logarithms) one is the inverse of the other."""
+    size = np.array(list(result.params.values()))
+    relative = result.covariance / np.outer(size, size)
+    np.testing.assert_allclose(relative @ result.information, np.eye(3), atol=1e-6)
+
+
+# Real data
+
+
+PUBLISHED_FIT = {"M": 96.04, "F_v": 218.0, "F_c": 19.05, "offset": -3.275}
+
+
+@pytest.fixture(scope="module")
+def emps_record() -> Record:
+    """The public EMPS record, where the data are present."""
+    own = os.environ.get("EXCITE_DATA")
+    folder = Path(own) if own else ROOT.parent / "shared" / "data" / "emps"
+    path = folder / "DATA_EMPS.mat"
+    if not path.is_file():
+        pytest.skip("DATA_EMPS.mat is not here; EXCITE_DATA names the folder that has it")
+    gain = float(scipy.io.loadmat(path)["gtau"].item())
+    columns = {"time": "t", "force": "vir", "position": "qm"}
+    return read_record(path, EMPS.definition, columns, {"force": gain})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "signs", [(1, -1, 1, -1), (1, 1, 1, 1)], ids=["alternating", "all too large"]
+)
+def test_emps_is_identified_from_starts_that_are_30_percent_off(signs, emps_record):
+    plant = EMPS()
+    nominal = plant.nominal._asdict()
+    start = {n: (1 + 0.3 * s) * float(v) for (n, v), s in zip(nominal.items(), signs, strict=True)}
+    result = identify(plant, [emps_record], start=start)
+    assert result.status == "successful"
+    assert not result.initial_state_known
+    assert result.fit()["position"] >= 97.0
+    for name, value in PUBLISHED_FIT.items():
+        assert result.params[name] == pytest.approx(value, rel=5e-3)
+    assert "not white" in result.verdict[-1]
+    low, high = result.ci95("M")
+    assert low < 95.1089 < high  # the value published with the data

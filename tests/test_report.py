@@ -1,0 +1,373 @@
+import csv
+import io
+import math
+import subprocess
+import sys
+from typing import Any
+
+import matplotlib.figure
+import numpy as np
+import pytest
+from catalogue import TwoMasses
+
+from excite.description import PlantDescription
+from excite.plant import EMPS, Aero2
+from excite.records import Record
+from excite.report import (
+    PLOT_ENDINGS,
+    all_cells,
+    benchmark_csv,
+    benchmark_figure,
+    benchmark_markdown,
+    digits_for,
+    episode_figure,
+    episodes_figure,
+    footnotes,
+    identification_figure,
+    information_figure,
+    number,
+    reference_cells,
+    require_plot_path,
+    save,
+    table_cells,
+    table_header,
+)
+
+AERO2 = Aero2.definition
+
+
+# Numbers
+
+
+@pytest.mark.parametrize("digits", [2, 3, 5, 8])
+@pytest.mark.parametrize(
+    "value",
+    [1.0, 9.9996, 0.012345678, 0.001, 0.00099999, 1.2e-9, 999.96, 12345.678, 1e5, 7.7e22, 1 / 3],
+)
+def test_a_number_is_shown_to_so_many_significant_digits(value, digits):
+    for sign in (1, -1):
+        assert float(number(sign * value, digits)) == pytest.approx(
+            sign * value, rel=0.51 * 10.0 ** (1 - digits)
+        )
+    assert len(number(value, digits).partition("e")[0].replace(".", "").lstrip("0")) <= max(
+        digits + 1, 5
+    )
+
+
+@pytest.mark.parametrize("value", [None, math.nan, math.inf, -math.inf])
+def test_what_is_no_number_is_a_dash(value):
+    assert number(value) == "–"
+
+
+def test_numbers_look_as_people_write_them():
+    assert [number(v) for v in (0.0, 1.0, 0.0123456, 25.06, 3026.4)] == [
+        "0", "1.00", "0.0123", "25.1", "3026",
+    ]  # fmt: skip
+    assert [number(v) for v in (0.000456, 1.5e7)] == ["4.56e-04", "1.50e+07"]
+
+
+@pytest.mark.parametrize("value", [0.0232, -3.275, 218.04, 95108.9, 1e-7, 5e8])
+@pytest.mark.parametrize("relative", [0.3, 0.011, 1e-3, 2e-6])
+def test_an_estimate_shows_two_digits_of_its_error(value, relative):
+    error = relative * abs(value)
+    shown = float(number(value, digits_for(value, error)))
+    assert abs(shown - value) <= error / 19
+    assert digits_for(value, error) <= 3 - math.log10(relative) + 1
+
+
+@pytest.mark.parametrize("error", [None, math.nan, math.inf, 0.0, 2.0])
+def test_an_estimate_without_a_useful_error_shows_five_digits(error):
+    assert number(1.23456789, digits_for(1.23456789, error)) == "1.2346"
+
+
+# Tables
+
+
+def row(method: str, estimator: str, size: float, failed: int = 0) -> dict[str, Any]:
+    error = {"mean": size, "sd": size / 3, "median": 0.9 * size, "rms": 1.1 * size}
+    none = dict.fromkeys(error, math.nan)
+    names = ("J_p", "K_pu", "D_p")
+    return {
+        "method": method,
+        "estimator": estimator,
+        "evaluations": 50,
+        "failed": failed,
+        "violations": 1,
+        "violation_rate": {"estimate": 0.02, "ci95": (0.0035, 0.105)},
+        "max_abs_output": {"output": "pitch", "mean": 20.1, "sd": 7.7, "unit": "deg"},
+        "relative_error_percent": {n: dict(none if failed == 50 else error) for n in names},
+        "cramer_rao_percent": {n: size / (10 + i) for i, n in enumerate(names)},
+    }
+
+
+ROWS = [
+    row("random", "arx-rls", 8.125), row("random", "nls", 1 / 3),
+    row("chirp", "arx-rls", 0.75, failed=2), row("chirp", "nls", 0.05, failed=50),
+]  # fmt: skip
+REFERENCE = {
+    "relative_error_percent": {"J_p": (8.23, 6.61), "K_pu": (10.18, 5.14), "D_p": (3026.0, 2067.0)},
+    "max_abs_output": (11.2, 4.6),
+    "violations": "0/100",
+}
+STUDY = {
+    "name": "short",
+    "title": "A title",
+    "reference": {"random": REFERENCE},
+    "source": "Table 9 of somebody",
+    "inferred": ["the first thing", "the second thing"],
+}
+
+
+def markdown_table(text: str) -> list[list[str]]:
+    lines = [line for line in text.splitlines() if line.startswith("|")]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+
+
+def test_every_line_of_a_markdown_table_has_the_columns_of_its_header():
+    table = markdown_table(benchmark_markdown(ROWS, STUDY))
+    assert table[0] == [
+        "method", "estimator", "J_p error %", "bound %", "K_pu error %", "bound %",
+        "D_p error %", "bound %", "max pitch deg", "violations (95 %)", "failed",
+    ]  # fmt: skip
+    assert {len(line) for line in table} == {len(table[0])}
+    assert set(table[1]) == {"---"}
+
+
+def test_a_markdown_row_shows_what_its_row_says():
+    table = markdown_table(benchmark_markdown(ROWS, STUDY))
+    assert table[2] == [
+        "random", "arx-rls", "8.12 ± 2.71", "0.81", "8.12 ± 2.71", "0.74", "8.12 ± 2.71", "0.68",
+        "20.1 ± 7.70", "1/50 (0.4–10.5 %)", "0/50",
+    ]  # fmt: skip
+    assert [line[-1] for line in table[2:]] == ["0/50", "0/50", "–", "2/50", "50/50"]
+
+
+def test_a_mean_over_nothing_is_a_dash():
+    assert table_cells(ROWS[3])[2] == "– ± –"
+
+
+def test_a_published_row_stands_below_those_of_its_method():
+    cells = all_cells(ROWS, STUDY["reference"])
+    assert [line[:2] for line in cells] == [
+        ["random", "arx-rls"], ["random", "nls"], ["random", "as published"],
+        ["chirp", "arx-rls"], ["chirp", "nls"],
+    ]  # fmt: skip
+    assert cells[2][2:] == [
+        "8.23 ± 6.61", "–", "10.2 ± 5.14", "–", "3026 ± 2067", "–", "11.2 ± 4.60", "0/100", "–",
+    ]  # fmt: skip
+    assert len(all_cells(ROWS, {})) == len(ROWS)
+
+
+def test_a_published_number_stands_in_the_column_of_its_parameter():
+    """Whatever the order in the study file."""
+    errors = REFERENCE["relative_error_percent"]
+    turned = {**REFERENCE, "relative_error_percent": dict(reversed(errors.items()))}
+    assert all_cells(ROWS, {"random": turned}) == all_cells(ROWS, {"random": REFERENCE})
+
+
+def test_footnotes_tell_what_was_inferred_and_where_rows_were_published():
+    notes = footnotes(STUDY)
+    assert "Published rows: Table 9 of somebody." in notes
+    assert notes[-1].startswith("Inferred")
+    assert "the first thing; the second thing" in notes[-1]
+    text = benchmark_markdown(ROWS, STUDY)
+    assert text.startswith("# A title\n")
+    assert all(f"\n{note}\n" in text for note in notes)
+    assert len(footnotes({"name": "bare"})) == 1
+    assert benchmark_markdown(ROWS, {"name": "bare"}).startswith("# bare\n")
+
+
+def test_csv_reads_back_to_the_numbers_of_the_rows():
+    read = list(csv.DictReader(io.StringIO(benchmark_csv(ROWS))))
+    assert len(read) == len(ROWS)
+    for line, r in zip(read, ROWS, strict=True):
+        assert (line["method"], line["estimator"]) == (r["method"], r["estimator"])
+        for key in ("evaluations", "failed", "violations"):
+            assert float(line[key]) == r[key]
+        assert float(line["max_abs_pitch_deg_mean"]) == r["max_abs_output"]["mean"]
+        assert float(line["max_abs_pitch_deg_sd"]) == r["max_abs_output"]["sd"]
+        for name, error in r["relative_error_percent"].items():
+            for part, value in error.items():
+                np.testing.assert_equal(float(line[f"{name}_error_percent_{part}"]), value)
+            assert float(line[f"{name}_cramer_rao_percent"]) == r["cramer_rao_percent"][name]
+
+
+def test_csv_keeps_names_that_hold_a_comma_together():
+    comma = [{**ROWS[0], "method": "slow, then fast"}]
+    (line,) = csv.DictReader(io.StringIO(benchmark_csv(comma)))
+    assert line["method"] == "slow, then fast"
+    assert float(line["evaluations"]) == 50
+
+
+def test_reference_cells_go_with_the_header():
+    assert len(reference_cells(ROWS[0], REFERENCE)) == len(table_header(ROWS))
+
+
+# Figures
+
+
+def record_of(d: PlantDescription, samples: int = 60) -> Record:
+    time = d.dt * np.arange(samples)
+    wave = np.sin(0.3 * np.arange(samples))[:, None]
+    return Record(
+        time,
+        wave * [i.amplitude for i in d.inputs],
+        wave * [0.9 * (o.critical_level or o.scale) for o in d.outputs],
+    )
+
+
+def result_of(d: PlantDescription) -> dict[str, Any]:
+    """As `identify` says it, the last parameter held."""
+    params = {
+        p.name: {"estimate": p.nominal, "std_error": 0.01 * abs(p.nominal), "unit": p.unit}
+        for p in d.parameters
+    }
+    params[d.parameters[-1].name]["std_error"] = math.nan
+    fits = {o.name: 97.1234 for o in d.outputs}
+    return {"estimator": "nls", "status": "successful", "params": params, "fit_percent": fits}
+
+
+def figures_of(d: PlantDescription) -> dict[str, matplotlib.figure.Figure]:
+    record = record_of(d)
+    percent = {p.name: 10.0**i for i, p in enumerate(d.parameters)}
+    return {
+        "identification": identification_figure(
+            d, result_of(d), record, record.outputs + 0.01 * np.ones_like(record.outputs)
+        ),
+        "episode": episode_figure(d, record),
+        "episodes": episodes_figure(d, {"prbs": record, "chirp": record}),
+        "information": information_figure(d, record, {**percent, d.parameters[0].name: None}),
+    }
+
+
+@pytest.fixture(scope="module")
+def figures() -> dict[str, matplotlib.figure.Figure]:
+    benchmark = benchmark_figure(ROWS, "A title")
+    return {**figures_of(AERO2), "benchmark": benchmark}
+
+
+NAMES = ("identification", "episode", "episodes", "information", "benchmark")
+
+
+def labels_of(figure: matplotlib.figure.Figure) -> list[str]:
+    return [label for a in figure.axes for label in (a.get_xlabel(), a.get_ylabel())]
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    ("ending", "start"), [(".png", b"\x89PNG"), (".svg", b"<?xml"), (".PDF", b"%PDF")]
+)
+def test_every_figure_is_written(name, ending, start, figures, tmp_path):
+    path = tmp_path / f"figure{ending}"
+    save(figures[name], path)
+    content = path.read_bytes()
+    assert content.startswith(start)
+    assert len(content) > 5000
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("name", ["identification", "episode", "episodes"])
+def test_angles_are_drawn_in_degrees(name, figures):
+    labels = labels_of(figures[name])
+    assert any("pitch [deg]" in label for label in labels)
+    assert not any("[rad" in label for label in labels)
+    axis = next(a for a in figures[name].axes if a.get_ylabel() == "pitch [deg]")
+    drawn = np.asarray(axis.get_lines()[0].get_ydata(), float)
+    np.testing.assert_allclose(drawn, np.degrees(record_of(AERO2).outputs[:, 0]), rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_axis_that_shows_a_quantity_names_its_unit(name, figures):
+    labels = [label for label in labels_of(figures[name]) if label]
+    assert labels
+    assert all(label.endswith("]") for label in labels)
+
+
+def test_safety_levels_are_drawn_where_they_are(figures):
+    axis = next(a for a in figures["episode"].axes if a.get_ylabel() == "pitch [deg]")
+    flat = sorted(
+        float(np.asarray(line.get_ydata())[0])
+        for line in axis.get_lines()
+        if len(set(np.asarray(line.get_ydata()).tolist())) == 1
+    )
+    np.testing.assert_allclose(flat, [-40, -30, 30, 40])
+
+
+def test_the_residual_is_measured_minus_simulated(figures):
+    axis = next(a for a in figures["identification"].axes if a.get_ylabel() == "residual [deg]")
+    drawn = np.asarray(axis.get_lines()[0].get_ydata(), float)
+    np.testing.assert_allclose(drawn, np.degrees(-0.01), rtol=1e-9)
+
+
+def texts_of(figure: matplotlib.figure.Figure) -> str:
+    figure.canvas.draw()
+    artists = figure.findobj(lambda a: hasattr(a, "get_text"))
+    return "\n".join(a.get_text() for a in artists)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_the_identification_figure_says_fit_intervals_and_what_was_held(figures):
+    text = texts_of(figures["identification"])
+    for words in ("pitch: fit 97.12 %", "aero2: nls, successful", "D_p held", "0.0232", "kg m²"):
+        assert words in text
+
+
+@pytest.mark.parametrize("d", [EMPS.definition, TwoMasses.definition], ids=lambda d: d.name)
+def test_any_plant_can_be_drawn(d, tmp_path):
+    figures = figures_of(d)
+    for name, figure in figures.items():
+        save(figure, tmp_path / f"{name}.svg")
+    labels = labels_of(figures["episode"])
+    for part in (*d.inputs, *d.outputs):
+        assert f"{part.name} [{part.unit}]" in labels
+
+
+def test_figures_bear_what_has_no_number(tmp_path):
+    """All estimates failed, nothing is seen, no interval, an output that is not finite."""
+    failed = [row("chirp", "nls", 0.05, failed=50)]
+    save(benchmark_figure(failed, "failed"), tmp_path / "a.svg")
+    nothing: dict[str, float | None] = {"J_p": None, "K_pu": None, "D_p": None}
+    save(information_figure(AERO2, record_of(AERO2), nothing), tmp_path / "b.svg")
+    result, record = result_of(AERO2), record_of(AERO2)
+    for p in result["params"].values():
+        p["estimate"] = p["std_error"] = math.nan
+    simulated = np.full_like(record.outputs, np.nan)
+    result["fit_percent"]["pitch"] = math.nan
+    save(identification_figure(AERO2, result, record, simulated), tmp_path / "c.svg")
+    assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_an_estimate_of_zero_can_be_drawn(tmp_path):
+    result, record = result_of(AERO2), record_of(AERO2)
+    result["params"]["K_pu"] |= {"estimate": 0.0, "std_error": 1.0}
+    save(identification_figure(AERO2, result, record, record.outputs), tmp_path / "a.svg")
+    assert (tmp_path / "a.svg").is_file()
+
+
+def test_a_figure_that_cannot_be_written_leaves_nothing(figures, tmp_path):
+    with pytest.raises(ValueError, match="does not exist"):
+        save(figures["episode"], tmp_path / "nowhere" / "a.png")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["a.jpg", "a", "a.csv", "png"])
+def test_another_ending_is_refused_with_those_that_are_allowed(name, tmp_path):
+    with pytest.raises(ValueError, match="figures end in") as error:
+        require_plot_path(tmp_path / name)
+    assert all(ending in str(error.value) for ending in PLOT_ENDINGS)
+
+
+def test_a_figure_for_no_folder_is_refused_beforehand(tmp_path):
+    with pytest.raises(ValueError, match="does not exist"):
+        require_plot_path(tmp_path / "nowhere" / "a.png")
+    require_plot_path(tmp_path / "a.PNG")
+
+
+def test_report_needs_no_jax():
+    program = "import excite.report, sys; sys.exit('jax' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
+
+
+def test_the_figure_of_a_long_record_stays_small(tmp_path):
+    long = record_of(AERO2, 100_000)
+    save(episode_figure(AERO2, long), tmp_path / "long.svg")
+    assert (tmp_path / "long.svg").stat().st_size < 1_000_000

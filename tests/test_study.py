@@ -1,0 +1,543 @@
+import dataclasses
+import sys
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from excite.estimation import ARX, NLS
+from excite.excitation import PRBS, Chirp, Multisine, Random
+from excite.names import (
+    ESTIMATORS,
+    EXCITATIONS,
+    PLANTS,
+    estimator_named,
+    excitation_named,
+    plant_named,
+    with_sensor,
+)
+from excite.plant import Aero2, CartPole, DCMotor
+from excite.study import Study, read_study
+
+STUDIES = Path(__file__).parent.parent / "studies"
+
+MINIMAL = """
+name = "minimal"
+plant = "aero2"
+
+[methods.chirp]
+excitation = "chirp"
+
+[estimators.nls]
+kind = "nls"
+"""
+
+FULL = """
+name = "full"
+title = "Everything"
+plant = "aero2"
+episodes = 7
+num_steps = 60
+seed = 3
+spread = 0.1
+inferred = ["one", "two"]
+source = "nowhere"
+
+[sensor.pitch]
+noise_sd = 0.001
+resolution = 0.002
+
+[methods.own]
+excitation = "prbs"
+amplitude = 5
+clock = 4
+register = 6
+
+[methods.chirp]
+excitation = "chirp"
+logarithmic = true
+
+[estimators.arx-rls]
+kind = "arx-rls"
+start_covariance = 10
+forgetting_factor = 0.99
+
+[estimators.fine]
+kind = "nls"
+max_steps = 50
+tolerance = 1e-6
+
+[reference.own]
+relative_error_percent = { J_p = [1, 2], K_pu = [3, 4], D_p = [5, 6] }
+max_abs_output = [7, 8]
+violations = "0/10"
+"""
+
+
+def study_of(text: str, folder: Path) -> Study:
+    (folder / "study.toml").write_text(text, encoding="utf-8")
+    return read_study(folder / "study.toml")
+
+
+# What is written is understood
+
+
+@pytest.mark.parametrize("path", sorted(STUDIES.glob("*.toml")), ids=lambda p: p.stem)
+def test_every_shipped_study_loads(path):
+    study = read_study(path)
+    assert study.name == path.stem
+    assert study.episodes == 1000
+    assert list(study.methods) == ["random", "prbs", "chirp"]
+    assert set(study.reference) <= set(study.methods)
+
+
+def test_what_is_left_out_has_the_papers_value(tmp_path):
+    study = study_of(MINIMAL, tmp_path)
+    assert (study.num_steps, study.spread, study.seed) == (500, 0.3, 0)
+    plant = study.build_plant()
+    np.testing.assert_array_equal(plant.sensor.noise_sd, Aero2().sensor.noise_sd)
+    estimator = study.build_estimators(plant)["nls"]
+    assert isinstance(estimator, NLS)
+    assert estimator == NLS()
+
+
+def test_every_setting_arrives(tmp_path):
+    study = study_of(FULL, tmp_path)
+    assert (study.episodes, study.num_steps, study.seed, study.spread) == (7, 60, 3, 0.1)
+    assert study.inferred == ["one", "two"]
+    plant = study.build_plant()
+    assert isinstance(plant, Aero2)
+    assert plant.description.outputs[0].noise_sd == 0.001
+    assert plant.description.outputs[0].resolution == 0.002
+    own, chirp = study.build_methods(plant).values()
+    assert isinstance(own, PRBS)
+    assert (float(own.amplitude), own.clock, own.register) == (5.0, 4, 6)  # pyright: ignore[reportArgumentType]
+    assert isinstance(chirp, Chirp)
+    assert chirp.logarithmic
+    assert chirp.amplitude is None
+    arx, nls = study.build_estimators(plant).values()
+    assert isinstance(arx, ARX)
+    assert (float(arx.start_covariance), float(arx.forgetting_factor)) == (10.0, 0.99)
+    assert isinstance(nls, NLS)
+    assert (nls.max_steps, nls.tolerance) == (50, 1e-6)
+    assert study.reference["own"].relative_error_percent["K_pu"] == (3, 4)
+
+
+def test_a_study_is_a_fixed_object(tmp_path):
+    study = study_of(MINIMAL, tmp_path)
+    with pytest.raises(ValueError, match="frozen"):
+        study.episodes = 5  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_a_study_survives_being_written_as_plain_data(tmp_path):
+    study = study_of(FULL, tmp_path)
+    assert Study.model_validate(study.model_dump(mode="json")) == study
+
+
+def test_every_name_leads_to_its_object():
+    for name, kind in PLANTS.items():
+        plant = plant_named(name)
+        assert type(plant) is kind
+        assert plant.description.name == name
+    for name, kind in EXCITATIONS.items():
+        assert type(excitation_named(name, {}, Aero2())) is kind
+    for name, estimator in ESTIMATORS.items():
+        assert estimator_named(name) is estimator
+
+
+# Overrides
+
+
+def test_changed_leaves_everything_else_as_it_is(tmp_path):
+    study = study_of(FULL, tmp_path)
+    assert study.changed() == study
+    assert study.changed(episodes=None, seed=None) == study
+    other = study.changed(episodes=9, seed=11)
+    assert (other.episodes, other.seed) == (9, 11)
+    assert other.model_dump(exclude={"episodes", "seed"}) == study.model_dump(
+        exclude={"episodes", "seed"}
+    )
+
+
+def test_changed_chooses_the_studys_own_estimators_before_any_other(tmp_path):
+    study = study_of(FULL, tmp_path)
+    plant = study.build_plant()
+    chosen = study.changed(estimators="fine, arx-rls,arx-rls-wide").build_estimators(plant)
+    assert list(chosen) == ["fine", "arx-rls", "arx-rls-wide"]
+    covariances = [float(e.start_covariance) for e in chosen.values() if isinstance(e, ARX)]
+    assert covariances == [10.0, 1e8]
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"estimators": "nlss"}, "unknown estimator 'nlss'; did you mean 'nls'"),
+        ({"estimators": ""}, "unknown estimator ''"),
+        ({"estimators": "nls,"}, "unknown estimator ''"),
+        ({"episodes": 0}, "episodes: .* greater than 0, got 0"),
+        ({"episodes": -3}, "episodes: .* greater than 0, got -3"),
+        ({"seed": -1}, "seed: .* greater than or equal to 0, got -1"),
+        ({"episods": 5}, "unknown key 'episods'; did you mean 'episodes'"),
+    ],
+)
+def test_changed_checks_as_the_file_is_checked(values, words, tmp_path):
+    study = study_of(FULL, tmp_path)
+    with pytest.raises(ValueError, match=words):
+        study.changed(**values)
+
+
+# Bad studies
+
+
+def inserted(line: str, after: str = "", text: str = MINIMAL) -> str:
+    """A study with one more line: after the one given, else at the top."""
+    return text.replace(after, f"{after}\n{line}", 1) if after else f"{line}\n{text}"
+
+
+BAD_STUDIES: dict[str, tuple[str, tuple[str, ...]]] = {
+    "unknown key": (inserted("episode = 5"), ("unknown key 'episode'", "'episodes'?", "spread")),
+    "unknown key far from any": (inserted("zzz = 5"), ("unknown key 'zzz'", "(there is name")),
+    "unknown section": (
+        inserted("[sensors.pitch]\nnoise_sd = 1", 'kind = "nls"'),
+        ("unknown key 'sensors'", "'sensor'?"),
+    ),
+    "unknown key of a sensor": (
+        inserted("[sensor.pitch]\nnoise = 1", 'kind = "nls"'),
+        ("unknown key 'noise'", "'noise_sd'?"),
+    ),
+    "unknown key of a reference": (
+        FULL.replace('violations = "0/10"', 'violation = "0/10"'),
+        ("unknown key 'violation'", "'violations'?"),
+    ),
+    "unknown option of a method": (
+        inserted("amplitud = 5", 'excitation = "chirp"'), ("'amplitud'", "'amplitude'?"),
+    ),
+    "option of another method": (
+        inserted("clock = 5", 'excitation = "chirp"'), ("'clock'", "(there is amplitude"),
+    ),
+    "unknown option of an estimator": (
+        inserted("max_step = 5", 'kind = "nls"'), ("'max_step'", "'max_steps'?"),
+    ),
+    "unknown plant": (
+        MINIMAL.replace("aero2", "aero"), ("unknown plant 'aero'", "'aero2'?", "file.py:ClassName"),
+    ),
+    "unknown excitation": (
+        MINIMAL.replace('excitation = "chirp"', 'excitation = "chrip"'),
+        ("unknown excitation 'chrip'", "'chirp'?", "multisine"),
+    ),
+    "unknown estimator": (
+        MINIMAL.replace('kind = "nls"', 'kind = "arx"'),
+        ("unknown estimator 'arx'", "'arx-rls'?"),
+    ),
+    "unknown output": (
+        inserted("[sensor.pich]\nnoise_sd = 1", 'kind = "nls"'), ("'pich'", "'pitch'?"),
+    ),
+    "negative noise": (FULL.replace("0.001", "-0.001"), ("sensor.pitch.noise_sd", "got -0.001")),
+    "infinite noise": (
+        FULL.replace("0.001", "inf"), ("sensor.pitch.noise_sd", "finite", "got inf"),
+    ),
+    "noise as text": (FULL.replace("0.001", '"0.001"'), ("sensor.pitch.noise_sd",)),
+    "noise as truth": (FULL.replace("0.001", "true"), ("sensor.pitch.noise_sd",)),
+    "zero episodes": (inserted("episodes = 0"), ("episodes", "greater than 0", "got 0")),
+    "negative steps": (inserted("num_steps = -5"), ("num_steps", "greater than 0", "got -5")),
+    "half an episode": (inserted("episodes = 1.5"), ("episodes", "integer", "got 1.5")),
+    "episodes as text": (inserted('episodes = "10"'), ("episodes", "integer", 'got "10"')),
+    "negative seed": (inserted("seed = -1"), ("seed", "got -1")),
+    "seed beyond what a key can hold": (inserted(f"seed = {10**20}"), ("seed", f"{10**20}")),
+    "spread of one": (inserted("spread = 1.0"), ("spread", "less than 1", "got 1.0")),
+    "spread as text": (inserted('spread = "0.3"'), ("spread", 'got "0.3"')),
+    "spread that is no number": (inserted("spread = nan"), ("spread", "got nan")),
+    "date for a seed": (inserted("seed = 2026-01-01"), ("seed", "integer")),
+    "plant as number": (MINIMAL.replace('"aero2"', "2"), ("plant", "string", "got 2")),
+    "method as number": (
+        MINIMAL.replace('[methods.chirp]\nexcitation = "chirp"', "[methods]\nchirp = 3"),
+        ("methods.chirp", "got 3"),
+    ),
+    "no plant": (MINIMAL.replace('plant = "aero2"', ""), ("key 'plant' is missing",)),
+    "no excitation": (
+        MINIMAL.replace('excitation = "chirp"', ""), ("'methods.chirp.excitation' is missing",),
+    ),
+    "no methods": (
+        MINIMAL.replace('[methods.chirp]\nexcitation = "chirp"', ""), ("'methods' is missing",),
+    ),
+    "empty methods": (
+        MINIMAL.replace('[methods.chirp]\nexcitation = "chirp"', "[methods]"), ("no methods",),
+    ),
+    "amplitude beyond the limits": (
+        inserted("amplitude = 25", 'excitation = "chirp"'),
+        ("amplitude 25 V", "'voltage'", "from 0 to 24 V"),
+    ),
+    "negative amplitude": (
+        inserted("amplitude = -1", 'excitation = "chirp"'), ("-1 V", "from 0 to 24 V"),
+    ),
+    "two amplitudes for one input": (
+        inserted("amplitude = [1, 2]", 'excitation = "chirp"'), ("2 amplitudes", "1 inputs"),
+    ),
+    "amplitude as text": (
+        inserted('amplitude = "7.2"', 'excitation = "chirp"'), ("amplitude", "a number", "'7.2'"),
+    ),
+    "amplitude as code": (
+        inserted('amplitude = "3 + 4"', 'excitation = "chirp"'), ("a number", "'3 + 4'"),
+    ),
+    "amplitude as truth": (
+        inserted("amplitude = true", 'excitation = "chirp"'), ("amplitude", "a number", "True"),
+    ),
+    "truth as number": (
+        inserted("logarithmic = 1", 'excitation = "chirp"'), ("true or false", "got 1"),
+    ),
+    "frequency beyond half the sampling rate": (
+        inserted("stop_frequency = 6.0", 'excitation = "chirp"'),
+        ("stop_frequency 6 Hz", "at most 5 Hz"),
+    ),
+    "frequency of zero": (
+        inserted("start_frequency = 0", 'excitation = "chirp"'),
+        ("start_frequency 0 Hz", "above 0"),
+    ),
+    "two frequencies": (
+        inserted("start_frequency = [0.1, 0.2]", 'excitation = "chirp"'), ("start_frequency",),
+    ),
+    "half a clock": (FULL.replace("clock = 4", "clock = 1.5"), ("clock", "whole number", "1.5")),
+    "clock of zero": (FULL.replace("clock = 4", "clock = 0"), ("clock", "at least 1")),
+    "register without taps": (FULL.replace("register = 6", "register = 40"), ("2 to 16", "40")),
+    "negative option of an estimator": (
+        FULL.replace("start_covariance = 10", "start_covariance = -10"),
+        ("start_covariance", "positive", "-10"),
+    ),
+    "forgetting factor above one": (
+        FULL.replace("forgetting_factor = 0.99", "forgetting_factor = 1.5"),
+        ("forgetting_factor", "1.5"),
+    ),
+    "several start covariances": (
+        FULL.replace("start_covariance = 10", "start_covariance = [10, 20]"),
+        ("start_covariance", "[10, 20]"),
+    ),
+    "no steps of a search": (inserted("max_steps = 0", 'kind = "nls"'), ("max_steps", "0")),
+    "negative tolerance": (inserted("tolerance = -1", 'kind = "nls"'), ("tolerance", "-1")),
+    "no horizons": (inserted("horizons = []", 'kind = "nls"'), ("horizons",)),
+    "horizons as one number": (inserted("horizons = 0.5", 'kind = "nls"'), ("horizons",)),
+    "horizons that end before the data": (
+        inserted("horizons = [0.1, 0.5]", 'kind = "nls"'), ("horizons",),
+    ),
+    "reference of an unknown parameter": (
+        FULL.replace("J_p = [1, 2]", "J_q = [1, 2]"), ("J_q", "J_p"),
+    ),
+    "reference without a parameter": (FULL.replace("J_p = [1, 2], ", ""), ("own", "'J_p'")),
+    "reference of an unknown method": (
+        FULL.replace("[reference.own]", "[reference.owm]"), ("'owm'", "'own'?"),
+    ),
+    "ARX for a plant without mapping": (
+        MINIMAL.replace("aero2", "dc_motor").replace('kind = "nls"', 'kind = "arx-rls"'),
+        ("needs a plant with a mapping", "'dc_motor' has none", "'nls'"),
+    ),
+    "no TOML": ("methods = [", ("not valid TOML",)),
+    "a key twice": (inserted("seed = 1\nseed = 2"), ("not valid TOML", "seed")),
+    "nothing": ("", ("'name' is missing",)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("text", "fragments"), BAD_STUDIES.values(), ids=list(BAD_STUDIES))
+def test_a_study_that_cannot_be_run_is_one_sentence(text, fragments, tmp_path):
+    with pytest.raises(ValueError, match=r"study\.toml: ") as error:
+        study_of(text, tmp_path)
+    sentence = str(error.value)
+    assert "\n" not in sentence
+    assert [f for f in fragments if f not in sentence] == []
+
+
+@pytest.mark.parametrize("kind", ["missing", "folder", "binary"])
+def test_a_file_that_is_no_text_is_said(kind, tmp_path):
+    path = tmp_path / "study.toml"
+    if kind == "folder":
+        path.mkdir()
+    elif kind == "binary":
+        path.write_bytes(b"\xff\xfe\x00\x01")
+    with pytest.raises(ValueError, match=r"study\.toml: cannot be read"):
+        read_study(path)
+
+
+def test_the_sensor_of_an_output_is_changed_alone():
+    plant = CartPole()
+    changed = with_sensor(plant, {"angle": 0.5}, {"position": 0.25})
+    np.testing.assert_array_equal(changed.sensor.noise_sd, [plant.sensor.noise_sd[0], 0.5])
+    np.testing.assert_array_equal(changed.sensor.resolution, [0.25, plant.sensor.resolution[1]])
+    with pytest.raises(ValueError, match="noise of 'angle' must be zero or positive: got -1"):
+        with_sensor(plant, {"angle": -1.0}, {})
+    with pytest.raises(ValueError, match=r"'angel'; did you mean 'angle'"):
+        with_sensor(plant, {}, {"angel": 1.0})
+
+
+def test_each_input_may_have_an_amplitude_of_its_own():
+    excitation = excitation_named("random", {"amplitude": [3]}, DCMotor())
+    assert isinstance(excitation, Random)
+    np.testing.assert_array_equal(excitation.amplitude, [3.0])  # pyright: ignore[reportArgumentType]
+    assert isinstance(excitation_named("multisine", {"start_frequency": 1}, Aero2()), Multisine)
+
+
+# A user's own plant
+
+
+PLANT_FILE = """
+import jax.numpy as jnp
+from excite.description import Constant, Input, Output, Parameter, PlantDescription, State
+from excite.plant import AbstractPlant
+
+
+class Tank(AbstractPlant):
+    definition = PlantDescription(
+        name="tank",
+        states=(State("level", "m"),),
+        inputs=(Input("flow", "m³/s", 0.0, 1.0),),
+        outputs=(Output("level_m", "m", 1.0, noise_sd=0.01),),
+        parameters=(Parameter("area", "m²", 2.0), Parameter("leak", "m²/s", 0.3)),
+        dt=0.5,
+        band=(0.01, 0.5),
+    )
+
+    def derivative(self, state, input, params):
+        return (input - params.leak * state) / params.area
+
+    def output(self, state, params):
+        return state
+
+
+class Half(AbstractPlant):
+    definition = Tank.definition
+
+    def output(self, state, params):
+        return state
+
+
+class Nameless(AbstractPlant):
+    def derivative(self, state, input, params):
+        return state
+
+    def output(self, state, params):
+        return state
+
+
+class Wide(Tank):
+    def output(self, state, params):
+        return jnp.concatenate([state, state])
+
+
+class Typo(Tank):
+    def derivative(self, state, input, params):
+        return params.aera * state
+
+
+number = 3
+"""
+
+
+@pytest.fixture
+def plant_file(tmp_path: Path) -> Path:
+    (tmp_path / "tank.py").write_text(PLANT_FILE)
+    return tmp_path / "tank.py"
+
+
+@pytest.fixture(autouse=True)
+def _forget_user_modules():
+    before = set(sys.modules)
+    yield
+    for name in set(sys.modules) - before:
+        if name.startswith("excite_plant_"):
+            del sys.modules[name]
+
+
+def test_a_users_plant_is_named_by_file_and_class(plant_file, tmp_path, monkeypatch):
+    plant = plant_named(f"{plant_file}:Tank")
+    assert plant.description.name == "tank"
+    rate = plant.derivative(jnp.array([1.0]), jnp.array([0.5]), plant.nominal)
+    np.testing.assert_allclose(rate, [0.1])
+    monkeypatch.chdir(tmp_path)
+    assert plant_named("tank.py:Tank").description == plant.description
+
+
+def test_a_study_takes_a_users_plant(plant_file, tmp_path):
+    text = MINIMAL.replace("aero2", f"{plant_file}:Tank")
+    assert study_of(text, tmp_path).build_plant().description.name == "tank"
+
+
+def test_a_users_plant_is_found_beside_its_study(plant_file, tmp_path, monkeypatch):
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    text = MINIMAL.replace("aero2", f"{plant_file.name}:Tank")
+    assert study_of(text, tmp_path).build_plant().description.name == "tank"
+
+
+@pytest.mark.parametrize(
+    ("class_name", "words"),
+    [
+        ("Tanc", "has no plant class 'Tanc'"),
+        ("number", "has no plant class 'number'"),
+        ("State", "has no plant class 'State'"),
+        ("", "has no plant class ''"),
+        ("Half", "Half in .* is not a complete plant: .*derivative"),
+        ("Wide", r"output of Wide in .* returns shape \(2,\); \(1,\) is needed"),
+        ("Typo", "derivative of Typo in .* fails: AttributeError: .*aera"),
+        ("Nameless", "Nameless in .* is not a complete plant: .*definition"),
+    ],
+)
+def test_what_is_no_plant_class_is_said(class_name, words, plant_file):
+    with pytest.raises(ValueError, match=words) as error:
+        plant_named(f"{plant_file}:{class_name}")
+    assert str(plant_file) in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("class Tank(:\n    pass", "SyntaxError"),
+        ("import a_module_that_is_nowhere", "ModuleNotFoundError.*a_module_that_is_nowhere"),
+        ("1 / 0", "ZeroDivisionError"),
+        (PLANT_FILE.replace("dt=0.5", "dt=-0.5"), "dt must be positive: got -0.5"),
+        ("import sys\nsys.exit(3)", "SystemExit"),
+    ],
+)
+def test_a_plant_file_that_cannot_be_imported_is_said(content, words, plant_file):
+    plant_file.write_text(content)
+    with pytest.raises(ValueError, match=words) as error:
+        plant_named(f"{plant_file}:Tank")
+    assert str(plant_file) in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("name", ["nowhere.py:Tank", "folder.py:Tank"])
+def test_a_plant_file_that_is_not_there_is_said(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "folder.py").mkdir()
+    with pytest.raises(ValueError, match="no such file"):
+        plant_named(name)
+
+
+@pytest.mark.parametrize("name", ["Aero2", "aero3", "tank.py", "tank.txt:Tank", ""])
+def test_a_name_that_is_no_plant_is_said(name):
+    with pytest.raises(ValueError, match=r"unknown plant .* \(there is aero2, .*ClassName\)"):
+        plant_named(name)
+
+
+@pytest.mark.parametrize(
+    "name", ["__import__('pathlib').Path('trace').touch()", "open('trace', 'w').py:Tank"]
+)
+def test_no_name_is_evaluated(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=r"unknown plant|no such file"):
+        plant_named(name)
+    for lookup in (estimator_named, lambda n: excitation_named(n, {}, Aero2())):
+        with pytest.raises(ValueError, match="unknown"):
+            lookup(name)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_option_names_are_those_of_the_excitations():
+    """No option of an excitation is out of a study's reach."""
+    values = {
+        "amplitude": 1.0, "hold": 2, "clock": 2, "register": 5, "start_frequency": 0.2,
+        "stop_frequency": 1.0, "frequency": 0.5, "logarithmic": True,
+    }  # fmt: skip
+    for name, kind in EXCITATIONS.items():
+        options = {f.name: values[f.name] for f in dataclasses.fields(kind)}
+        built = excitation_named(name, options, Aero2())
+        for option, value in options.items():
+            assert float(getattr(built, option)) == value
