@@ -232,8 +232,8 @@ def test_a_multisine_is_flat_in_its_band_and_zero_outside(low, high, num_steps):
 def test_schroeder_phases_lower_the_crest_factor(low, high):
     values = of_aero2(Multisine(1.0, low, high), 500)
     zero_phases = np.fft.irfft(np.abs(np.fft.rfft(values)), 500)
-    both = crest_factor(jnp.asarray(np.stack([values, zero_phases], axis=1)))
-    assert both[0] < 2.0 < both[1]
+    ours, theirs = np.asarray(crest_factor(jnp.stack([values, zero_phases], axis=1)))
+    assert ours < 2.0 < theirs
 
 
 def test_several_inputs_of_a_multisine_share_out_the_harmonics():
@@ -242,7 +242,7 @@ def test_several_inputs_of_a_multisine_share_out_the_harmonics():
     frequency = np.fft.rfftfreq(300, 0.05)
     np.testing.assert_array_equal(first ^ second, (frequency > 0.199) & (frequency < 4.001))
     assert not np.any(first & second)
-    assert abs(np.corrcoef(sequence.T)[0, 1]) < 1e-12
+    assert abs(sequence[:, 0] @ sequence[:, 1]) < 1e-9
 
 
 def test_a_multisine_of_a_band_without_harmonics_is_zero():

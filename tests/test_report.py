@@ -159,10 +159,14 @@ def test_a_published_row_stands_below_those_of_its_method():
 
 
 def test_a_published_number_stands_in_the_column_of_its_parameter():
-    """Whatever the order in the study file."""
+    """Whatever the order in the study file, and where a parameter was not published."""
     errors = REFERENCE["relative_error_percent"]
     turned = {**REFERENCE, "relative_error_percent": dict(reversed(errors.items()))}
     assert all_cells(ROWS, {"random": turned}) == all_cells(ROWS, {"random": REFERENCE})
+    part = {**REFERENCE, "relative_error_percent": {"D_p": errors["D_p"]}}
+    cells = all_cells(ROWS, {"random": part})[2]
+    assert len(cells) == len(table_header(ROWS))
+    assert cells[2:7] == ["–", "–", "–", "–", "3026 ± 2067"]
 
 
 def test_footnotes_tell_what_was_inferred_and_where_rows_were_published():

@@ -322,7 +322,6 @@ BAD_STUDIES: dict[str, tuple[str, tuple[str, ...]]] = {
     "reference of an unknown parameter": (
         FULL.replace("J_p = [1, 2]", "J_q = [1, 2]"), ("J_q", "J_p"),
     ),
-    "reference without a parameter": (FULL.replace("J_p = [1, 2], ", ""), ("own", "'J_p'")),
     "reference of an unknown method": (
         FULL.replace("[reference.own]", "[reference.owm]"), ("'owm'", "'own'?"),
     ),

@@ -70,7 +70,7 @@ class Record:
     @property
     def starts_at_initial_state(self) -> bool:
         """Whether the sidecar says that the plant was at its initial state."""
-        return bool(self.metadata.get("starts_at_initial_state", False))
+        return self.metadata.get("starts_at_initial_state") is True
 
 
 def read_record(

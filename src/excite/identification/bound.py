@@ -30,13 +30,20 @@ def best_possible(
     """Least standard deviation of each parameter for an input, as JSON-ready data.
 
     Raises:
-        ValueError: for a sensor without noise, which sets no bound.
+        ValueError: for a sensor without noise, which sets no bound, and for a response
+            that is not finite.
     """
     if not np.all(np.asarray(plant.sensor.sd) > 0):
         raise ValueError("a sensor without noise sets no bound; give every output a noise")
     information = experiment_information(
         plant, params, inputs, initial_state_known=initial_state_known
     )
+    values = np.linalg.eigvalsh(np.nan_to_num(np.asarray(information)))
+    if not np.all(np.isfinite(information)) or values[0] < -1e-6 * values[-1]:
+        raise ValueError(
+            "the response to this input is not finite, or chaotic: it has no information that "
+            "could be trusted; a smaller amplitude or other parameters may help"
+        )
     size = np.asarray(relative_size(plant, params))
     sd = np.asarray(cramer_rao_bound(information)) * size
     return {

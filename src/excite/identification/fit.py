@@ -78,7 +78,7 @@ def identify(
     fit = _fit(plant, experiments, estimator, params_from(plant, start or {}))
     residual = _residuals(plant, records, experiments, estimator, fit)
     fitted = tuple(_fitted(plant.definition, *pair) for pair in zip(records, residual, strict=True))
-    if fit.is_successful and isinstance(estimator, NLS):
+    if isinstance(estimator, NLS) and fit.estimate.status != Status.NOT_FINITE:
         _require_explanation(records, residual, int(fit.free.sum()))
     whiteness = {
         name: _whiteness([r[:, i] for r in residual], plant.definition.outputs[i].scale)

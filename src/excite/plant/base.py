@@ -112,7 +112,7 @@ class AbstractPlant(_Module):
         self.dt = jnp.asarray(d.dt if dt is None else dt, float)
         # Without a dt of its own a plant can be built of traced numbers.
         self.substeps = (
-            d.substeps if dt is None else math.ceil(float(dt) * d.substeps / d.dt - 1e-6)
+            d.substeps if dt is None else math.ceil(float(dt) * d.substeps / d.dt - 1e-3)
         )
 
     @abc.abstractmethod
