@@ -22,7 +22,7 @@ def main() -> None:
         print(f"\n{type(excitation).__name__}: log det {bound['log_det_information']:.1f}")
         for name, value in result.params.items():
             low, high = result.ci95(name)
-            least = bound["params"][name]["percent"]
+            least = bound["params"][name]["cramer_rao_percent"]
             print(f"  {name}: {value:.4g} in [{low:.4g}, {high:.4g}], bound {least:.2g} %")
 
 
