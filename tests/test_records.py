@@ -550,3 +550,19 @@ def test_json_has_no_number_that_is_not_finite():
     value = {"a": np.array([1.0, np.nan]), 2: (math.inf, np.float64(0.5)), "c": [np.int64(3), None]}
     assert json_ready(value) == {"a": [1.0, None], "2": [None, 0.5], "c": [3, None]}
     assert json.loads(json_text(value)) == json_ready(value)
+
+
+def test_time_in_another_unit_is_refused_unless_said_to_be_right(tmp_path):
+    path = tmp_path / "r.csv"
+    path.write_text(text_of(table()))
+    with pytest.raises(ValueError, match=r"'time' in another unit\? \(--scale time=FACTOR"):
+        read_record(path, AERO2, scales={"time": 1000.0})
+    slow = dataclasses.replace(AERO2, dt=1e-3, band=(1.0, 100.0))
+    assert read_record(path, slow, scales={"time": 1.0}).dt == pytest.approx(0.1)
+
+
+def test_a_factor_of_zero_is_refused(tmp_path):
+    path = tmp_path / "r.csv"
+    path.write_text(text_of(table()))
+    with pytest.raises(ValueError, match="scale 0 of 'pitch' is not allowed"):
+        read_record(path, AERO2, scales={"pitch": 0.0})

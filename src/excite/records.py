@@ -27,6 +27,7 @@ from .files import csv_text, write_bytes, write_json
 RECORD_KIND = "excite record"
 _UNEVEN = 0.05  # of the sampling time: more than printing it with few digits explains
 _TIMES_LIMIT = 2.0  # inputs beyond this many times the limits are in another unit
+_TIMES_DT = 50.0  # likewise sampling times this many times the plant's
 _TIMES_SCALE = 10.0  # likewise outputs beyond this many times their typical size
 
 
@@ -102,6 +103,9 @@ def read_record(
                 f"plant {description.name!r} has no column {name!r}; "
                 f"it has {', '.join(description.columns)}"
             )
+    for name, factor in scales.items():
+        if not (np.isfinite(factor) and factor != 0):
+            raise ValueError(f"scale {factor:g} of {name!r} is not allowed: finite and not zero")
     table = _read_table(path)
 
     def read(name: str) -> np.ndarray:
@@ -109,6 +113,13 @@ def read_record(
 
     time = read("time")
     _check_time(time, path)
+    dt = float(time[1] - time[0])
+    if dt > _TIMES_DT * description.dt and scales.get("time") != 1:
+        raise ValueError(
+            f"{path}: sampled every {dt:g} s, where {description.name!r} is every "
+            f"{description.dt:g} s; is 'time' in another unit? (--scale time=FACTOR; 1 says that "
+            "the unit is right)"
+        )
     outputs = () if inputs_only else description.outputs
     parts = {part.name: read(part.name) for part in (*description.inputs, *outputs)}
     for part in (*description.inputs, *outputs):

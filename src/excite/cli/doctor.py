@@ -30,7 +30,7 @@ def doctor(as_json: bool) -> None:
             extra: {
                 "installed": not (missing := [n for n in names if _version(n) is None]),
                 "missing": missing,
-                "install": f"pip install 'excite[{extra}]'",
+                "install": f"pip install --constraint constraints.txt --editable '.[{extra}]'",
             }
             for extra, names in extras.items()
         },
