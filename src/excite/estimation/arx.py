@@ -4,7 +4,8 @@ The estimator of the paper: y_k = -a_1 y_{k-1} - a_2 y_{k-2} + b_1 u_{k-1} + b_2
 fitted by recursive least squares (Ljung, System Identification, sec. 11.2), its poles
 mapped to continuous time by the logarithm. The innovations are taken as white although
 sensor noise enters past outputs too, which biases the damping; the start covariance acts
-as a ridge penalty towards zero coefficients, which biases it further (see the README).
+as a ridge penalty towards zero coefficients, which biases it further
+(docs/choosing-an-estimator.md).
 """
 
 from __future__ import annotations
@@ -38,10 +39,13 @@ class RLSState(eqx.Module):
 
 
 def regressor(
-    y_1: Float[Array, ""], y_2: Float[Array, ""], u_1: Float[Array, ""], u_2: Float[Array, ""]
-) -> Float[Array, "4"]:
+    y_1: Float[Array, "*batch"],
+    y_2: Float[Array, "*batch"],
+    u_1: Float[Array, "*batch"],
+    u_2: Float[Array, "*batch"],
+) -> Float[Array, "*batch 4"]:
     """Regressor of y_k: outputs and inputs one and two samples ago."""
-    return jnp.stack([-y_1, -y_2, u_1, u_2])
+    return jnp.stack([-y_1, -y_2, u_1, u_2], axis=-1)
 
 
 class ARX(AbstractEstimator):
@@ -140,7 +144,7 @@ def _regression(
 ) -> tuple[Float[Array, "sample 4"], Float[Array, " sample"], Bool[Array, " sample"]]:
     """Regressors and outputs of all experiments; none straddles two of them."""
     y, u = experiments.measured[..., 0], experiments.inputs[..., 0]
-    rows = jnp.stack([-y[:, 1:-1], -y[:, :-2], u[:, 1:], u[:, :-1]], axis=-1)
+    rows = regressor(y[:, 1:-1], y[:, :-2], u[:, 1:], u[:, :-1])
     valid = experiments.valid[:, 2:]
     return rows.reshape(-1, 4), y[:, 2:].ravel(), valid.ravel()
 

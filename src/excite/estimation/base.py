@@ -51,7 +51,7 @@ class Experiments(eqx.Module):
         measured: measured outputs.
         valid: False where an experiment was padded.
         initial_state: known, or where the search for it begins.
-        initial_state_known: whether it is estimated along.
+        initial_state_known: False where it is estimated along.
     """
 
     inputs: Float[Array, "experiment time input"]

@@ -38,9 +38,10 @@ class Identification:
     Attributes:
         plant: the plant as it was fitted, sampled as the records are.
         estimator: its name on the command line.
-        status: "successful", or what is wrong in a few words.
+        status: in a few words; docs/machine-readable.md lists them.
         params, std_error: by parameter, in its unit; the error of a held one is nan.
-        held: parameters that the data could not see, held where the search started.
+        held: parameters not estimated: unseen by the data and held where the search started,
+            or held at a bound that they reached.
         covariance, information: of the estimates; see `excite.estimation.Estimate`.
         whiteness: by output, p-value of the residual being white (Ljung-Box).
         verdict: sentences on what the data can see and how far to trust the intervals.
