@@ -3,6 +3,11 @@
 The import hook stands here because it must be installed before anything imports `excite`.
 """
 
+import os
+
+# One thread a process: with more, the tests' processes wait for each other's.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 import jax
 from jaxtyping import install_import_hook
 

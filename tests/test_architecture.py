@@ -29,6 +29,7 @@ CELLS = [
     {"information"},
     {"estimation"},
     {"design"},
+    {"objective"},
     {"env"},
     {"gymnasium_env"},
     {"training"},
@@ -255,7 +256,10 @@ def test_from_plant_to_training_there_is_no_file_clock_log_or_global_state(modul
         assert not any(is_outer(name, package) for package in forbidden), name
     for node in ast.walk(tree_of(module)):
         text = ast.unparse(node) if isinstance(node, ast.Attribute | ast.Call) else ""
-        assert not text.startswith(("np.random", "open(", "jax.config.update"))
+        # Stable-Baselines3 shuffles with NumPy's global state, which checkpoints must keep.
+        if module == "training/ppo" and text.startswith(("np.random.get", "np.random.set")):
+            continue
+        assert not text.startswith(("np.random.", "open(", "jax.config.update"))
 
 
 # ------------------------------------------------------------- names, sizes, words

@@ -10,13 +10,15 @@ import pytest
 import scipy.stats
 from documented import documented
 
-from excite import benchmark
 from excite.benchmark import (
     Episodes,
     evaluate,
     run_benchmark,
     wilson,
     write_benchmark,
+)
+from excite.benchmark import (
+    base as benchmark,
 )
 from excite.estimation import Status
 from excite.excitation import PRBS, Chirp, Random

@@ -28,10 +28,17 @@ def shell(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("name", cli.commands)
+COMMANDS = {
+    f"{name} {sub}".strip(): command
+    for name, group in cli.commands.items()
+    for sub, command in (group.commands if isinstance(group, click.Group) else {"": group}).items()
+}
+
+
+@pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_and_option_is_in_the_readme(name: str):
     row = next(line for line in README.splitlines() if line.startswith(f"| `excite {name}"))
-    for option in cli.commands[name].params:
+    for option in COMMANDS[name].params:
         if isinstance(option, click.Option) and option.name not in ("as_json", "plot"):
             shown = option.opts[0] in row or name == "information"
             assert shown, f"{option.opts[0]} of {name} is not in the README's table"

@@ -2,6 +2,7 @@
 
 import functools
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,11 +10,13 @@ import pytest
 import scipy.signal
 from catalogue import EXCITATIONS, PLANTS, TwoMasses
 
+from excite.env import Env
 from excite.excitation import (
     PRBS,
     AbstractSignal,
     Chirp,
     Multisine,
+    PolicyExcitation,
     Random,
     Replay,
     Square,
@@ -21,6 +24,9 @@ from excite.excitation import (
     maximum_length_sequence,
 )
 from excite.plant import Aero2
+from excite.plant.base import Sensor
+from excite.policy import Layout, Policy
+from excite.simulation import run_episode
 
 NUM_STEPS = 200
 KEY = jax.random.key(7)
@@ -299,3 +305,70 @@ def test_a_logarithmic_chirp_that_stays_at_its_frequency_is_a_sine():
     np.testing.assert_allclose(
         of_aero2(Chirp(1.0, 0.5, 0.5, logarithmic=True), 100), expected, atol=1e-9
     )
+
+
+# --------------------------------------------------------------------------- a policy
+
+
+def policy_of(plant, num_steps: int = 30, gain: float = 0.1) -> Policy:
+    """Random weights: what it does matters less than that it is done twice."""
+    layout = Layout.of(plant.description, window=6, num_steps=num_steps)
+    rng, num_inputs = np.random.default_rng(5), len(layout.input_half)
+    weights = (
+        (rng.normal(size=(8, layout.size)), 0.3 * rng.normal(size=8)),
+        (gain * rng.normal(size=(num_inputs, 8)), np.zeros(num_inputs)),
+    )
+    return Policy(plant.description, layout, weights)
+
+
+@pytest.mark.parametrize("gain", [0.1, 3.0])
+@pytest.mark.parametrize("plant", [AERO2, TWO], ids=["aero2", "two_masses"])
+def test_a_policy_meets_in_an_experiment_what_it_met_in_training(plant, gain):
+    num_outputs = len(plant.definition.outputs)
+    silent = plant.changed(sensor=Sensor(jnp.zeros(num_outputs), jnp.zeros(num_outputs)))
+    policy = policy_of(plant, gain=gain)
+    env = Env.of(silent, layout=policy.layout)
+    state, observation = env.reset(KEY)
+    step = eqx.filter_jit(env.step)
+    params, actions, states = state.params, [], []
+    for _ in range(30):
+        actions.append(policy(np.asarray(observation)))
+        state, transition = step(state, jnp.asarray(actions[-1]))
+        observation = transition.observation
+        states.append(state.plant_state)
+    episode = run_episode(silent, params, PolicyExcitation.of(policy), 30, jax.random.key(0))
+    lower = np.array([part.lower for part in plant.definition.inputs])
+    upper = np.array([part.upper for part in plant.definition.inputs])
+    inputs = (lower + upper) / 2 + (upper - lower) / 2 * np.array(actions, float)
+    np.testing.assert_allclose(episode.inputs, inputs, rtol=1e-5, atol=1e-5 * upper.max())
+    outputs = [plant.output(state, params) for state in states]
+    np.testing.assert_allclose(episode.outputs[1:], outputs, rtol=1e-5, atol=1e-6)
+    assert np.all(np.std(episode.inputs, axis=0) > 0)
+    limits = (episode.inputs == lower[None]) | (episode.inputs == upper[None])
+    assert np.any(limits) == (gain == 3.0)
+
+
+def test_a_policy_looks_at_the_measurements():
+    policy = policy_of(AERO2)
+    loud = AERO2.changed(sensor=Sensor(jnp.ones(1), jnp.zeros(1)))
+    excitation = PolicyExcitation.of(policy)
+    ours, other = (
+        run_episode(plant, plant.nominal, excitation, 30, KEY).inputs for plant in (AERO2, loud)
+    )
+    assert np.all(ours != other)
+
+
+def test_a_shorter_experiment_is_the_beginning_of_a_longer_one():
+    # k / T is that of the policy, not of the experiment.
+    excitation = PolicyExcitation.of(policy_of(AERO2))
+    silent = AERO2.changed(sensor=Sensor(jnp.zeros(1), jnp.zeros(1)))
+    long, short = (
+        run_episode(silent, AERO2.nominal, excitation, num_steps, KEY) for num_steps in (30, 11)
+    )
+    np.testing.assert_allclose(short.inputs, long.inputs[:11], rtol=1e-6)
+
+
+def test_an_experiment_longer_than_the_policy_was_made_for_is_refused():
+    excitation = PolicyExcitation.of(policy_of(AERO2))
+    with pytest.raises(ValueError, match="made for 30 steps; the experiment has 31"):
+        run_episode(AERO2, AERO2.nominal, excitation, 31, KEY)

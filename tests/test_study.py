@@ -87,9 +87,9 @@ def study_of(text: str, folder: Path) -> Study:
 def test_every_shipped_study_loads(path):
     study = read_study(path)
     assert study.name == path.stem
-    assert study.episodes == 1000
-    assert list(study.methods) == ["random", "prbs", "chirp"]
-    assert set(study.reference) <= set(study.methods)
+    assert study.episodes == (100 if study.agents else 1000)
+    assert list(study.methods) == ([] if path.stem == "paper" else ["random", "prbs", "chirp"])
+    assert set(study.reference) <= {*study.methods, *study.agents}
 
 
 def test_what_is_left_out_has_the_papers_value(tmp_path):
@@ -259,7 +259,44 @@ BAD_STUDIES: dict[str, tuple[str, tuple[str, ...]]] = {
         MINIMAL.replace('excitation = "chirp"', ""), ("'methods.chirp.excitation' is missing",),
     ),
     "no methods": (
-        MINIMAL.replace('[methods.chirp]\nexcitation = "chirp"', ""), ("'methods' is missing",),
+        MINIMAL.replace('[methods.chirp]\nexcitation = "chirp"', ""), ("no methods",),
+    ),
+    "unknown agent setting": (MINIMAL + '[agents.a]\nkind = "ppo"\n', ("unknown key 'kind'",)),
+    "unknown trainer": (MINIMAL + '[agents.a]\nmethod = "sac"\n', ("agents.a.method", "sac")),
+    "unknown target": (MINIMAL + '[agents.a]\ntargets = ["K"]\n', ("no parameter 'K'", "J_p")),
+    "no target": (MINIMAL + "[agents.a]\ntargets = []\n", ("at least one parameter",)),
+    "unknown training setting": (
+        MINIMAL + "[agents.a]\n[training]\nlr = 1\n", ("training setting 'lr'", "learning_rate"),
+    ),
+    "negative training steps": (
+        MINIMAL + "[agents.a]\n[training]\ntotal_steps = -5\n", ("total_steps", "-5"),
+    ),
+    "text for a number": (
+        MINIMAL + '[agents.a]\n[training]\ngamma = "big"\n', ("training: gamma", "big"),
+    ),
+    "unknown decision setting": (
+        MINIMAL + "[agents.a]\n[decision]\nwindows = 3\n", ("did you mean 'window'",),
+    ),
+    "unknown reward": (
+        MINIMAL + '[agents.a]\n[decision]\nreward = "nice"\n', ("decision: reward", "nice"),
+    ),
+    "negative goal": (
+        MINIMAL + "[agents.a]\n[decision]\ngoals = { J_p = -1 }\n", ("goals.J_p", "-1"),
+    ),
+    "unknown goal": (
+        MINIMAL + "[agents.a]\n[decision]\ngoals = { J = 1 }\n", ("no parameter 'J'",),
+    ),
+    "unknown output scale": (
+        MINIMAL + "[agents.a]\n[decision]\noutput_scale = { p = 1 }\n", ("output_scale 'p'",),
+    ),
+    "negative seeds": (MINIMAL.replace("aero2", 'aero2"\nseeds = -1 #'), ("seeds", "-1")),
+    "agent named like a method": (MINIMAL + "[agents.chirp]\n", ("both a method and an agent",)),
+    "reward from nls": (
+        MINIMAL + '[agents.a]\n[decision]\nestimator = "nls"\n', ("needs an ARX estimator",),
+    ),
+    "reward from ARX without a mapping": (
+        MINIMAL.replace("aero2", "dc_motor") + '[agents.a]\n[decision]\nreward = "log"\n',
+        ("mapping from ARX", "'information'"),
     ),
     "empty methods": (
         MINIMAL.replace('[methods.chirp]\nexcitation = "chirp"', "[methods]"), ("no methods",),

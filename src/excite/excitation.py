@@ -21,6 +21,17 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from .plant import AbstractPlant
+from .policy import (
+    Layout,
+    Policy,
+    Window,
+    empty_window,
+    forward,
+    observe,
+    scaled_action,
+    with_input,
+    with_measurement,
+)
 
 Sequence: TypeAlias = Float[Array, "time input"]
 SignalState: TypeAlias = Any
@@ -286,6 +297,48 @@ class Replay(AbstractSignal):
             )
         lower, upper = plant.input_limits
         return jnp.clip(self.inputs[:num_steps], lower[None], upper[None])
+
+
+class PolicyExcitation(AbstractExcitation):
+    """A learned policy: the only excitation here that looks at the measurements.
+
+    Attributes:
+        weights: of the network, single precision.
+        layout: what it observes.
+    """
+
+    weights: tuple[tuple[Float[Array, "_to _from"], Float[Array, " _to"]], ...]
+    layout: Layout = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, policy: Policy) -> PolicyExcitation:
+        """The excitation of a policy read from a file."""
+        layers = tuple((jnp.asarray(m), jnp.asarray(b)) for m, b in policy.weights)
+        return cls(layers, policy.layout)
+
+    def init(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> tuple[Window, Array]:
+        """An empty window and k = 0.
+
+        Raises:
+            ValueError: for an experiment longer than the policy was made for.
+        """
+        del plant, key
+        if num_steps > self.layout.num_steps:
+            raise ValueError(
+                f"the policy was made for {self.layout.num_steps} steps; "
+                f"the experiment has {num_steps}"
+            )
+        return empty_window(jnp, self.layout), jnp.asarray(0)
+
+    def __call__(
+        self, state: tuple[Window, Array], measurement: Float[Array, " output"]
+    ) -> tuple[tuple[Window, Array], Float[Array, " input"]]:
+        """The network's input for the window that ends with this measurement."""
+        window, k = state
+        window = with_measurement(jnp, self.layout, window, measurement)
+        action = forward(jnp, self.weights, observe(jnp, self.layout, window, k))
+        input = scaled_action(jnp, self.layout, action.astype(float))
+        return (with_input(jnp, self.layout, window, input), k + 1), input
 
 
 def crest_factor(sequence: Sequence) -> Float[Array, " input"]:

@@ -25,11 +25,13 @@ from .excitation import (
     AbstractExcitation,
     Chirp,
     Multisine,
+    PolicyExcitation,
     Random,
     Square,
     maximum_length_sequence,
 )
 from .plant import EMPS, AbstractPlant, Aero2, CartPole, DCMotor, Sensor
+from .policy import Policy, mismatch, read_policy
 
 PLANTS: Mapping[str, type[AbstractPlant]] = {
     "aero2": Aero2,
@@ -49,6 +51,9 @@ ESTIMATORS: Mapping[str, AbstractEstimator] = {
     "arx-rls-wide": ARX(start_covariance=1e8, name="arx-rls-wide"),
     "nls": NLS(),
 }
+
+
+POLICY_ENDING = ".safetensors"
 
 
 def unknown(kind: str, word: str, allowed: Iterable[str]) -> ValueError:
@@ -139,16 +144,42 @@ def _module(path: Path) -> Any:
 def excitation_named(
     name: str, options: Mapping[str, Any], plant: AbstractPlant
 ) -> AbstractExcitation:
-    """An excitation by name, its options checked against the plant.
+    """An excitation by name, or a trained policy by its file, checked against the plant.
 
     Raises:
-        ValueError: for an unknown name or option, or a value that is not allowed.
+        ValueError: for an unknown name or option, a value that is not allowed, or a policy
+            that may not excite this plant.
     """
+    if name.endswith(POLICY_ENDING):
+        if options:
+            raise ValueError(f"a policy has no options: got {', '.join(options)}")
+        policy = read_policy(Path(name))
+        _check_policy(policy, name, plant)
+        return PolicyExcitation.of(policy)
     if name not in EXCITATIONS:
-        raise unknown("excitation", name, EXCITATIONS)
+        raise unknown("excitation", name, [*EXCITATIONS, f"path/to/policy{POLICY_ENDING}"])
     excitation = _build(EXCITATIONS[name](), name, options)
     _check_excitation(excitation, plant)
     return excitation
+
+
+def policy_origin(name: str, plant: AbstractPlant) -> dict[str, str]:
+    """What a record must say of the policy that made it; nothing for other excitations.
+
+    `policy_hash`, and a `warning` where the policy was trained on another plant.
+    """
+    if not name.endswith(POLICY_ENDING):
+        return {}
+    policy = read_policy(Path(name))
+    warning = _check_policy(policy, name, plant)
+    return {"policy_hash": policy.hash} | ({} if warning is None else {"warning": warning})
+
+
+def _check_policy(policy: Policy, name: str, plant: AbstractPlant) -> str | None:
+    try:
+        return mismatch(policy, plant.description)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from None
 
 
 def estimator_named(name: str, options: Mapping[str, Any] | None = None) -> AbstractEstimator:

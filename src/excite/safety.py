@@ -34,6 +34,35 @@ def watched_output(description: PlantDescription) -> int:
     return next((i for i, level in enumerate(levels) if level < math.inf), 0)
 
 
+def watched_levels(
+    description: PlantDescription,
+) -> tuple[tuple[int, ...], Float[np.ndarray, " watched"], Float[np.ndarray, " watched"]]:
+    """Indices of the outputs with a critical level, their warning and critical levels.
+
+    Where an output has no warning level, the critical one takes its place.
+    """
+    parts = [(i, o) for i, o in enumerate(description.outputs) if o.critical_level is not None]
+    critical = np.array([o.critical_level for _, o in parts], float)
+    warning = [o.warning_level for _, o in parts]
+    warning = np.array([c if w is None else w for w, c in zip(warning, critical, strict=True)])
+    return tuple(i for i, _ in parts), warning.astype(float), critical
+
+
+def penalty(outputs: AnyArray, warning: AnyArray, critical: AnyArray) -> AnyArray:
+    """Stepwise safety penalty, at most zero: Eq. 3 of Langschwert et al., summed over outputs.
+
+    Args:
+        outputs: true outputs that have a critical level, the last axis.
+        warning, critical: their levels.
+    """
+    magnitude = abs(outputs)
+    is_over = magnitude >= critical
+    is_near = (magnitude >= warning) & ~is_over
+    over = 1 + 2 * (magnitude - critical) / critical
+    near = 0.1 * ((magnitude - warning) / (critical - warning + (critical == warning))) ** 2
+    return -(is_over * over + is_near * near).sum(axis=-1)
+
+
 def max_abs_output(outputs: AnyArray) -> AnyArray:
     """Largest magnitude of each output over time."""
     return abs(outputs).max(axis=-2)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal, TypeVar
 
 import pydantic
 import tomlkit
@@ -14,10 +15,22 @@ import tomlkit.exceptions
 from pydantic import BaseModel, ConfigDict, Field
 
 from .description import names_of
+from .env import Env
 from .estimation import ARX, AbstractEstimator
 from .excitation import AbstractExcitation
 from .names import ESTIMATORS, estimator_named, excitation_named, plant_named, unknown, with_sensor
+from .objective import (
+    AbstractObjective,
+    EstimationError,
+    InformationGain,
+    prior_sd_of,
+    target_mask,
+)
 from .plant import AbstractARXPlant, AbstractPlant
+from .policy import Layout
+from .training.base import PPOSettings
+
+_T = TypeVar("_T")
 
 
 class _Settings(BaseModel):
@@ -26,6 +39,7 @@ class _Settings(BaseModel):
 
 Count = Annotated[int, Field(gt=0, strict=True)]
 Magnitude = Annotated[float, Field(ge=0, strict=True, allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, strict=True, allow_inf_nan=False)]
 
 
 class SensorSettings(_Settings):
@@ -59,12 +73,50 @@ class EstimatorSettings(_Settings):
         return dict(self.model_extra or {})
 
 
+class DecisionSettings(_Settings):
+    """The decision process an agent is trained on; the paper's, but for what is set.
+
+    Attributes:
+        window: samples observed.
+        output_scale: y_max by output, in its unit, where it differs from the output's scale.
+        reward: of the experiment: `relative` errors (Eq. 4), `log` of them, or
+            `information` (its increment at every step); by default the plant's.
+        weight: factor of that reward.
+        goals: by parameter, the relative error that counts as one, default one.
+        estimator: ARX estimator in the reward, by the study's name or any.
+        normalise_penalty: whether the safety penalty is divided by the number of steps.
+    """
+
+    window: Count = 80
+    output_scale: dict[str, Positive] = {}
+    reward: Literal["relative", "log", "information"] | None = None
+    weight: Positive = 1.0
+    goals: dict[str, Positive] = {}
+    estimator: str = "arx-rls"
+    normalise_penalty: Annotated[bool, Field(strict=True)] = False
+
+
+class AgentSettings(_Settings):
+    """An agent to be trained: what it is to estimate, and where it differs from the others.
+
+    Attributes:
+        targets: parameters in its reward, default the plant's targets.
+        decision, training: instead of the study's.
+    """
+
+    targets: list[str] | None = None
+    method: Literal["ppo"] = "ppo"
+    decision: dict[str, Any] = {}
+    training: dict[str, Any] = {}
+
+
 class ReferenceRow(_Settings):
     """A published row of the same table: mean and standard deviation of each column."""
 
     relative_error_percent: dict[str, tuple[float, float]]
     max_abs_output: tuple[float, float]
     violations: str
+    viable_seeds: str = ""
 
 
 class Study(_Settings):
@@ -80,7 +132,11 @@ class Study(_Settings):
             default the nominal value itself).
         sensor: by output, where it differs from the plant's.
         methods, estimators: by the name that tables show.
+        agents: to be trained, by the name that tables show.
+        seeds: trainings of each agent, with the seeds 0, 1, ...
+        decision, training: settings of all agents.
         inferred: settings that the source of the study does not state, in words.
+        ours: settings that differ from the source's, in words.
         reference: published rows by method, shown in tables for comparison.
         source: where they were published.
     """
@@ -93,9 +149,14 @@ class Study(_Settings):
     seed: Annotated[int, Field(ge=0, lt=2**63, strict=True)] = 0
     spread: Annotated[float, Field(ge=0, lt=1, strict=True, allow_inf_nan=False)] = 0.3
     sensor: dict[str, SensorSettings] = {}
-    methods: dict[str, MethodSettings]
+    methods: dict[str, MethodSettings] = {}
     estimators: dict[str, EstimatorSettings]
+    agents: dict[str, AgentSettings] = {}
+    seeds: Count = 10
+    decision: dict[str, Any] = {}
+    training: dict[str, Any] = {}
     inferred: list[str] = []
+    ours: list[str] = []
     reference: dict[str, ReferenceRow] = {}
     source: str = ""
 
@@ -133,12 +194,69 @@ class Study(_Settings):
                 )
         return estimators
 
+    def build_env(self, plant: AbstractPlant, agent: str) -> Env:
+        """The decision process of an agent.
+
+        Raises:
+            ValueError: for a setting or target that does not exist, or a reward from an
+                ARX estimator where the plant has no mapping from it.
+        """
+        own = self.agents[agent]
+        decision = _settings(DecisionSettings, {**self.decision, **own.decision}, "decision")
+        outputs = plant.definition.outputs
+        for name in decision.output_scale:
+            if name not in names_of(outputs):
+                raise unknown("output in output_scale", name, names_of(outputs))
+        scales = tuple(decision.output_scale.get(o.name, o.scale) for o in outputs)
+        layout = dataclasses.replace(
+            Layout.of(plant.description, decision.window, self.num_steps), output_scale=scales
+        )
+        return Env.of(
+            plant,
+            objective=self._objective(plant, own, decision),
+            layout=layout,
+            spread=self.spread,
+            penalty_weight=1 / self.num_steps if decision.normalise_penalty else 1.0,
+        )
+
+    def _objective(
+        self, plant: AbstractPlant, agent: AgentSettings, decision: DecisionSettings
+    ) -> AbstractObjective:
+        targets = target_mask(plant.definition, agent.targets)
+        has_mapping = isinstance(plant, AbstractARXPlant)
+        if decision.reward == "information" or (decision.reward is None and not has_mapping):
+            return InformationGain(targets, prior_sd_of(self.spread), decision.weight)
+        chosen = self.estimators.get(decision.estimator, EstimatorSettings(kind=decision.estimator))
+        estimator = estimator_named(chosen.kind, chosen.options)
+        if not (has_mapping and isinstance(estimator, ARX)):
+            raise ValueError(
+                f"the reward {decision.reward!r} from the estimator {decision.estimator!r} needs "
+                "an ARX estimator, and a plant with a mapping from ARX coefficients; the reward "
+                "'information' needs neither"
+            )
+        target_mask(plant.definition, list(decision.goals) or None)  # checks the names
+        goals = [decision.goals.get(p.name, 1.0) for p in plant.definition.parameters]
+        is_log = decision.reward == "log"
+        return EstimationError(estimator, targets, goals, is_log, decision.weight)
+
+    def build_training(self, agent: str) -> PPOSettings:
+        """Hyper-parameters of an agent; ValueError for one that is not allowed."""
+        return _settings(PPOSettings, {**self.training, **self.agents[agent].training}, "training")
+
+    def check_agents(self, plant: AbstractPlant) -> None:
+        """Raises ValueError where an agent cannot be built, or is named like a method."""
+        for name in self.agents:
+            if name in self.methods:
+                raise ValueError(f"{name!r} is both a method and an agent")
+            self.build_env(plant, name)
+            self.build_training(name)
+
     def check_reference(self, plant: AbstractPlant) -> None:
         """Raises ValueError for published rows of an unknown method or parameter."""
         parameters = names_of(plant.definition.parameters)
         for method, row in self.reference.items():
-            if method not in self.methods:
-                raise unknown("method in reference", method, self.methods)
+            if method not in (known := [*self.methods, *self.agents]):
+                raise unknown("method in reference", method, known)
             for name in row.relative_error_percent:
                 if name not in parameters:
                     raise unknown(f"parameter in reference.{method}", name, parameters)
@@ -159,7 +277,7 @@ class Study(_Settings):
                 if name not in known:
                     raise unknown("estimator", name, known)
             settings["estimators"] = {name: known[name] for name in chosen}
-        return _study({**self.model_dump(), **settings}, "settings")
+        return study_from({**self.model_dump(), **settings}, "settings")
 
 
 def read_study(path: Path) -> Study:
@@ -176,28 +294,45 @@ def read_study(path: Path) -> Study:
         raise ValueError(f"{path}: cannot be read ({reason})") from None
     except tomlkit.exceptions.ParseError as error:
         raise ValueError(f"{path}: not valid TOML: {error}") from None
-    study = _study(content, str(path))
+    study = study_from(content, str(path))
     if ":" in study.plant and (path.parent / study.plant.rpartition(":")[0]).is_file():
         study = study.changed(plant=str(path.parent / study.plant))  # relative to the study
     try:
         plant = study.build_plant()
         study.build_methods(plant)
         study.build_estimators(plant)
+        study.check_agents(plant)
         study.check_reference(plant)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     return study
 
 
-def _study(content: Mapping[str, Any], where: str) -> Study:
+def study_from(content: Mapping[str, Any], where: str) -> Study:
+    """A study from its settings; ValueError, naming `where`, for what is not allowed."""
     try:
         study = Study.model_validate(content)
     except pydantic.ValidationError as error:
         raise ValueError(f"{where}: {_sentence(error)}") from None
-    for kind in ("methods", "estimators"):
-        if not getattr(study, kind):
-            raise ValueError(f"{where}: the study has no {kind}")
+    if not (study.methods or study.agents):
+        raise ValueError(f"{where}: the study has no methods")
+    if not study.estimators:
+        raise ValueError(f"{where}: the study has no estimators")
     return study
+
+
+def _settings(kind: type[_T], values: Mapping[str, Any], where: str) -> _T:
+    """Checked settings of one kind from a table of the study."""
+    adapter = pydantic.TypeAdapter(kind)
+    fields = [f.name for f in dataclasses.fields(kind)] if dataclasses.is_dataclass(kind) else []
+    fields = fields or list(getattr(kind, "model_fields", {}))
+    for name in values:
+        if name not in fields:
+            raise unknown(f"{where} setting", name, fields)
+    try:
+        return adapter.validate_python(values)
+    except pydantic.ValidationError as error:
+        raise ValueError(f"{where}: {_sentence(error)}") from None
 
 
 def _sentence(error: pydantic.ValidationError) -> str:

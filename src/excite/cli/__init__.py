@@ -20,6 +20,7 @@ from .identify import identify
 from .information import information
 from .plants import plants
 from .simulate import simulate
+from .study import study
 
 _DEBUG = "--debug"
 
@@ -32,7 +33,7 @@ def cli(debug: bool) -> None:
     del debug  # read from the arguments in `main`, where errors arrive
 
 
-for command in (plants, simulate, information, identify, benchmark, doctor):
+for command in (plants, simulate, information, identify, benchmark, study, doctor):
     cli.add_command(command)
 
 

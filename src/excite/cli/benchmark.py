@@ -50,6 +50,8 @@ def benchmark(
     if out is not None:
         require_free_run_folder(out, overwrite)
     chosen = read_study(study).changed(**options)
+    if chosen.agents:
+        raise ValueError(f"{study} has agents to train: excite study run {study} --out FOLDER")
     with progress_bar(chosen.name) as progress:
         rows = run_benchmark(chosen, progress)
     settings = chosen.model_dump()

@@ -28,7 +28,8 @@ def excitation_options(command: Any) -> Any:
     for option in reversed(
         [
             click.option("--excitation", metavar="NAME",
-                         help="random, prbs, chirp, multisine or square; default chirp."),
+                         help="random, prbs, chirp, multisine, square, or the file of a policy "
+                         "(.safetensors); default chirp."),
             click.option("--set", "settings", type=VALUES, multiple=True,
                          help="Options of the excitation: amplitude, hold, clock, register, "
                          "start_frequency, stop_frequency, frequency, logarithmic."),
@@ -57,7 +58,7 @@ def prepared(options: dict[str, Any], plant_name: str, file: Path | None) -> dic
     import jax.numpy as jnp
 
     from ..excitation import Replay
-    from ..names import excitation_named, plant_named, with_sensor
+    from ..names import excitation_named, plant_named, policy_origin, with_sensor
     from ..plant import params_from
     from ..records import read_record
 
@@ -85,6 +86,7 @@ def prepared(options: dict[str, Any], plant_name: str, file: Path | None) -> dic
         "params": params_from(plant, merged(options["params"])),
         "excitation": excitation,
         "excitation_name": name,
+        "origin": policy_origin(name, plant),
         "steps": steps,
         "key": jax.random.key(options["seed"]),
         "record": record,
@@ -136,6 +138,8 @@ def simulate(
             "the simulation left the finite numbers: these parameters make the plant too fast "
             "for its integration step, or unstable"
         )
+    if "warning" in job["origin"]:
+        click.echo(f"warning: {job['origin']['warning']}", err=True)
     description = job["plant"].description
     record = _record(run, job, options["seed"])
     summary = {
@@ -180,6 +184,7 @@ def _record(run: Any, job: dict[str, Any], seed: int) -> Any:
                 "simulated": True,
                 "excitation": job["excitation_name"],
                 "seed": seed,
+                **job["origin"],
             },
         },
     )

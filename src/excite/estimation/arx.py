@@ -191,3 +191,22 @@ def physical_params(
     status = jnp.where(jnp.any(positive & (values <= 0)), Status.UNPHYSICAL, status)
     finite = jnp.all(jnp.isfinite(values))
     return params, jnp.where(finite, status, Status.NOT_FINITE)
+
+
+@eqx.filter_jit
+def running_params(
+    estimator: ARX,
+    plant: AbstractARXPlant,
+    inputs: Float[Array, "time input"],
+    measured: Float[Array, "sample output"],
+) -> Float[Array, "sample param"]:
+    """Estimates after every sample of one experiment; not numbers where there is none yet."""
+    y, u = measured[:, 0], inputs[:, 0]
+    rows = regressor(y[1:-1], y[:-2], u[1:], u[:-1])
+
+    def advance(memory: RLSState, sample: tuple[Array, Array]) -> tuple[RLSState, Array]:
+        memory = estimator.update(memory, *sample)
+        return memory, jnp.stack(physical_params(plant, memory.coefficients)[0])
+
+    _, params = jax.lax.scan(advance, estimator.init(), (rows, y[2:]))
+    return jnp.concatenate([jnp.full((2, params.shape[1]), jnp.nan), params])

@@ -222,7 +222,9 @@ def params_from(plant: AbstractPlant, values: Mapping[str, float]) -> Params:
     return plant.nominal._replace(**given)
 
 
-def draw_params(plant: AbstractPlant, key: PRNGKeyArray, spread: float) -> Params:
+def draw_params(
+    plant: AbstractPlant, key: PRNGKeyArray, spread: float | Float[Array, ""]
+) -> Params:
     """Random parameters, each uniform in its nominal value ± `spread` times its scale."""
     unit = jax.random.uniform(key, (len(plant.nominal),), float, -1.0, 1.0)
     scales = [p.scale for p in plant.definition.parameters]

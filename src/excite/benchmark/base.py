@@ -9,7 +9,9 @@ the estimator's.
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,15 +23,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, PRNGKeyArray
 
-from .description import PlantDescription, display_unit, names_of
-from .estimation import AbstractEstimator, Status, stack_experiments
-from .excitation import AbstractExcitation
-from .files import new_run_folder, write_json
-from .information import cramer_rao_bound, experiment_information, relative_size
-from .plant import AbstractPlant, Params, draw_params
-from .safety import critical_levels, is_violation, max_abs_output, watched_output
-from .simulation import Trajectory, run_episode
-from .study import Study
+from ..description import PlantDescription, display_unit, names_of
+from ..estimation import AbstractEstimator, Status, stack_experiments
+from ..excitation import AbstractExcitation
+from ..files import new_run_folder, write_json
+from ..information import cramer_rao_bound, experiment_information, relative_size
+from ..plant import AbstractPlant, Params, draw_params
+from ..safety import critical_levels, is_violation, max_abs_output, watched_output
+from ..simulation import Trajectory, run_episode
+from ..study import Study, study_from
 
 CHUNK = 100
 """Episodes computed in one call: enough to be fast, few enough to show progress."""
@@ -113,25 +115,47 @@ class _Outcome:
 
 
 def run_benchmark(study: Study, progress: Progress = lambda *_: None) -> list[dict[str, Any]]:
-    """Rows of the study's table, methods in order, each with all estimators."""
+    """Rows of the study's methods in order, each with all estimators."""
     plant = study.build_plant()
+    methods, rows = study.build_methods(plant), []
+    parts = -(-study.episodes // CHUNK)
+    for m, (name, excitation) in enumerate(methods.items()):
+
+        def in_method(c: int, name: str = name, before: int = m * parts) -> None:
+            progress(name, before + c, len(methods) * parts)
+
+        rows += evaluate_method(study, plant, name, excitation, in_method)[0]
+    progress("done", len(methods) * parts, len(methods) * parts)
+    return rows
+
+
+def evaluate_method(
+    study: Study,
+    plant: AbstractPlant,
+    name: str,
+    excitation: AbstractExcitation,
+    progress: Callable[[int], None] = lambda _: None,
+) -> tuple[list[dict[str, Any]], Float[np.ndarray, " input"]]:
+    """One row an estimator for one method, and the root mean square of each input.
+
+    Raises:
+        ValueError: for a sensor without noise, which has no Cramér-Rao bound.
+    """
     if not np.all(np.asarray(plant.sensor.sd) > 0):
         raise ValueError("a sensor without noise has no Cramér-Rao bound; give it a noise_sd")
-    methods, estimators = study.build_methods(plant), study.build_estimators(plant)
+    estimators = study.build_estimators(plant)
     keys = jax.random.split(jax.random.key(study.seed), study.episodes)
-    chunks = [keys[i : i + CHUNK] for i in range(0, study.episodes, CHUNK)]
-    total, rows = len(chunks) * len(methods), []
-    for m, (name, excitation) in enumerate(methods.items()):
-        parts: dict[str, list[_Outcome]] = {e: [] for e in estimators}
-        for c, chunk in enumerate(chunks):
-            progress(name, m * len(chunks) + c, total)
-            episodes = evaluate(plant, excitation, study.num_steps, study.spread, chunk)
-            for e, estimator in estimators.items():
-                parts[e].append(_outcome(plant, estimator, episodes))
-        for e, outcomes in parts.items():
-            rows.append(_row(plant.description, name, e, _joined(outcomes)))
-    progress("done", total, total)
-    return rows
+    outcomes: dict[str, list[_Outcome]] = {e: [] for e in estimators}
+    squares = []
+    for c, first in enumerate(range(0, study.episodes, CHUNK)):
+        progress(c)
+        chunk = keys[first : first + CHUNK]
+        episodes = evaluate(plant, excitation, study.num_steps, study.spread, chunk)
+        squares.append(np.mean(np.asarray(episodes.trajectory.inputs) ** 2, axis=1))
+        for e, estimator in estimators.items():
+            outcomes[e].append(_outcome(plant, estimator, episodes))
+    rows = [_row(plant.description, name, e, _joined(parts)) for e, parts in outcomes.items()]
+    return rows, np.sqrt(np.concatenate(squares).mean(axis=0))
 
 
 def _outcome(plant: AbstractPlant, estimator: AbstractEstimator, episodes: Episodes) -> _Outcome:
@@ -247,3 +271,33 @@ def write_benchmark(
         plant = study.build_plant().description
         write_json(folder / "study.json", study.model_dump())
         write_json(folder / "run.json", {"kind": "excite benchmark", "plant": plant.to_dict()})
+
+
+def seed_folder(folder: Path, agent: str, seed: int) -> Path:
+    """Where a seed of an agent keeps its files."""
+    return folder / "seeds" / re.sub(r"\W+", "_", agent).strip("_") / str(seed)
+
+
+def study_of(folder: Path) -> Study:
+    """The study of a run folder."""
+    if not (folder / "study.json").is_file():
+        raise ValueError(f"{folder} holds no study")
+    settings = read_json(folder / "study.json")
+    return study_from(settings, str(folder / "study.json"))
+
+
+def numbers_of(value: Any) -> Any:
+    """A copy of rows read from a file, None become the numbers that do not exist again."""
+    if isinstance(value, dict):
+        return {key: numbers_of(part) for key, part in value.items()}
+    if isinstance(value, list):
+        return [numbers_of(part) for part in value]
+    return math.nan if value is None else value
+
+
+def read_json(path: Path) -> Any:
+    """Content of a file of a run folder; ValueError where it cannot be read."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise ValueError(f"{path}: cannot be read ({error})") from None

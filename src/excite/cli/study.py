@@ -1,0 +1,161 @@
+"""`excite study`: trains and compares the agents of a study file, and shows the table."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import click
+
+from .door import (
+    OUT_FILE,
+    RunFailedError,
+    computing,
+    json_option,
+    progress_bar,
+    show_json,
+    show_table,
+)
+
+
+@click.group()
+def study() -> None:
+    """Train the agents of a study, resume it, print its table."""
+
+
+@study.command()
+@click.argument("study_file", type=OUT_FILE, metavar="STUDY.toml")
+@click.option("--out", type=OUT_FILE, required=True, metavar="FOLDER", help="Its run folder.")
+@click.option(
+    "--engine",
+    type=click.Choice(["local", "dask"]),
+    default="local",
+    show_default=True,
+    help="Processes of this machine, or a Dask cluster.",
+)
+@click.option("--address", metavar="tcp://HOST:PORT", help="Scheduler of the Dask cluster.")
+@click.option(
+    "--workers",
+    type=click.IntRange(min=1),
+    help="Processes of the local engine; default one a core.",
+)
+@json_option
+@computing
+def run(
+    study_file: Path,
+    out: Path,
+    engine: str,
+    address: str | None,
+    workers: int | None,
+    as_json: bool,
+) -> None:
+    """Train what STUDY.toml lacks in its run folder, then write its table and figures.
+
+    Interrupted at any moment, the same command goes on where it was.
+    """
+    from ..benchmark.run import run_study
+    from ..study import read_study
+
+    chosen = read_study(study_file)
+    if chosen.agents:
+        _require_trainer()
+    machine = _engine(engine, address, workers)
+
+    def finished(name: str) -> None:
+        click.echo(f"finished: {name}", err=True)
+
+    with progress_bar(chosen.name) as progress:
+        failures = run_study(chosen, out, machine, progress, finished)
+    if failures:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in failures.items())
+        raise RunFailedError(
+            f"{len(failures)} tasks failed ({reasons}); what is finished is kept in {out}, "
+            "the same command tries the rest again"
+        )
+    _finish(chosen, out)
+    _show(out, as_json)
+
+
+@study.command()
+@click.argument("folder", type=OUT_FILE, metavar="FOLDER")
+@json_option
+@computing
+def table(folder: Path, as_json: bool) -> None:
+    """Print the table of a finished study."""
+    _show(folder, as_json)
+
+
+def _require_trainer() -> None:
+    from importlib.util import find_spec
+
+    missing = [n for n in ("stable_baselines3", "torch", "tensorboard") if find_spec(n) is None]
+    if missing:
+        raise ValueError(
+            f"training needs {', '.join(missing)}: "
+            "pip install --constraint constraints.txt '.[ppo]'"
+        )
+
+
+def _engine(engine: str, address: str | None, workers: int | None) -> Any:
+    from ..engine import dask_engine, local_engine
+
+    if engine == "dask":
+        if address is None:
+            raise ValueError("--engine dask needs --address tcp://HOST:PORT of its scheduler")
+        if workers is not None:
+            raise ValueError("--workers is for the local engine; a Dask cluster has its own")
+        return dask_engine(address)
+    if address is not None:
+        raise ValueError("--address is for --engine dask")
+    return local_engine(workers or len(os.sched_getaffinity(0)))
+
+
+def _finish(chosen: Any, folder: Path) -> None:
+    """Writes the table and the figures into the run folder."""
+    from ..benchmark.table import best_seeds, example_episodes, learning_curves, study_table
+    from ..files import write_bytes, write_json
+    from ..report import (
+        agents_figure,
+        benchmark_csv,
+        benchmark_figure,
+        benchmark_latex,
+        benchmark_markdown,
+        curves_figure,
+        image,
+    )
+
+    content, settings = study_table(folder), chosen.model_dump()
+    rows, title = content["rows"], chosen.title or chosen.name
+    shown = {
+        "table.md": benchmark_markdown(rows, settings).encode(),
+        "table.csv": benchmark_csv(rows).encode(),
+        "table.tex": benchmark_latex(rows, settings).encode(),
+        "errors.png": image(benchmark_figure(rows, title), "png"),
+    }
+    if chosen.agents:
+        plant = chosen.build_plant().description
+        curves = curves_figure(plant, learning_curves(chosen, folder), title)
+        episodes = agents_figure(plant, example_episodes(chosen, folder), title)
+        shown |= {"curves.png": image(curves, "png"), "episodes.png": image(episodes, "png")}
+        content["best_seeds"] = best_seeds(chosen, folder)
+    for name, data in shown.items():
+        write_bytes(folder / name, data)
+    write_json(folder / "table.json", content)
+
+
+def _show(folder: Path, as_json: bool) -> None:
+    from ..benchmark.base import study_of
+    from ..benchmark.table import finished_table
+    from ..report import all_cells, footnotes, table_header
+
+    content, settings = finished_table(folder), study_of(folder).model_dump()
+    if as_json:
+        show_json(content)
+        return
+    rows = content["rows"]
+    title = settings["title"] or settings["name"]
+    show_table(title, table_header(rows), all_cells(rows, settings["reference"]))
+    for note in footnotes(settings):
+        click.echo(note)
+    click.echo(f"run folder: {folder}")

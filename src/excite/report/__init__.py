@@ -1,0 +1,27 @@
+"""From records to tables and figures that people read.
+
+Everything comes in as plain data (records, descriptions, JSON-ready dictionaries): no
+line of this room computes an experiment.
+"""
+
+from .base import PLOT_ENDINGS as PLOT_ENDINGS
+from .base import digits_for as digits_for
+from .base import image as image
+from .base import number as number
+from .base import require_plot_path as require_plot_path
+from .base import save as save
+from .figures import benchmark_figure as benchmark_figure
+from .figures import episode_figure as episode_figure
+from .figures import episodes_figure as episodes_figure
+from .figures import identification_figure as identification_figure
+from .figures import information_figure as information_figure
+from .study import agents_figure as agents_figure
+from .study import curves_figure as curves_figure
+from .tables import all_cells as all_cells
+from .tables import benchmark_csv as benchmark_csv
+from .tables import benchmark_latex as benchmark_latex
+from .tables import benchmark_markdown as benchmark_markdown
+from .tables import footnotes as footnotes
+from .tables import reference_cells as reference_cells
+from .tables import table_cells as table_cells
+from .tables import table_header as table_header

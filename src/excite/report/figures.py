@@ -1,0 +1,147 @@
+"""Figures of experiments, estimates and comparisons."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import matplotlib.figure
+import numpy as np
+from jaxtyping import Float
+
+from ..description import PlantDescription, display_unit
+from ..records import Record
+from .base import (
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    RED,
+    add_legend,
+    axis_label,
+    digits_for,
+    draw_episode,
+    new_figure,
+    number,
+    thin,
+)
+
+
+def identification_figure(
+    description: PlantDescription,
+    result: Mapping[str, Any],
+    record: Record,
+    simulated: Float[np.ndarray, "sample output"],
+) -> matplotlib.figure.Figure:
+    """Measured against simulated outputs, residuals, and the parameters' intervals."""
+    outputs = description.outputs
+    figure, axes = new_figure(2 * len(outputs) + 1)
+    for i, part in enumerate(outputs):
+        top, below = axes[2 * i, 0], axes[2 * i + 1, 0]
+        factor = display_unit(part.unit)[1]
+        time, measured, model = thin(record.time, record.outputs[:, i], simulated[:, i])
+        top.plot(time, factor * measured, color=GREY, lw=1.6, label="measured")
+        top.plot(time, factor * model, color=BLUE, lw=1, label="simulated")
+        fit = result["fit_percent"][part.name]
+        top.set(ylabel=axis_label(part), title=f"{part.name}: fit {number(fit, 4)} %")
+        below.plot(time, factor * (measured - model), color=ORANGE, lw=0.8)
+        below.set(ylabel=f"residual [{display_unit(part.unit)[0]}]")
+    axes[-2, 0].set(xlabel="time [s]")
+    _draw_intervals(axes[-1, 0], result["params"])
+    add_legend(figure, axes[0, 0])
+    figure.suptitle(f"{description.name}: {result['estimator']}, {result['status']}")
+    return figure
+
+
+def _draw_intervals(axis: Any, params: Mapping[str, Mapping[str, Any]]) -> None:
+    """95 % intervals in percent of the estimate."""
+    for i, (name, p) in enumerate(params.items()):
+        value, error = p["estimate"], p["std_error"]
+        if error is None or not math.isfinite(error):
+            axis.text(0, i, f"{name} held", color=GREY, va="center", ha="center")
+            continue
+        half = 100 * 1.96 * error / (abs(value) or math.nan)
+        axis.errorbar(0, i, xerr=half, color=BLUE, fmt="o", capsize=4, ms=4)
+        text = f"{number(value, digits_for(value, error))} {p['unit']}"
+        axis.annotate(text, (0, i), (0, 7), textcoords="offset points", ha="center", fontsize=8)
+    axis.set_yticks(range(len(params)), params)
+    axis.set(ylim=(len(params) - 0.4, -0.9), xlabel="95 % interval [% of the estimate]")
+
+
+def episode_figure(description: PlantDescription, record: Record) -> matplotlib.figure.Figure:
+    """Inputs and outputs of one experiment, with the safety levels."""
+    figure, axes = new_figure(len(description.inputs) + len(description.outputs))
+    draw_episode(axes[:, 0], description, record)
+    axes[-1, 0].set(xlabel="time [s]")
+    add_legend(figure, *axes[:, 0])
+    figure.suptitle(description.name)
+    return figure
+
+
+def episodes_figure(
+    description: PlantDescription, records: Mapping[str, Record]
+) -> matplotlib.figure.Figure:
+    """Several experiments of one plant side by side, by title."""
+    rows = len(description.inputs) + len(description.outputs)
+    figure, axes = new_figure(rows, len(records), width=3.2 * len(records))
+    for column, (title, record) in enumerate(records.items()):
+        draw_episode(axes[:, column], description, record)
+        axes[0, column].set(title=title)
+        axes[-1, column].set(xlabel="time [s]")
+    add_legend(figure, *axes[:, 0])
+    figure.suptitle(f"{description.name}: nominal response")
+    return figure
+
+
+def information_figure(
+    description: PlantDescription, record: Record, percent: Mapping[str, float | None]
+) -> matplotlib.figure.Figure:
+    """The input, and the least standard deviation of each parameter in percent."""
+    inputs = description.inputs
+    figure, axes = new_figure(len(inputs) + 1)
+    for i, part in enumerate(inputs):
+        time, values = thin(record.time, record.inputs[:, i])
+        axes[i, 0].step(time, values, where="post", color=GREEN, lw=1)
+        axes[i, 0].set(ylabel=axis_label(part))
+    axes[len(inputs) - 1, 0].set(xlabel="time [s]")
+    axis, finite = axes[-1, 0], {n: v for n, v in percent.items() if v is not None}
+    axis.plot(list(finite.values()), list(finite), "o", color=BLUE, ms=8)
+    for i, value in enumerate(finite.values()):
+        axis.annotate(
+            f"{number(value)} %", (value, i), (8, 0), textcoords="offset points", va="center"
+        )
+    axis.set(
+        xlabel="least standard deviation (Cramér-Rao) [%]", xscale="log" if finite else "linear"
+    )
+    axis.invert_yaxis()
+    axis.margins(x=0.15)
+    return figure
+
+
+def benchmark_figure(rows: Sequence[Mapping[str, Any]], title: str) -> matplotlib.figure.Figure:
+    """Mean relative error of each method and estimator beside its Cramér-Rao bound."""
+    names = list(rows[0]["relative_error_percent"])
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    estimators = list(dict.fromkeys(row["estimator"] for row in rows))
+    figure, axes = new_figure(1, len(names), height=3.2, width=3.2 * len(names))
+    for axis, name in zip(axes[0], names, strict=True):
+        for e, estimator in enumerate(estimators):
+            chosen = [r for r in rows if r["estimator"] == estimator]
+            place = [
+                methods.index(r["method"]) + 0.12 * (e - (len(estimators) - 1) / 2) for r in chosen
+            ]
+            means = [r["relative_error_percent"][name]["mean"] for r in chosen]
+            colour = (BLUE, ORANGE, GREEN, RED)[e % 4]
+            axis.plot(place, means, "o", color=colour, ms=6, label=estimator)
+        for m, method in enumerate(methods):
+            # What an efficient estimator's mean error would be: sqrt(2 / pi) of the bound.
+            bound = next(r for r in rows if r["method"] == method)["cramer_rao_percent"][name]
+            label = "attainable (0.80 of the bound)" if m == 0 else None
+            axis.hlines(0.798 * bound, m - 0.35, m + 0.35, color=GREY, lw=2, label=label)
+        axis.set_xticks(range(len(methods)), methods)
+        axis.set(yscale="log", title=name)
+    axes[0, 0].set(ylabel="mean relative error [%]")
+    add_legend(figure, axes[0, 0])
+    figure.suptitle(title)
+    return figure

@@ -1,0 +1,150 @@
+"""Tables: Markdown, CSV, LaTeX, and the cells that the command line shows."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from ..files import csv_text
+from .base import mean_sd, number
+
+
+def table_header(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Column titles of a benchmark table."""
+    largest = rows[0]["max_abs_output"]
+    header = ["method", "estimator"]
+    for name in rows[0]["relative_error_percent"]:
+        header += [f"{name} error %", "bound %"]
+    header += [f"max {largest['output']} {largest['unit']}", "violations (95 %)", "failed"]
+    return [*header, "viable seeds", "training"] if "seeds" in rows[0] else header
+
+
+def table_cells(row: Mapping[str, Any]) -> list[str]:
+    """The cells of one row, errors and magnitudes as mean ± standard deviation."""
+    cells = [row["method"], row["estimator"]]
+    for name, error in row["relative_error_percent"].items():
+        text = mean_sd(error["mean"], error["sd"])
+        if row.get("viable_seeds") != row.get("seeds"):
+            every = error["all_seeds"]
+            text += f" (all seeds: {mean_sd(every['mean'], every['sd'])})"
+        cells += [text, number(row["cramer_rao_percent"][name], 2)]
+    low, high = row["violation_rate"]["ci95"]
+    count = f"{row['violations']}/{row['evaluations']} ({100 * low:.1f}–{100 * high:.1f} %)"
+    largest = row["max_abs_output"]
+    failed = f"{row['failed']}/{row['evaluations']}"
+    cells += [mean_sd(largest["mean"], largest["sd"]), count, failed]
+    return [*cells, *_training_cells(row)] if "seeds" in row else cells
+
+
+def _training_cells(row: Mapping[str, Any]) -> list[str]:
+    """Viable seeds and training time; dashes for a method that is not trained."""
+    if row["seeds"] is None:
+        return ["–", "–"]
+    minutes = row["train_seconds"] / 60 / row["seeds"]
+    return [f"{row['viable_seeds']}/{row['seeds']}", f"{number(minutes, 2)} min a seed"]
+
+
+def reference_cells(row: Mapping[str, Any], reference: Mapping[str, Any]) -> list[str]:
+    """A published row in the columns of the method's own `row`."""
+    cells = [row["method"], "as published"]
+    for name in row["relative_error_percent"]:
+        published = reference["relative_error_percent"].get(name)
+        cells += ["–" if published is None else mean_sd(*published), "–"]
+    cells += [mean_sd(*reference["max_abs_output"]), reference["violations"], "–"]
+    return [*cells, reference.get("viable_seeds") or "–", "–"] if "seeds" in row else cells
+
+
+def all_cells(
+    rows: Sequence[Mapping[str, Any]], reference: Mapping[str, Mapping[str, Any]]
+) -> list[list[str]]:
+    """All rows of a table, after each method's the published one, if there is one."""
+    cells = []
+    for i, row in enumerate(rows):
+        cells.append(table_cells(row))
+        is_last = i + 1 == len(rows) or rows[i + 1]["method"] != row["method"]
+        if is_last and row["method"] in reference:
+            cells.append(reference_cells(row, reference[row["method"]]))
+    return cells
+
+
+def footnotes(study: Mapping[str, Any]) -> list[str]:
+    """What a reader of the table must know."""
+    notes = [
+        "Errors are relative errors in percent, mean ± standard deviation over the estimates "
+        "that did not fail. The bound is the mean Cramér-Rao bound of the same data, a standard "
+        "deviation: the mean error of an efficient estimator is 0.80 of it.",
+    ]
+    if study.get("agents"):
+        notes.append(
+            f"Agents: cross-seed mean ± standard deviation of the mean errors of {study['seeds']} "
+            f"training seeds, {study['episodes']} evaluation episodes each, over viable seeds (a "
+            "seed has collapsed where the RMS input is below 1 % of its limit); violations and "
+            "failures over all evaluations of all seeds. The policy is evaluated without "
+            "exploration noise."
+        )
+    if study.get("ours"):
+        notes.append("Ours, other than the source: " + "; ".join(study["ours"]) + ".")
+    if study.get("reference"):
+        notes.append(f"Published rows: {study['source']}.")
+    if study.get("inferred"):
+        notes.append("Inferred, not stated by the source: " + "; ".join(study["inferred"]) + ".")
+    return notes
+
+
+def benchmark_markdown(rows: Sequence[Mapping[str, Any]], study: Mapping[str, Any]) -> str:
+    """The table as Markdown, with its footnotes."""
+    header = table_header(rows)
+    lines = [f"# {study.get('title') or study['name']}", ""]
+    lines += ["| " + " | ".join(header) + " |", "|" + " --- |" * len(header)]
+    lines += ["| " + " | ".join(c) + " |" for c in all_cells(rows, study.get("reference", {}))]
+    lines += [line for note in footnotes(study) for line in ("", note)]
+    return "\n".join(lines) + "\n"
+
+
+def benchmark_csv(rows: Sequence[Mapping[str, Any]]) -> str:
+    """The table as CSV, numbers unrounded."""
+    text = {"method": [r["method"] for r in rows], "estimator": [r["estimator"] for r in rows]}
+    columns: dict[str, list[float]] = {
+        key: [row[key] for row in rows] for key in ("evaluations", "failed", "violations")
+    }
+    for key in ("viable_seeds", "seeds", "train_seconds"):
+        if key in rows[0]:
+            columns[key] = [math.nan if row[key] is None else row[key] for row in rows]
+    largest = rows[0]["max_abs_output"]
+    for part in ("mean", "sd"):
+        title = f"max_abs_{largest['output']}_{largest['unit']}_{part}"
+        columns[title] = [row["max_abs_output"][part] for row in rows]
+    for name in rows[0]["relative_error_percent"]:
+        for part in ("mean", "sd", "median", "rms"):
+            columns[f"{name}_error_percent_{part}"] = [
+                row["relative_error_percent"][name][part] for row in rows
+            ]
+        columns[f"{name}_cramer_rao_percent"] = [row["cramer_rao_percent"][name] for row in rows]
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    numbers = csv.reader(csv_text(columns).splitlines())
+    labels = [["method", "estimator"], *zip(text["method"], text["estimator"], strict=True)]
+    writer.writerows([*pair, *values] for pair, values in zip(labels, numbers, strict=True))
+    return buffer.getvalue()
+
+
+def benchmark_latex(rows: Sequence[Mapping[str, Any]], study: Mapping[str, Any]) -> str:
+    """The table as LaTeX (booktabs), its footnotes as comments."""
+    header = table_header(rows)
+    lines = [f"% {note}" for note in footnotes(study)]
+    lines += [r"\begin{tabular}{ll" + "r" * (len(header) - 2) + "}", r"\toprule"]
+    lines += [_latex_row(header), r"\midrule"]
+    lines += [_latex_row(cells) for cells in all_cells(rows, study.get("reference", {}))]
+    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"]) + "\n"
+
+
+def _latex_row(cells: Sequence[str]) -> str:
+    """One line of a tabular; parameters like K_pu are set as mathematics."""
+    text = " & ".join(cells)
+    for plain, latex in (("%", r"\%"), ("±", r"$\pm$"), ("–", "--"), ("&nbsp;", "~")):
+        text = text.replace(plain, latex)
+    return re.sub(r"([A-Za-z])_([A-Za-z]+)", r"$\1_{\2}$", text) + r" \\"

@@ -1,0 +1,1 @@
+"""Trainers: what turns a decision process into a policy."""

@@ -1,0 +1,171 @@
+"""What trainers share: settings, checkpoints, and a look at the policy being trained."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray
+
+from ..env import Env
+from ..policy import Weights, forward, tensors_from_bytes, tensors_to_bytes
+
+FORMAT = "excite checkpoint 1"
+WATCH_SEED = 0x7A11DA7E
+"""Validation episodes, the same for all seeds, apart from training and every evaluation."""
+
+
+@dataclass(frozen=True)
+class PPOSettings:
+    """Hyper-parameters, named as in Stable-Baselines3 and with its defaults where it has one.
+
+    Attributes:
+        total_steps: environment steps of the whole training.
+        num_envs: plants stepped as one batch.
+        n_steps: steps of each plant in a rollout.
+        batch_size, n_epochs, gamma, gae_lambda, clip_range, ent_coef, vf_coef,
+            max_grad_norm: as in Stable-Baselines3.
+        learning_rate, learning_rate_end: Adam's step, first and last, linear between;
+            without an end it is constant.
+        noise_sd, noise_sd_end: standard deviation of the exploration noise, in units of
+            the input limit, first and last, geometric between; without an end it is learnt.
+        average_last: fraction of the training, at its end, over which the weights of the policy
+            are averaged (B. Polyak, A. Juditsky, Acceleration of stochastic approximation by
+            averaging, 1992); 0 is the last policy, as in Stable-Baselines3.
+        hidden: widths of the hidden layers of policy and value function, tanh.
+        watch_every: rollouts between two looks at the deterministic policy.
+        watch_episodes: episodes of such a look.
+    """
+
+    total_steps: int = 1_000_000
+    num_envs: int = 1
+    n_steps: int = 2048
+    batch_size: int = 64
+    n_epochs: int = 10
+    gamma: float = 0.99
+    gae_lambda: float = 0.95
+    clip_range: float = 0.2
+    ent_coef: float = 0.0
+    vf_coef: float = 0.5
+    max_grad_norm: float = 0.5
+    learning_rate: float = 3e-4
+    learning_rate_end: float | None = None
+    noise_sd: float = 1.0
+    noise_sd_end: float | None = None
+    average_last: float = 0.0
+    hidden: tuple[int, ...] = (64, 64)
+    watch_every: int = 10
+    watch_episodes: int = 100
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for a value that is not allowed."""
+        counts = ("total_steps", "num_envs", "n_steps", "batch_size", "n_epochs")
+        for name in (*counts, "watch_every", "watch_episodes"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1: got {getattr(self, name)}")
+        rates = ("learning_rate", "learning_rate_end", "noise_sd", "noise_sd_end")
+        for name in (*rates, "clip_range", "max_grad_norm"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < math.inf:
+                raise ValueError(f"{name} must be positive: got {value:g}")
+        for name in ("gamma", "gae_lambda"):
+            if not 0 < getattr(self, name) <= 1:
+                raise ValueError(
+                    f"{name} must be above 0 and at most 1: got {getattr(self, name):g}"
+                )
+        if not 0 <= self.average_last < 1:
+            raise ValueError(f"average_last must lie in [0, 1): got {self.average_last:g}")
+        if not self.hidden or min(self.hidden) < 1:
+            raise ValueError(f"hidden needs widths of at least 1: got {list(self.hidden)}")
+        rollout = self.num_envs * self.n_steps
+        if self.batch_size < 2 or rollout % self.batch_size:
+            raise ValueError(
+                f"batch_size {self.batch_size} does not divide the {rollout} steps of a rollout "
+                "(num_envs times n_steps), or is below 2"
+            )
+
+    def noise_at(self, progress: float) -> float | None:
+        """Exploration noise at a fraction of the training; None where it is learnt."""
+        if self.noise_sd_end is None:
+            return None
+        return self.noise_sd ** (1 - progress) * self.noise_sd_end**progress
+
+    def learning_rate_at(self, remaining: float) -> float:
+        """Learning rate at a remaining fraction of the training."""
+        end = self.learning_rate if self.learning_rate_end is None else self.learning_rate_end
+        return end + (self.learning_rate - end) * remaining
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """Training at a rollout boundary.
+
+    Attributes:
+        tensors: weights, moments, running episodes, random states.
+        state: counters and the learning curve so far.
+    """
+
+    tensors: Mapping[str, np.ndarray]
+    state: Mapping[str, Any]
+
+    def to_bytes(self) -> bytes:
+        """Content of a checkpoint file."""
+        return tensors_to_bytes(self.tensors, FORMAT, self.state)
+
+    @classmethod
+    def from_bytes(cls, content: bytes, where: str) -> Checkpoint:
+        """The checkpoint in the content of a file; ValueError where it is none."""
+        return cls(*tensors_from_bytes(content, FORMAT, where))
+
+
+@dataclass(frozen=True)
+class Trained:
+    """Weights of the trained policy, and its learning curve: one row a look."""
+
+    weights: Weights
+    curve: list[dict[str, float]]
+
+
+class Watched(eqx.Module):
+    """Episodes of a policy without exploration noise; the leading axis is the episode.
+
+    Attributes:
+        total_reward: undiscounted return.
+        relative_errors: of the parameters, as the objective knows them.
+        is_violation: whether a critical level was reached.
+        rms_action: root mean square action of each episode, 1 is the input limit.
+    """
+
+    total_reward: Float[Array, "*episode"]
+    relative_errors: Float[Array, "*episode param"]
+    is_violation: Bool[Array, "*episode"]
+    rms_action: Float[Array, "*episode"]
+
+
+@eqx.filter_jit
+def watch(env: Env, weights: Weights, keys: Key[Array, " episode"]) -> Watched:
+    """One episode of the deterministic policy for every key."""
+
+    def episode(key: PRNGKeyArray) -> Watched:
+        state, observation = env.reset(key)
+
+        def advance(carry: tuple, _: None) -> tuple[tuple, tuple]:
+            state, observation = carry
+            action = forward(jnp, weights, observation)
+            state, t = env.step(state, action)
+            kept = t.reward, t.relative_errors, t.is_violation, jnp.mean(action**2)
+            return (state, t.observation), kept
+
+        start = state, observation
+        _, kept = jax.lax.scan(advance, start, None, length=env.layout.num_steps)
+        rewards, errors, violations, squares = kept
+        rms = jnp.sqrt(jnp.mean(squares))
+        return Watched(jnp.sum(rewards), errors[-1], violations[-1], rms)
+
+    return jax.vmap(episode)(keys)

@@ -1,0 +1,338 @@
+"""Work arrives whole, whatever happens to workers, and leaves nobody behind."""
+
+import json
+import multiprocessing
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from excite import __version__, engine
+
+TESTS = Path(__file__).parent
+MIXED = "tasks:any_of_them"
+
+
+@pytest.fixture(autouse=True)
+def _tasks_are_importable(monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", str(TESTS))
+
+
+@pytest.fixture(autouse=True)
+def _nobody_is_left():
+    yield
+    assert not multiprocessing.active_children()
+
+
+def work(
+    target: str, tasks: dict[str, Any], where: engine.Engine, **options: Any
+) -> tuple[dict[str, Any], dict[str, str]]:
+    results = {}
+
+    def on_done(name: str, result: Any) -> None:
+        assert name not in results
+        results[name] = result
+
+    failures = engine.run(target, tasks, where, on_done=on_done, **options)
+    return results, failures
+
+
+def wait_for(condition: Callable[[], Any], seconds: float = 10.0) -> bool:
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        if condition():
+            return True
+        time.sleep(0.02)
+    return bool(condition())
+
+
+def is_alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    # Nobody may be there to bury it in a container; the dead run no longer.
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+
+
+# ----------------------------------------------------------------- without processes
+
+
+def test_importing_the_engine_loads_no_jax():
+    code = "import sys, excite.engine; print(*{'jax', 'torch', 'equinox'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == ""
+
+
+def test_another_version_is_refused():
+    with pytest.raises(RuntimeError, match=rf"runs excite {__version__}.*started by 0\.0\.0"):
+        engine.call("tasks:add", "0.0.0", {"a": 1, "b": 2})
+
+
+def test_no_tasks_open_no_engine():
+    def never() -> Any:
+        raise RuntimeError
+
+    assert work("tasks:add", {}, never) == ({}, {})
+
+
+def test_less_than_one_worker_is_refused():
+    with pytest.raises(ValueError, match="at least one"):
+        engine.local_engine(0)
+
+
+def test_without_dask_the_extra_is_named(monkeypatch):
+    monkeypatch.setattr(engine, "distributed", None)
+    with pytest.raises(ValueError, match=r"pip install 'excite\[dask\]'"):
+        engine.dask_engine("tcp://127.0.0.1:8786")
+
+
+@pytest.mark.parametrize(
+    "address", ["", "here", "127.0.0.1", "tcp://:8786", "http://h:1", "h:99999", "h:one", "[::1"]
+)
+def test_a_malformed_address_is_refused(address):
+    pytest.importorskip("distributed")
+    with pytest.raises(ValueError, match="no address of a scheduler"):
+        engine.dask_engine(address)
+
+
+# ------------------------------------------------------------------- processes here
+
+
+def test_results_arrive_and_what_fails_is_tried_again(tmp_path):
+    def failing(kind: str, times: int) -> dict[str, Any]:
+        marker = str(tmp_path / f"{kind}{times}")
+        return {"function": "fail", "marker": marker, "kind": kind, "times": times}
+
+    tasks = {f"sum {i}": {"function": "add", "a": i, "b": 1} for i in range(5)}
+    tasks |= {"once": failing("os", 1), "always": failing("os", 99), "two": failing("two", 99)}
+    tasks |= {"value": failing("value", 99), "exit": failing("exit", 1)}
+    results, failures = work(MIXED, tasks, engine.local_engine(2))
+    assert results == {f"sum {i}": i + 1 for i in range(5)} | {"once": "mended", "exit": "mended"}
+    assert failures == {
+        "always": "OSError: a disk is full",
+        "two": "RuntimeError: NeedsTwoError: does not travel",
+        "value": "ValueError: a user's mistake",
+    }
+    assert {p.name: len(p.read_text().splitlines()) for p in tmp_path.iterdir()} == {
+        "os1": 2,
+        "os99": 3,
+        "two99": 3,
+        "value99": 1,  # a user's mistake stays one
+        "exit1": 2,
+    }
+
+
+def test_workers_that_die_take_nobody_along(tmp_path):
+    tasks: dict[str, Any] = {"always": {"function": "die"}}
+    tasks["once"] = {"function": "die", "marker": str(tmp_path / "died"), "a": 1, "b": 2}
+    for i in range(4):
+        marker = str(tmp_path / f"sum{i}")
+        tasks[f"sum {i}"] = {"function": "add", "a": i, "b": 1, "marker": marker, "seconds": 0.5}
+    results, failures = work(MIXED, tasks, engine.local_engine(2))
+    assert results == {"once": 3} | {f"sum {i}": i + 1 for i in range(4)}
+    assert failures == {"always": "its worker died 3 times"}
+    for i in range(4):  # not even a task that ran beside one that died is done again
+        assert (tmp_path / f"sum{i}").read_text() == "called\n"
+
+
+def test_the_environment_is_set_before_anything_is_imported(monkeypatch):
+    told = "--xla_cpu_multi_thread_eigen=true --xla_dump_to=nowhere"
+    monkeypatch.setenv("XLA_FLAGS", told)
+    monkeypatch.delenv("NPROC", raising=False)
+    before = os.environ.copy()
+    results, failures = work("tasks:environment", {"e": {}}, engine.local_engine(1))
+    assert not failures
+    expected = {
+        "OMP_NUM_THREADS": "1",
+        "OPENBLAS_NUM_THREADS": "1",
+        "MKL_NUM_THREADS": "1",
+        "NPROC": "1",
+        "JAX_ENABLE_X64": "1",
+        "TF_CPP_MIN_LOG_LEVEL": "3",
+        "XLA_FLAGS": "--xla_dump_to=nowhere --xla_cpu_multi_thread_eigen=false",
+    }
+    assert results["e"]["environment"] == expected
+    assert results["e"]["at the import of this file"].items() >= expected.items()
+    assert results["e"]["loaded"] == []
+    assert os.environ.copy() == before  # of the driver, which is left as it was
+
+
+def test_openblas_of_a_worker_has_one_thread():
+    """Dask imports NumPy before a worker is told anything: what it inherits has to do."""
+    there, _ = work("tasks:num_blas_threads", {"t": {}}, engine.local_engine(1))
+    assert there == {"t": 1}
+
+
+def test_ctrl_c_ends_the_workers_at_once(tmp_path):
+    markers = [tmp_path / str(i) for i in range(2)]
+
+    def interrupt() -> None:
+        if all(m.exists() and m.read_text() for m in markers):
+            os.kill(os.getpid(), signal.SIGINT)  # as it comes, between two lines of anything
+            time.sleep(5)
+
+    tasks = {m.name: {"marker": str(m)} for m in markers}
+    with pytest.raises(KeyboardInterrupt):
+        work("tasks:hang", tasks, engine.local_engine(2), on_tick=interrupt)
+    pids = [int(m.read_text()) for m in markers]
+    assert wait_for(lambda: not any(map(is_alive, pids)), 1.0)
+
+
+def test_an_error_of_on_done_ends_the_workers_and_is_told(tmp_path):
+    def on_done(name: str, result: Any) -> None:
+        assert wait_for(lambda: marker.exists() and marker.read_text())
+        raise OSError("disk full")
+
+    marker = tmp_path / "pid"
+    tasks: dict[str, Any] = {"hang": {"function": "hang", "marker": str(marker)}}
+    tasks["sum"] = {"function": "add", "a": 1, "b": 1}
+    with pytest.raises(OSError, match="disk full"):
+        engine.run(MIXED, tasks, engine.local_engine(2), on_done=on_done)
+    assert wait_for(lambda: not is_alive(int(marker.read_text())), 1.0)
+
+
+def test_a_killed_driver_leaves_no_worker(tmp_path):
+    markers = [tmp_path / str(i) for i in range(2)]
+    tasks = {m.name: {"marker": str(m)} for m in markers}
+    code = (
+        "from excite import engine\n"
+        f"engine.run('tasks:hang', {tasks}, engine.local_engine(2), on_done=print)"
+    )
+    driver = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL)
+    try:
+        assert wait_for(lambda: all(m.exists() and m.read_text() for m in markers), 20)
+        pids = [int(m.read_text()) for m in markers]
+        assert all(map(is_alive, pids))
+    finally:
+        driver.kill()
+        driver.wait()
+    assert wait_for(lambda: not any(map(is_alive, pids)), 2.0)
+
+
+# -------------------------------------------------------------------- a Dask cluster
+
+
+class Cluster:
+    """A scheduler and its workers on this computer, each to be killed."""
+
+    def __init__(self, folder: Path, num_workers: int = 3) -> None:
+        self.processes: list[subprocess.Popen] = []
+        file = folder / "scheduler.json"
+        here = ("--no-dashboard", "--host", "127.0.0.1", "--scheduler-file", str(file))
+        self.start("scheduler", *here, "--port", "0")
+        options = ("--no-nanny", "--nthreads", "1", "--local-directory", str(folder))
+        for _ in range(num_workers):
+            self.start("worker", *here, *options)
+
+        def address() -> str:
+            return json.loads(file.read_text())["address"] if file.exists() else ""
+
+        if not wait_for(address, 30):
+            self.close()
+            pytest.fail("the scheduler does not start")
+        self.address = address()
+
+    def start(self, name: str, *options: str) -> None:
+        """Dask's own command; it tells a lot that nobody asks for."""
+        command = [sys.executable, "-m", f"distributed.cli.dask_{name}", *options]
+        silent = subprocess.DEVNULL
+        self.processes.append(subprocess.Popen(command, stdout=silent, stderr=silent))
+
+    def kill(self, which: int) -> None:
+        self.processes[which].kill()
+        self.processes[which].wait()
+
+    def close(self) -> None:
+        for which in range(len(self.processes)):
+            self.kill(which)
+
+
+@pytest.fixture
+def cluster(tmp_path, monkeypatch) -> Iterator[Cluster]:
+    pytest.importorskip("distributed")
+    # The scheduler tells of every death at once, or one task would end all three workers.
+    monkeypatch.setenv("DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES", "0")
+    cluster = Cluster(tmp_path)
+    yield cluster
+    cluster.close()
+
+
+def test_a_cluster_that_loses_a_worker_gives_what_the_local_engine_gives(cluster, tmp_path):
+    tasks = {f"{i}": {"function": "add", "a": i, "b": 1, "seconds": 0.1} for i in range(24)}
+    for kind in ("os", "two", "value"):
+        marker = str(tmp_path / kind)
+        tasks[kind] = {"function": "fail", "marker": marker, "kind": kind, "times": 1}
+    results = {}
+
+    def on_done(name: str, result: Any) -> None:
+        results[name] = result
+        if len(results) == 8:
+            cluster.kill(1)
+
+    where = engine.dask_engine(cluster.address)
+    failures = engine.run(MIXED, tasks, where, on_done=on_done)
+    for kind in ("os", "two", "value"):
+        (tmp_path / kind).unlink()
+    assert (results, failures) == work(MIXED, tasks, engine.local_engine(2))
+    assert results == {f"{i}": i + 1 for i in range(24)} | {"os": "mended", "two": "mended"}
+    assert failures == {"value": "ValueError: a user's mistake"}
+
+
+def test_a_task_that_kills_the_workers_of_a_cluster_is_given_up(cluster):
+    tasks: dict[str, Any] = {"always": {"function": "die"}}
+    tasks |= {f"{i}": {"function": "add", "a": i, "b": 1, "seconds": 0.1} for i in range(9)}
+    where = engine.dask_engine(cluster.address)
+    results, failures = work(MIXED, tasks, where, num_tries=2)
+    assert results == {f"{i}": i + 1 for i in range(9)}
+    assert failures == {"always": "its worker died 2 times"}
+
+
+def test_ctrl_c_calls_back_what_waits_on_a_cluster_and_a_lost_one_is_told(
+    cluster, tmp_path, monkeypatch
+):
+    def stop() -> None:
+        if marker.exists():
+            raise KeyboardInterrupt
+
+    def lose(name: str, result: Any) -> None:
+        cluster.kill(0)
+
+    marker = tmp_path / "called"
+    task = {"a": 1, "b": 1, "marker": str(marker), "seconds": 0.4}
+    where = engine.dask_engine(cluster.address)
+    with pytest.raises(KeyboardInterrupt):
+        work("tasks:add", {f"{i}": task for i in range(40)}, where, on_tick=stop)
+    time.sleep(0.5)
+    num_calls = len(marker.read_text().splitlines())
+    time.sleep(1)
+    assert len(marker.read_text().splitlines()) == num_calls < 20
+
+    monkeypatch.setattr(engine, "CONNECT_TIMEOUT", 1.0)
+    with pytest.raises(ValueError, match="no Dask scheduler answers"):
+        engine.run("tasks:add", {f"{i}": task for i in range(40)}, where, on_done=lose)
+
+
+@pytest.mark.parametrize("is_silent", [True, False], ids=["silent", "closed"])
+def test_a_scheduler_that_does_not_answer_is_one_sentence(is_silent):
+    pytest.importorskip("distributed")
+    code = (
+        "import sys\nfrom excite import engine\nengine.CONNECT_TIMEOUT = 1.0\n"
+        "try:\n    engine.run('a:b', {'t': {}}, engine.dask_engine(sys.argv[1]), on_done=print)\n"
+        "except ValueError as error:\n    print(error)"
+    )
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
+        if not is_silent:
+            server.close()
+        command = [sys.executable, "-c", code, address]
+        done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=15)
+    assert done.stdout == f"no Dask scheduler answers at {address}\n"
+    assert done.stderr == ""

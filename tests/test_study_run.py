@@ -1,0 +1,349 @@
+"""A tiny study, trained from end to end: interrupted, repeated, refused, shown."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.stats
+
+from excite.benchmark.base import seed_folder, study_of
+from excite.benchmark.run import opened, run_study
+from excite.benchmark.table import across_seeds, best_seeds, finished_table, study_table
+from excite.engine import local_engine
+from excite.policy import read_policy
+from excite.study import read_study
+
+TINY = """
+name = "tiny"
+plant = "aero2"
+episodes = 5
+num_steps = 60
+seeds = 2
+[decision]
+window = 10
+output_scale = { pitch = 0.1 }
+[training]
+total_steps = 1920
+num_envs = 8
+n_steps = 60
+batch_size = 120
+n_epochs = 2
+noise_sd = 0.5
+noise_sd_end = 0.2
+watch_every = 2
+watch_episodes = 4
+[agents."RL(all)"]
+[agents."RL(K_pu)"]
+targets = ["K_pu"]
+decision = { reward = "log", goals = { K_pu = 0.004 } }
+training = { learning_rate = 1e-3 }
+[methods.chirp]
+excitation = "chirp"
+[estimators.arx-rls]
+kind = "arx-rls"
+[estimators.arx-rls-wide]
+kind = "arx-rls-wide"
+"""
+EXCITE = [sys.executable, "-m", "excite"]
+CLOCKS = ("train_seconds",)
+
+
+def write_study(folder: Path, text: str = TINY) -> Path:
+    path = folder / "tiny.toml"
+    path.write_text(text)
+    return path
+
+
+def excite(*arguments: Any) -> subprocess.CompletedProcess[str]:
+    command = [*EXCITE, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    """The run folder of the whole tiny study."""
+    folder = tmp_path_factory.mktemp("study")
+    done = excite("study", "run", write_study(folder), "--out", folder / "run", "--workers", 1)
+    assert done.returncode == 0, done.stderr
+    assert "RL(K_pu)" in done.stdout
+    assert "finished: RL(all) seed 1" in done.stderr
+    return folder / "run"
+
+
+def without_clocks(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: without_clocks(v) for k, v in value.items() if k not in CLOCKS}
+    return [without_clocks(v) for v in value] if isinstance(value, list) else value
+
+
+def table_of(folder: Path) -> Any:
+    return without_clocks(json.loads((folder / "table.json").read_text()))
+
+
+# The whole study
+
+
+def test_a_study_leaves_tables_figures_policies_and_curves(run):
+    for name in ("table.md", "table.csv", "table.tex", "table.json", "curves.png", "episodes.png"):
+        assert (run / name).stat().st_size > 100, name
+    for agent in ("RL(all)", "RL(K_pu)"):
+        for seed in range(2):
+            place = seed_folder(run, agent, seed)
+            policy = read_policy(place / "policy.safetensors")
+            assert policy.provenance["agent"] == agent
+            assert policy.provenance["seed"] == seed
+            assert policy.layout.size == 21
+            curve = (place / "curve.csv").read_text().splitlines()
+            assert curve[0].startswith("steps,return,")
+            assert curve[-1].startswith("1920.0,")
+            assert not list(place.glob("checkpoint*"))
+            assert list(place.glob("tensorboard/**/events*"))
+
+
+def test_rows_are_methods_then_agents_with_what_a_benchmark_row_has(run):
+    content = finished_table(run)
+    assert [(r["method"], r["estimator"]) for r in content["rows"]] == [
+        (m, e) for m in ("chirp", "RL(all)", "RL(K_pu)") for e in ("arx-rls", "arx-rls-wide")
+    ]
+    methods, agents = content["rows"][:2], content["rows"][2:]
+    for row in agents:
+        assert row.keys() == methods[0].keys()
+        assert row["seeds"] == 2
+        assert row["evaluations"] == 10
+        assert row["train_seconds"] > 0
+    assert methods[0]["seeds"] is None
+    assert methods[0]["evaluations"] == 5
+
+
+def test_policies_of_different_seeds_and_agents_differ(run):
+    policies = {
+        (a, s): read_policy(seed_folder(run, a, s) / "policy.safetensors").weights[0][0]
+        for a in ("RL(all)", "RL(K_pu)") for s in range(2)
+    }  # fmt: skip
+    keys = list(policies)
+    for i, a in enumerate(keys):
+        for b in keys[:i]:
+            assert not np.array_equal(policies[a], policies[b])
+
+
+def test_differences_are_paired_over_seeds(run):
+    content = finished_table(run)
+    pair = next(
+        d for d in content["differences"]
+        if (d["method"], d["minus"], d["estimator"]) == ("RL(K_pu)", "RL(all)", "arx-rls-wide")
+    )  # fmt: skip
+
+    def means(agent: str, name: str) -> np.ndarray:
+        rows = [
+            json.loads((seed_folder(run, agent, s) / "metrics.json").read_text())["rows"][1]
+            for s in range(2)
+        ]
+        return np.array([r["relative_error_percent"][name]["mean"] for r in rows], float)
+
+    for name, shown in pair["relative_error_percent"].items():
+        gaps = means("RL(K_pu)", name) - means("RL(all)", name)
+        if not np.all(np.isfinite(gaps)):
+            assert shown["mean"] is None
+            continue
+        low, high = scipy.stats.ttest_1samp(gaps, 0).confidence_interval()
+        assert shown["mean"] == pytest.approx(gaps.mean())
+        assert shown["ci95"] == pytest.approx([low, high])
+
+
+def test_the_table_command_prints_what_was_written(run):
+    shown = excite("study", "table", run, "--json")
+    assert shown.returncode == 0, shown.stderr
+    assert json.loads(shown.stdout)["rows"] == finished_table(run)["rows"]
+    assert "viable" in excite("study", "table", run).stdout
+
+
+def test_a_finished_study_is_not_computed_again(run):
+    before = {p: p.stat().st_mtime_ns for p in run.rglob("policy.safetensors")}
+    done = excite("study", "run", run.parent / "tiny.toml", "--out", run)
+    assert done.returncode == 0, done.stderr
+    assert "finished:" not in done.stderr
+    assert {p: p.stat().st_mtime_ns for p in run.rglob("policy.safetensors")} == before
+
+
+def test_the_best_seed_is_chosen_on_validation_episodes(run):
+    study = read_study(run.parent / "tiny.toml")
+    for agent, best in best_seeds(study, run).items():
+        returns = [
+            json.loads((seed_folder(run, agent, s) / "metrics.json").read_text())["validation"]
+            for s in range(2)
+        ]
+        assert returns[best]["return"] == max(r["return"] for r in returns)
+
+
+# Interruption
+
+
+def killed_in_the_middle(study: Path, folder: Path) -> None:
+    """Starts a study and kills it, without warning, when a seed has a checkpoint."""
+    environment = {**os.environ, "EXCITE_CHECKPOINT_SECONDS": "0"}
+    command = [*EXCITE, "study", "run", str(study), "--out", str(folder), "--workers", "1"]
+    process = subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 200
+    while time.monotonic() < deadline:
+        finished = list(folder.glob("seeds/*/*/metrics.json"))
+        if finished and list(folder.glob("seeds/*/*/checkpoint.safetensors")):
+            break
+        assert process.poll() is None
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+
+
+def test_a_study_killed_in_the_middle_goes_on_and_gives_the_same_table(run, tmp_path):
+    study, folder = write_study(tmp_path), tmp_path / "run"
+    killed_in_the_middle(study, folder)
+    finished = {p: p.stat().st_mtime_ns for p in folder.glob("seeds/*/*/metrics.json")}
+    assert finished
+    assert len(finished) < 4
+    with pytest.raises(ValueError, match=r"not finished, . of 4 trainings are missing"):
+        study_table(folder)
+    shown = excite("study", "table", folder)
+    assert shown.returncode == 2
+    assert "'excite study run' goes on with it" in shown.stderr
+    done = excite("study", "run", study, "--out", folder, "--workers", 2)
+    assert done.returncode == 0, done.stderr
+    assert {p: p.stat().st_mtime_ns for p in finished} == finished
+    assert table_of(folder) == table_of(run)
+
+
+def test_a_broken_checkpoint_is_a_sentence_and_loses_nothing(run, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(run, folder)
+    place = seed_folder(folder, "RL(all)", 1)
+    (place / "metrics.json").unlink()
+    (place / "checkpoint.safetensors").write_bytes(b"not a checkpoint")
+    done = excite("study", "run", run.parent / "tiny.toml", "--out", folder)
+    assert done.returncode == 1
+    assert "RL(all) seed 1" in done.stderr
+    assert "checkpoint.safetensors" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert len(list(folder.glob("seeds/*/*/metrics.json"))) == 3
+
+
+def test_a_full_disk_is_a_sentence_and_loses_nothing(run, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(run, folder)
+    shutil.rmtree(seed_folder(folder, "RL(all)", 0))
+
+    # No file can grow beyond 60 kB; everything but a checkpoint is smaller.
+    nearly_full = ["sh", "-c", 'ulimit -f 117; exec "$@"', "sh"]
+    done = subprocess.run(
+        [*nearly_full, *EXCITE, "study", "run", run.parent / "tiny.toml", "--out", folder],
+        env={**os.environ, "EXCITE_CHECKPOINT_SECONDS": "0", "EXCITE_CACHE": str(tmp_path)},
+        capture_output=True, text=True, timeout=300, check=False,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert "checkpoint.safetensors: cannot be written (File too large)" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert len(list(folder.glob("seeds/*/*/metrics.json"))) == 3
+
+
+# Refusals
+
+
+def test_another_study_in_the_folder_is_refused(run, tmp_path):
+    other = write_study(tmp_path, TINY.replace("total_steps = 1920", "total_steps = 2400"))
+    done = excite("study", "run", other, "--out", run)
+    assert done.returncode == 2
+    assert "holds another study: its 'training' differs" in done.stderr
+    benchmark = tmp_path / "benchmark"
+    benchmark.mkdir()
+    (benchmark / "notes.txt").write_text("mine")
+    done = excite("study", "run", run.parent / "tiny.toml", "--out", benchmark)
+    assert done.returncode == 2
+    assert "no run folder" in done.stderr
+    assert (benchmark / "notes.txt").read_text() == "mine"
+
+
+def test_words_of_a_study_may_change(run, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(run, folder)
+    other = write_study(tmp_path, TINY.replace('"tiny"\nplant', '"tiny"\ntitle = "T"\nplant'))
+    done = excite("study", "run", other, "--out", folder)
+    assert done.returncode == 0, done.stderr
+    assert study_of(folder).title == "T"
+
+
+def test_a_folder_in_use_is_refused(run):
+    study = read_study(run.parent / "tiny.toml")
+    with opened(study, run), pytest.raises(ValueError, match="another process"):
+        run_study(study, run, local_engine(1))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--engine", "dask"], ["--address"]),
+        (["--address", "tcp://127.0.0.1:1"], ["--engine dask"]),
+        (["--engine", "dask", "--address", "nowhere"], ["'nowhere'", "tcp://"]),
+        (["--engine", "dask", "--address", "tcp://127.0.0.1:9"], ["no Dask scheduler"]),
+        (["--workers", "0"], ["--workers"]),
+    ],
+)
+def test_an_engine_that_cannot_be_is_one_sentence(arguments, words, tmp_path):
+    done = excite("study", "run", write_study(tmp_path), "--out", tmp_path / "run", *arguments)
+    assert done.returncode == 2
+    assert "Traceback" not in done.stderr
+    assert [w for w in words if w not in done.stderr] == []
+
+
+def test_a_benchmark_of_agents_points_to_the_command_that_trains(tmp_path):
+    done = excite("benchmark", write_study(tmp_path))
+    assert done.returncode == 2
+    assert "excite study run" in done.stderr
+
+
+def test_no_study_is_one_sentence(tmp_path):
+    done = excite("study", "table", tmp_path)
+    assert done.returncode == 2
+    assert "holds no study" in done.stderr
+
+
+# Rows across seeds
+
+
+def metrics(viable: bool, error: float, violations: int) -> dict[str, Any]:
+    row = {
+        "method": "a", "estimator": "e", "evaluations": 10, "failed": 1, "failures": {"x": 1},
+        "violations": violations, "violation_rate": {}, "beyond_6_std_errors": 2,
+        "max_abs_output": {"output": "y", "mean": 2 * error, "sd": 1.0, "unit": "m"},
+        "relative_error_percent": {
+            "p": {"mean": error, "sd": 1.0, "median": error, "rms": 2 * error}
+        },
+        "cramer_rao_percent": {"p": 0.5}, "rms_over_cramer_rao": {"p": 3.0},
+        "coverage95_percent": {"p": 90.0},
+    }  # fmt: skip
+    return {"viable": viable, "rows": [row], "train_seconds": 60.0}
+
+
+def test_means_are_over_viable_seeds_and_counts_over_all():
+    row = across_seeds([metrics(True, 1.0, 0), metrics(False, 50.0, 4), metrics(True, 3.0, 1)], 0)
+    error = row["relative_error_percent"]["p"]
+    assert (error["mean"], error["sd"]) == (2.0, pytest.approx(2**0.5))
+    assert error["all_seeds"]["mean"] == 18.0
+    assert error["rms"] == pytest.approx((((2.0) ** 2 + 6.0**2) / 2) ** 0.5)
+    assert row["max_abs_output"]["mean"] == 4.0
+    assert (row["viable_seeds"], row["seeds"]) == (2, 3)
+    assert (row["violations"], row["evaluations"]) == (5, 30)
+    assert (row["failed"], row["failures"]) == (3, {"x": 3})
+    assert row["train_seconds"] == 180.0
+
+
+def test_no_viable_seed_leaves_counts_and_no_means():
+    row = across_seeds([metrics(False, 1.0, 2)], 0)
+    assert np.isnan(row["relative_error_percent"]["p"]["mean"])
+    assert row["violations"] == 2
+    assert row["viable_seeds"] == 0
