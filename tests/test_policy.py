@@ -289,7 +289,7 @@ def spoilt_tensors() -> dict[str, dict[str, np.ndarray]]:
     first = POLICY.weights[0][0]
     not_finite = {}
     for value in (np.nan, np.inf, -np.inf):
-        for name, array in tensors_of().items():
+        for name, array in sorted(tensors_of().items()):
             spoilt = array.copy()
             spoilt.flat[-1] = value
             not_finite[f"{name} {value}"] = tensors_of() | {name: spoilt}
