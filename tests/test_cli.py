@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import click
 import jax
 import numpy as np
 import pytest
@@ -243,10 +244,19 @@ def test_help_opens_without_what_computes():
 
 
 def test_commands_are_those_that_are_promised():
-    assert set(COMMANDS) >= {"plants", "simulate", "identify", "information", "benchmark", "doctor"}
+    assert set(COMMANDS) >= {
+        "plants",
+        "simulate",
+        "identify",
+        "information",
+        "benchmark",
+        "study",
+        "doctor",
+    }
     for command in cli.commands.values():
-        options = {opt for p in command.params for opt in p.opts}
-        assert "--json" in options
+        group = command.commands if isinstance(command, click.Group) else {"": command}
+        for single in group.values():
+            assert "--json" in {opt for p in single.params for opt in p.opts}
         assert command.help
 
 

@@ -84,6 +84,8 @@ class DecisionSettings(_Settings):
         weight: factor of that reward.
         goals: by parameter, the relative error that counts as one, default one.
         estimator: ARX estimator in the reward, by the study's name or any.
+        start_covariance: instead of that estimator's; a smaller one lets its bias, which is
+            a smooth function of the inputs, outweigh the sensor's noise.
         normalise_penalty: whether the safety penalty is divided by the number of steps.
     """
 
@@ -93,6 +95,7 @@ class DecisionSettings(_Settings):
     weight: Positive = 1.0
     goals: dict[str, Positive] = {}
     estimator: str = "arx-rls"
+    start_covariance: Positive | None = None
     normalise_penalty: Annotated[bool, Field(strict=True)] = False
 
 
@@ -236,6 +239,8 @@ class Study(_Settings):
             )
         target_mask(plant.definition, list(decision.goals) or None)  # checks the names
         goals = [decision.goals.get(p.name, 1.0) for p in plant.definition.parameters]
+        if decision.start_covariance is not None:
+            estimator = dataclasses.replace(estimator, start_covariance=decision.start_covariance)
         is_log = decision.reward == "log"
         return EstimationError(estimator, targets, goals, is_log, decision.weight)
 

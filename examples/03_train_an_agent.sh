@@ -1,0 +1,7 @@
+# Train an agent, look at its table, play its policy on a simulated plant, identify from the record.
+# Needs the extra: pip install --constraint constraints.txt '.[ppo]'
+here=$(dirname "$0")
+excite study run "$here/first_agent.toml" --out first_agent
+excite study table first_agent
+excite simulate aero2 --excitation first_agent/seeds/RL_all/0/policy.safetensors --out learned.csv
+excite identify learned.csv --plant aero2
