@@ -1,6 +1,5 @@
 """Work arrives whole, whatever happens to workers, and leaves nobody behind."""
 
-import json
 import multiprocessing
 import os
 import signal
@@ -8,11 +7,12 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from cluster import Cluster, wait_for
 
 from excite import __version__, engine
 
@@ -42,15 +42,6 @@ def work(
 
     failures = engine.run(target, tasks, where, on_done=on_done, **options)
     return results, failures
-
-
-def wait_for(condition: Callable[[], Any], seconds: float = 10.0) -> bool:
-    deadline = time.monotonic() + seconds
-    while time.monotonic() < deadline:
-        if condition():
-            return True
-        time.sleep(0.02)
-    return bool(condition())
 
 
 def is_alive(pid: int) -> bool:
@@ -218,41 +209,6 @@ def test_a_killed_driver_leaves_no_worker(tmp_path):
 
 
 # -------------------------------------------------------------------- a Dask cluster
-
-
-class Cluster:
-    """A scheduler and its workers on this computer, each to be killed."""
-
-    def __init__(self, folder: Path, num_workers: int = 3) -> None:
-        self.processes: list[subprocess.Popen] = []
-        file = folder / "scheduler.json"
-        here = ("--no-dashboard", "--host", "127.0.0.1", "--scheduler-file", str(file))
-        self.start("scheduler", *here, "--port", "0")
-        options = ("--no-nanny", "--nthreads", "1", "--local-directory", str(folder))
-        for _ in range(num_workers):
-            self.start("worker", *here, *options)
-
-        def address() -> str:
-            return json.loads(file.read_text())["address"] if file.exists() else ""
-
-        if not wait_for(address, 30):
-            self.close()
-            pytest.fail("the scheduler does not start")
-        self.address = address()
-
-    def start(self, name: str, *options: str) -> None:
-        """Dask's own command; it tells a lot that nobody asks for."""
-        command = [sys.executable, "-m", f"distributed.cli.dask_{name}", *options]
-        silent = subprocess.DEVNULL
-        self.processes.append(subprocess.Popen(command, stdout=silent, stderr=silent))
-
-    def kill(self, which: int) -> None:
-        self.processes[which].kill()
-        self.processes[which].wait()
-
-    def close(self) -> None:
-        for which in range(len(self.processes)):
-            self.kill(which)
 
 
 @pytest.fixture

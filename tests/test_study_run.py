@@ -1,6 +1,7 @@
 """A tiny study, trained from end to end: interrupted, repeated, refused, shown."""
 
 import json
+import math
 import os
 import shutil
 import signal
@@ -13,9 +14,10 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy.stats
+from cluster import Cluster, wait_for
 
 from excite.benchmark.base import seed_folder, study_of
-from excite.benchmark.run import opened, run_study
+from excite.benchmark.run import _live, opened, run_study
 from excite.benchmark.table import across_seeds, best_seeds, finished_table, study_table
 from excite.engine import local_engine
 from excite.policy import read_policy
@@ -186,15 +188,22 @@ def test_the_best_seed_is_chosen_on_validation_episodes(run):
 # Interruption
 
 
+def steps_of(progress: Path) -> float:
+    try:
+        return json.loads(progress.read_text())["steps"]
+    except (OSError, ValueError):
+        return 0.0
+
+
 def killed_in_the_middle(study: Path, folder: Path) -> None:
-    """Starts a study and kills it, without warning, when a seed has a checkpoint."""
+    """Starts a study and kills it, without warning, when a seed is half trained."""
     environment = {**os.environ, "EXCITE_CHECKPOINT_SECONDS": "0"}
     command = [*EXCITE, "study", "run", str(study), "--out", str(folder), "--workers", "1"]
     process = subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 200
     while time.monotonic() < deadline:
         finished = list(folder.glob("seeds/*/*/metrics.json"))
-        if finished and list(folder.glob("seeds/*/*/checkpoint.safetensors")):
+        if finished and any(steps_of(p) >= 960 for p in folder.glob("seeds/*/*/progress.json")):
             break
         assert process.poll() is None
         time.sleep(0.01)
@@ -217,6 +226,72 @@ def test_a_study_killed_in_the_middle_goes_on_and_gives_the_same_table(run, tmp_
     assert done.returncode == 0, done.stderr
     assert {p: p.stat().st_mtime_ns for p in finished} == finished
     assert table_of(folder) == table_of(run)
+    metrics = [json.loads(p.read_text()) for p in folder.glob("seeds/*/*/metrics.json")]
+    assert any((m["resumed_at_steps"] or 0) >= 960 for m in metrics)
+
+
+def test_an_agent_that_comes_back_with_other_settings_is_refused(run, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(run, folder)
+    start, end = TINY.index('[agents."RL(K_pu)"]'), TINY.index("[methods.chirp]")
+    without = TINY[:start] + TINY[end:]
+    assert excite("study", "run", write_study(tmp_path, without), "--out", folder).returncode == 0
+    other = TINY.replace("learning_rate = 1e-3", "learning_rate = 2e-3")
+    done = excite("study", "run", write_study(tmp_path, other), "--out", folder)
+    assert done.returncode == 2
+    assert "other settings of 'RL(K_pu)'" in done.stderr
+    done = excite("study", "run", write_study(tmp_path), "--out", folder)
+    assert done.returncode == 0
+    assert table_of(folder) == table_of(run)
+
+
+@pytest.mark.parametrize("name", ["methods.json", "table.json", "run.json", "study.json"])
+@pytest.mark.parametrize("content", ["{}", "[]", '{"agents": null}', "\x00"])
+def test_a_damaged_file_is_one_sentence(run, tmp_path, name, content):
+    folder = tmp_path / "run"
+    shutil.copytree(run, folder)
+    (folder / name).write_text(content)
+    with pytest.raises(ValueError, match=r"damaged|cannot be read|another study|malformed|study"):
+        read_all(read_study(run.parent / "tiny.toml"), folder)
+
+
+def read_all(study: Any, folder: Path) -> None:
+    """Whatever is read of a run folder."""
+    with opened(study, folder):
+        study_table(folder)
+        finished_table(folder)
+
+
+def test_progress_may_be_anything(run, tmp_path):
+    study, folder = read_study(run.parent / "tiny.toml"), tmp_path / "run"
+    place = seed_folder(folder, "RL(all)", 0)
+    place.mkdir(parents=True)
+    for content in ("", "{}", "[]", "null", '{"steps": 1, "return": null}', "\udcff"):
+        (place / "progress.json").write_bytes(content.encode("utf-8", "surrogateescape"))
+        assert _live(study, ("seed", "RL(all)", 0), folder) == (0.0, "")
+
+
+def test_a_cluster_that_loses_a_worker_gives_the_same_table(run, tmp_path):
+    pytest.importorskip("distributed")
+    (tmp_path / "cluster").mkdir()
+    cluster, folder = Cluster(tmp_path / "cluster"), tmp_path / "run"
+    try:
+        command = [
+            *EXCITE, "study", "run", str(write_study(tmp_path)), "--out", str(folder),
+            "--engine", "dask", "--address", cluster.address,
+        ]  # fmt: skip
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+        assert wait_for(lambda: list(folder.glob("seeds/*/*/progress.json")), 120)
+        cluster.kill(1)
+        _, errors = process.communicate(timeout=300)
+    finally:
+        cluster.close()
+    assert process.returncode == 0, errors
+    assert table_of(folder) == table_of(run)
+    policies = sorted(p.relative_to(run) for p in run.rglob("policy.safetensors"))
+    assert len(policies) == 4
+    for path in policies:
+        assert (folder / path).read_bytes() == (run / path).read_bytes()
 
 
 def test_a_broken_checkpoint_is_a_sentence_and_loses_nothing(run, tmp_path):
@@ -258,7 +333,11 @@ def test_another_study_in_the_folder_is_refused(run, tmp_path):
     other = write_study(tmp_path, TINY.replace("total_steps = 1920", "total_steps = 2400"))
     done = excite("study", "run", other, "--out", run)
     assert done.returncode == 2
-    assert "holds another study: its 'training' differs" in done.stderr
+    assert "holds another study" in done.stderr
+    assert "other settings of 'RL(all)'" in done.stderr
+    other = write_study(tmp_path, TINY.replace("episodes = 5", "episodes = 6"))
+    done = excite("study", "run", other, "--out", run)
+    assert "holds another study: its 'episodes' differs" in done.stderr
     benchmark = tmp_path / "benchmark"
     benchmark.mkdir()
     (benchmark / "notes.txt").write_text("mine")
@@ -340,6 +419,12 @@ def test_means_are_over_viable_seeds_and_counts_over_all():
     assert (row["violations"], row["evaluations"]) == (5, 30)
     assert (row["failed"], row["failures"]) == (3, {"x": 3})
     assert row["train_seconds"] == 180.0
+
+
+def test_a_seed_without_estimates_does_not_hide_the_others():
+    row = across_seeds([metrics(True, 1.0, 0), metrics(True, math.nan, 0)], 0)
+    assert row["relative_error_percent"]["p"]["mean"] == 1.0
+    assert row["viable_seeds"] == 2
 
 
 def test_no_viable_seed_leaves_counts_and_no_means():

@@ -57,9 +57,11 @@ def call(target: str, version: str, arguments: Mapping[str, Any]) -> Any:
     # import JAX before this line, and JAX reads its environment once.
     os.environ.update(_environment())
     module, _, name = target.partition(":")
-    function = getattr(importlib.import_module(module), name)
     try:
-        return function(**arguments)
+        return getattr(importlib.import_module(module), name)(**arguments)
+    except ModuleNotFoundError as error:
+        lack = f"the worker has no module {error.name!r}; training needs the extra 'ppo'"
+        told = ValueError(lack)
     except Exception as error:
         kind = ValueError if isinstance(error, ValueError) else RuntimeError
         told = error if _can_travel(error) else kind(_sentence(error))
@@ -178,6 +180,12 @@ class _Cluster(Executor):
             stack.enter_context(distributed.utils.silence_logging_cmgr("CRITICAL"))
             warnings.simplefilter("ignore", distributed.versions.VersionMismatchWarning)
             self._client = _connected(address)
+            if max(self._client.nthreads().values(), default=1) > 1:
+                self._client.close()
+                raise ValueError(
+                    f"workers at {address} have several threads, which trainings would share; "
+                    "start them with --nthreads 1"
+                )
             self._quiet = stack.pop_all()
         self._executor = self._client.get_executor(pure=False, retries=0)
 

@@ -129,9 +129,11 @@ class Env(eqx.Module):
     def step(self, state: EnvState, action: Float[Array, " input"]) -> tuple[EnvState, Transition]:
         """One sampling time with this action held, in [-1, 1] of the input limits."""
         plant, k = self.plant, state.k + 1
-        input = scaled_action(jnp, self.layout, jnp.clip(action, -1, 1).astype(float))
+        action = jnp.where(jnp.isfinite(action), jnp.clip(action, -1, 1), 0.0)
+        input = scaled_action(jnp, self.layout, action.astype(float))
         after = step(plant, state.plant_state, input, state.params)
         is_finite = jnp.all(jnp.isfinite(after)) & self._is_visible(after, state.params)
+        is_finite = is_finite & state.is_finite
         after = jnp.where(is_finite, after, state.plant_state)
         output = plant.output(after, state.params)
         measured = measure(plant, output, jax.random.fold_in(state.key, k))
@@ -145,7 +147,7 @@ class Env(eqx.Module):
             memory=memory,
             k=k,
             max_abs_output=jnp.maximum(state.max_abs_output, jnp.abs(output)),
-            is_finite=state.is_finite & is_finite,
+            is_finite=is_finite,
             key=state.key,
         )
         return new, self._transition(new, output, gain)
@@ -163,7 +165,7 @@ class Env(eqx.Module):
         cost = penalty(output[np.array(watched, int)], warning, critical)
         terminated = state.k >= self.layout.num_steps
         final = self.objective.final(plant, state.memory, state.params)
-        # A run that cannot be computed costs a breach a step, and tells nothing more.
+        # A run that cannot be computed costs a breach a step, and no step gains anything.
         cost = jnp.where(state.is_finite, cost, -1.0)
         worth = jnp.where(state.is_finite, gain, 0.0) + jnp.where(terminated, final, 0.0)
         is_over = jnp.any(state.max_abs_output >= critical_levels(plant.definition))

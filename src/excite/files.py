@@ -12,6 +12,7 @@ import io
 import json
 import math
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
@@ -49,6 +50,11 @@ def json_text(value: Any) -> str:
     return json.dumps(json_ready(value), indent=2, ensure_ascii=False, allow_nan=False)
 
 
+def folder_word(name: str) -> str:
+    """A name as the word of a folder: letters, digits and underscores."""
+    return re.sub(r"\W+", "_", name).strip("_")
+
+
 def write_json(path: Path, value: Any) -> None:
     """Writes `value` as JSON, whole or not at all."""
     write_bytes(path, (json_text(value) + "\n").encode())
@@ -69,6 +75,8 @@ def write_bytes(path: Path, content: bytes) -> None:
     try:
         with os.fdopen(handle, "wb") as file:
             file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
         os.chmod(name, 0o644)  # mkstemp makes files that nobody else may read
         os.replace(name, path)
     except OSError as error:

@@ -192,6 +192,8 @@ class Policy:
             }
             layout = Layout(**numbers)
             plant = PlantDescription.from_dict(contract["plant"])
+            if contract["plant_hash"] != plant.hash:
+                raise ValueError("the plant in the contract is not the one that was written")
             num_layers = (len(tensors) + 1) // 2
             weights = tuple(
                 (tensors[f"{i}.weight"], tensors[f"{i}.bias"]) for i in range(num_layers)

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
+import numpy as np
 import pydantic
 import tomlkit
 import tomlkit.exceptions
@@ -18,6 +19,7 @@ from .description import names_of
 from .env import Env
 from .estimation import ARX, AbstractEstimator
 from .excitation import AbstractExcitation
+from .files import folder_word
 from .names import ESTIMATORS, estimator_named, excitation_named, plant_named, unknown, with_sensor
 from .objective import (
     AbstractObjective,
@@ -204,8 +206,7 @@ class Study(_Settings):
             ValueError: for a setting or target that does not exist, or a reward from an
                 ARX estimator where the plant has no mapping from it.
         """
-        own = self.agents[agent]
-        decision = _settings(DecisionSettings, {**self.decision, **own.decision}, "decision")
+        own, decision = self.agents[agent], self.build_decision(agent)
         outputs = plant.definition.outputs
         for name in decision.output_scale:
             if name not in names_of(outputs):
@@ -244,17 +245,53 @@ class Study(_Settings):
         is_log = decision.reward == "log"
         return EstimationError(estimator, targets, goals, is_log, decision.weight)
 
+    def build_decision(self, agent: str) -> DecisionSettings:
+        """How an agent's experiments are rewarded; ValueError for what is not allowed."""
+        own = {**self.decision, **self.agents[agent].decision}
+        decision = _settings(DecisionSettings, own, "decision")
+        unused = {"estimator", "goals", "start_covariance"} & self.agents[agent].decision.keys()
+        if decision.reward == "information" and unused:
+            raise ValueError(f"decision: the reward 'information' has no {sorted(unused)[0]!r}")
+        return decision
+
     def build_training(self, agent: str) -> PPOSettings:
         """Hyper-parameters of an agent; ValueError for one that is not allowed."""
         return _settings(PPOSettings, {**self.training, **self.agents[agent].training}, "training")
 
+    def agent_settings(self, plant: AbstractPlant, agent: str) -> dict[str, Any]:
+        """All that decides what an agent becomes, defaults included, JSON-ready."""
+        names = names_of(plant.definition.parameters)
+        mask = target_mask(plant.definition, self.agents[agent].targets)
+        return {
+            "method": self.agents[agent].method,
+            "targets": [name for name, chosen in zip(names, mask, strict=True) if chosen],
+            "decision": self.build_decision(agent).model_dump(),
+            "training": dataclasses.asdict(self.build_training(agent)),
+            "spread": self.spread,
+            "num_steps": self.num_steps,
+        }
+
     def check_agents(self, plant: AbstractPlant) -> None:
-        """Raises ValueError where an agent cannot be built, or is named like a method."""
+        """Raises ValueError where an agent cannot be built, or its name is taken."""
+        _settings(DecisionSettings, self.decision, "decision")
+        _settings(PPOSettings, self.training, "training")
+        words: dict[str, str] = {}
         for name in self.agents:
             if name in self.methods:
                 raise ValueError(f"{name!r} is both a method and an agent")
-            self.build_env(plant, name)
-            self.build_training(name)
+            other = words.setdefault(folder_word(name), name)
+            if other != name or not folder_word(name):
+                raise ValueError(
+                    f"the agent {name!r} needs a name of its own in letters and digits"
+                    + (f"; {other!r} has the same" if other != name else "")
+                )
+            try:
+                self.build_env(plant, name)
+                self.build_training(name)
+            except ValueError as error:
+                raise ValueError(f"agents.{name}: {error}") from None
+        if self.agents and not np.all(np.asarray(plant.sensor.sd) > 0):
+            raise ValueError("a sensor without noise has no Cramér-Rao bound; give it a noise_sd")
 
     def check_reference(self, plant: AbstractPlant) -> None:
         """Raises ValueError for published rows of an unknown method or parameter."""
@@ -328,14 +365,14 @@ def study_from(content: Mapping[str, Any], where: str) -> Study:
 
 def _settings(kind: type[_T], values: Mapping[str, Any], where: str) -> _T:
     """Checked settings of one kind from a table of the study."""
-    adapter = pydantic.TypeAdapter(kind)
     fields = [f.name for f in dataclasses.fields(kind)] if dataclasses.is_dataclass(kind) else []
     fields = fields or list(getattr(kind, "model_fields", {}))
     for name in values:
         if name not in fields:
             raise unknown(f"{where} setting", name, fields)
     try:
-        return adapter.validate_python(values)
+        # As JSON, because a strict check of Python's own types would want tuples for lists.
+        return pydantic.TypeAdapter(kind).validate_json(json.dumps(dict(values)), strict=True)
     except pydantic.ValidationError as error:
         raise ValueError(f"{where}: {_sentence(error)}") from None
 
@@ -345,13 +382,13 @@ def _sentence(error: pydantic.ValidationError) -> str:
     first = min(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
     location = ".".join(str(part) for part in first["loc"])
     if first["type"] == "extra_forbidden":
-        model = {"sensor": SensorSettings, "reference": ReferenceRow}.get(
-            str(first["loc"][0]) if len(first["loc"]) > 1 else "", Study
-        )
-        return str(unknown("key", location.rpartition(".")[2], model.model_fields))
+        tables = {"sensor": SensorSettings, "reference": ReferenceRow, "agents": AgentSettings}
+        model = tables.get(str(first["loc"][0]) if len(first["loc"]) > 1 else "", Study)
+        where, _, key = location.rpartition(".")
+        return f"{where}: " * bool(where) + str(unknown("key", key, model.model_fields))
     if first["type"] == "missing":
         return f"the key {location!r} is missing"
     got = json.dumps(first["input"], default=str)
     if isinstance(first["input"], float) and not math.isfinite(first["input"]):
         got = str(first["input"])
-    return f"{location}: {first['msg']}, got {got}"
+    return f"{location}: {first['msg']}, got {got}" if location else f"{first['msg']}, got {got}"

@@ -8,11 +8,13 @@ the estimator's.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import hashlib
 import json
 import math
-import re
-from collections.abc import Callable, Mapping
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,7 +28,7 @@ from jaxtyping import Array, Float, Key, PRNGKeyArray
 from ..description import PlantDescription, display_unit, names_of
 from ..estimation import AbstractEstimator, Status, stack_experiments
 from ..excitation import AbstractExcitation
-from ..files import new_run_folder, write_json
+from ..files import folder_word, new_run_folder, write_json
 from ..information import cramer_rao_bound, experiment_information, relative_size
 from ..plant import AbstractPlant, Params, draw_params
 from ..safety import critical_levels, is_violation, max_abs_output, watched_output
@@ -136,7 +138,9 @@ def evaluate_method(
     excitation: AbstractExcitation,
     progress: Callable[[int], None] = lambda _: None,
 ) -> tuple[list[dict[str, Any]], Float[np.ndarray, " input"]]:
-    """One row an estimator for one method, and the root mean square of each input.
+    """One row an estimator for one method, and each input's root mean square.
+
+    The latter counts from the middle of the input's limits.
 
     Raises:
         ValueError: for a sensor without noise, which has no Cramér-Rao bound.
@@ -144,6 +148,7 @@ def evaluate_method(
     if not np.all(np.asarray(plant.sensor.sd) > 0):
         raise ValueError("a sensor without noise has no Cramér-Rao bound; give it a noise_sd")
     estimators = study.build_estimators(plant)
+    middle = np.mean(plant.input_limits, axis=0)
     keys = jax.random.split(jax.random.key(study.seed), study.episodes)
     outcomes: dict[str, list[_Outcome]] = {e: [] for e in estimators}
     squares = []
@@ -151,7 +156,8 @@ def evaluate_method(
         progress(c)
         chunk = keys[first : first + CHUNK]
         episodes = evaluate(plant, excitation, study.num_steps, study.spread, chunk)
-        squares.append(np.mean(np.asarray(episodes.trajectory.inputs) ** 2, axis=1))
+        inputs = np.asarray(episodes.trajectory.inputs) - middle
+        squares.append(np.mean(inputs**2, axis=1))
         for e, estimator in estimators.items():
             outcomes[e].append(_outcome(plant, estimator, episodes))
     rows = [_row(plant.description, name, e, _joined(parts)) for e, parts in outcomes.items()]
@@ -275,7 +281,50 @@ def write_benchmark(
 
 def seed_folder(folder: Path, agent: str, seed: int) -> Path:
     """Where a seed of an agent keeps its files."""
-    return folder / "seeds" / re.sub(r"\W+", "_", agent).strip("_") / str(seed)
+    return folder / "seeds" / folder_word(agent) / str(seed)
+
+
+def fingerprint(study: Study, plant: AbstractPlant, agent: str) -> str:
+    """SHA-256 of all that decides what a seed of an agent becomes."""
+    settings = {**study.agent_settings(plant, agent), "plant": plant.description.hash}
+    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
+
+
+@contextlib.contextmanager
+def unpacked(
+    settings: Mapping[str, Any], source: Mapping[str, Any]
+) -> Iterator[tuple[Study, AbstractPlant]]:
+    """The study of a task and its plant; a user's plant file lies here while it is needed.
+
+    Args:
+        settings: of the study.
+        source: `text`, the source of a user's own plant or None, and the plant's `hash`.
+    """
+    settings = dict(settings)
+    with tempfile.TemporaryDirectory() as folder:
+        if source["text"] is not None:
+            path, _, class_name = str(settings["plant"]).rpartition(":")
+            file = Path(folder) / Path(path).name
+            file.write_text(source["text"], encoding="utf-8")
+            settings["plant"] = f"{file}:{class_name}"
+        study = study_from(settings, "study")
+        plant = study.build_plant()
+        if plant.description.hash != source["hash"]:
+            raise ValueError(
+                f"the plant {plant.definition.name!r} of this worker is another one "
+                f"(hash {plant.description.hash[:8]}) than that of the study "
+                f"({source['hash'][:8]})"
+            )
+        yield study, plant
+
+
+def methods_task(study: Mapping[str, Any], plant: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Rows of a study's own methods; what a worker is called for."""
+    with unpacked(study, plant) as (chosen, built):
+        rows = []
+        for name, excitation in chosen.build_methods(built).items():
+            rows += evaluate_method(chosen, built, name, excitation)[0]
+        return rows
 
 
 def study_of(folder: Path) -> Study:
@@ -295,9 +344,16 @@ def numbers_of(value: Any) -> Any:
     return math.nan if value is None else value
 
 
-def read_json(path: Path) -> Any:
-    """Content of a file of a run folder; ValueError where it cannot be read."""
+def read_json(path: Path, *keys: str) -> dict[str, Any]:
+    """Content of a file of a run folder, an object with these keys.
+
+    Raises:
+        ValueError: where it cannot be read, or holds something else.
+    """
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
         raise ValueError(f"{path}: cannot be read ({error})") from None
+    if not isinstance(content, dict) or not set(keys) <= content.keys():
+        raise ValueError(f"{path} is damaged; delete it and run the study again")
+    return content

@@ -10,22 +10,27 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import hashlib
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from .. import __version__
 from ..engine import Engine, run
 from ..files import csv_text, json_ready, write_bytes, write_json
+from ..plant import AbstractPlant
 from ..study import Study
-from .base import Progress, read_json, seed_folder
+from .base import Progress, fingerprint, read_json, seed_folder
 
 KIND = "excite study"
 WORDS = ("name", "title", "inferred", "ours", "reference", "source")
 """Settings of a study that change how its table reads, not what is computed."""
 
+_Target = tuple[str, str, int]
+
 _TASKS = {
-    "methods": "excite.benchmark.seeds:methods_task",
+    "methods": "excite.benchmark.base:methods_task",
     "seed": "excite.benchmark.seeds:seed_task",
 }
 
@@ -37,12 +42,12 @@ def opened(study: Study, folder: Path) -> Iterator[None]:
     Raises:
         ValueError: where the folder holds something else, or another study, or is in use.
     """
-    plant = study.build_plant().description
+    own = {"study.json", "run.json", ".lock"}
     marker = folder / "run.json"
-    if folder.exists() and not marker.is_file() and (folder.is_file() or any(folder.iterdir())):
+    if folder.is_file() or (
+        folder.exists() and not marker.is_file() and {p.name for p in folder.iterdir()} - own
+    ):
         raise ValueError(f"{folder} exists and is no run folder; choose another name")
-    if marker.is_file():
-        _require_same_study(study, plant.hash, folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         lock = (folder / ".lock").open("w")
@@ -53,27 +58,64 @@ def opened(study: Study, folder: Path) -> Iterator[None]:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             raise ValueError(f"{folder}: another process is working on this study") from None
+        plant, text = study.build_plant().description, _plant_text(study)
+        mark = None if text is None else hashlib.sha256(text.encode()).hexdigest()
+        if marker.is_file():
+            _require_same_study(study, plant.hash, mark, folder)
         write_json(folder / "study.json", study.model_dump())
-        write_json(marker, {"kind": KIND, "plant": plant.to_dict(), "plant_hash": plant.hash})
+        write_json(
+            marker,
+            {
+                "kind": KIND,
+                "excite": __version__,
+                "plant": plant.to_dict(),
+                "plant_hash": plant.hash,
+                "plant_file": mark,
+            },
+        )
         yield
 
 
-def _require_same_study(study: Study, plant_hash: str, folder: Path) -> None:
-    saved, marker = read_json(folder / "study.json"), read_json(folder / "run.json")
-    if marker.get("kind") != KIND:
+def _plant_text(study: Study) -> str | None:
+    """Source of a user's own plant."""
+    if ":" not in study.plant:
+        return None
+    return Path(study.plant.rpartition(":")[0]).read_text(encoding="utf-8")
+
+
+def _require_same_study(
+    study: Study, plant_hash: str, plant_file: str | None, folder: Path
+) -> None:
+    saved = read_json(folder / "study.json")
+    marker = read_json(folder / "run.json", "kind")
+    if marker["kind"] != KIND:
         raise ValueError(f"{folder} holds a run of another kind; choose another name")
     own = json_ready(study.model_dump())
-    for agent in own["agents"].keys() ^ saved.get("agents", {}).keys():
-        # An agent may be added, and trained beside those that are finished, or left out.
-        own["agents"].pop(agent, None)
-        saved["agents"].pop(agent, None)
+    # Agents may be added to a study, or left out; every seed says itself what it was.
     for key, value in own.items():
-        if key not in WORDS and saved.get(key) != value and not (key == "plant" and ":" in value):
+        is_free = key in (*WORDS, "agents", "decision", "training", "seeds")
+        if not is_free and saved.get(key) != value and not (key == "plant" and ":" in value):
             raise ValueError(
                 f"{folder} holds another study: its {key!r} differs; choose another name"
             )
-    if marker.get("plant_hash") != plant_hash:
+    if (marker.get("plant_hash"), marker.get("plant_file")) != (plant_hash, plant_file):
         raise ValueError(f"{folder} holds a study of another plant; choose another name")
+
+
+def _is_finished(study: Study, plant: AbstractPlant, target: _Target, folder: Path) -> bool:
+    """Whether a task's results are there; ValueError where they are of another training."""
+    kind, agent, seed = target
+    if kind == "methods":
+        return (folder / "methods.json").is_file()
+    path = seed_folder(folder, agent, seed) / "metrics.json"
+    if not path.is_file():
+        return False
+    if read_json(path, "rows", "fingerprint")["fingerprint"] != fingerprint(study, plant, agent):
+        raise ValueError(
+            f"{folder} holds another study: {path} is of other settings of {agent!r}; "
+            "choose another name"
+        )
+    return True
 
 
 def run_study(
@@ -94,6 +136,8 @@ def run_study(
     """
     with opened(study, folder):
         tasks, targets = _missing(study, folder), _names(study)
+        if tasks:  # a table of before is not that of this study
+            (folder / "table.json").unlink(missing_ok=True)
         before = len(targets) - len(tasks)
 
         def finished(name: str, result: Any) -> None:
@@ -113,9 +157,6 @@ def run_study(
         return failures
 
 
-_Target = tuple[str, str, int]
-
-
 def _names(study: Study) -> dict[str, _Target]:
     """Kind, agent and seed of every task by name."""
     names: dict[str, _Target] = {"methods": ("methods", "", 0)} if study.methods else {}
@@ -126,20 +167,19 @@ def _names(study: Study) -> dict[str, _Target]:
 
 def _missing(study: Study, folder: Path) -> dict[str, dict[str, Any]]:
     """Arguments of the tasks that are not finished; makes the seeds' folders."""
-    text = None
-    if ":" in study.plant:
-        text = Path(study.plant.rpartition(":")[0]).read_text(encoding="utf-8")
-    plant = {"text": text, "hash": study.build_plant().description.hash}
-    shared = {"study": json_ready(study.model_dump()), "plant": plant}
+    plant = study.build_plant()
+    source = {"text": _plant_text(study), "hash": plant.description.hash}
+    shared = {"study": json_ready(study.model_dump()), "plant": source}
     tasks = {}
     for name, (kind, agent, seed) in _names(study).items():
-        if kind == "methods" and not (folder / "methods.json").is_file():
-            tasks[name] = shared
-        place = seed_folder(folder, agent, seed)
-        if kind == "seed" and not (place / "metrics.json").is_file():
+        if _is_finished(study, plant, (kind, agent, seed), folder):
+            continue
+        own = {}
+        if kind == "seed":
+            place = seed_folder(folder, agent, seed)
             place.mkdir(parents=True, exist_ok=True)
             own = {"agent": agent, "seed": seed, "folder": str(place.absolute())}
-            tasks[name] = {**shared, **own}
+        tasks[name] = {**shared, **own}
     return tasks
 
 
@@ -166,17 +206,20 @@ def _live(study: Study, target: _Target, folder: Path) -> tuple[float, str]:
     place = seed_folder(folder, agent, seed)
     if (place / "metrics.json").is_file():
         return 1.0, ""
-    try:
+    try:  # it is there to be looked at, and may be anything
         row = json.loads((place / "progress.json").read_text(encoding="utf-8"))
-    except (OSError, json.JSONDecodeError):
+        return row["steps"] / study.build_training(agent).total_steps, _looks(agent, seed, row)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return 0.0, ""
+
+
+def _looks(agent: str, seed: int, row: dict[str, float]) -> str:
     errors = ", ".join(
         f"{name.removeprefix('relative_error_')} {100 * value:.3g} %"
         for name, value in row.items()
         if name.startswith("relative_error_")
     )
-    text = (
+    return (
         f"{agent} seed {seed}: return {row['return']:.3g}, {errors}, "
         f"violations {100 * row['violation_rate']:.0f} %"
     )
-    return row["steps"] / study.build_training(agent).total_steps, text

@@ -32,31 +32,40 @@ def study_table(folder: Path) -> dict[str, Any]:
     study = study_of(folder)
     seeds = {
         agent: [
-            numbers_of(read_json(path))
+            numbers_of(read_json(path, "rows", "viable"))
             for seed in range(study.seeds)
             if (path := seed_folder(folder, agent, seed) / "metrics.json").is_file()
         ]
         for agent in study.agents
     }
-    missing = sum(study.seeds - len(found) for found in seeds.values())
-    if missing or (study.methods and not (folder / "methods.json").is_file()):
-        raise ValueError(
-            f"{folder}: the study is not finished, {missing} of "
-            f"{study.seeds * len(study.agents)} trainings are missing; "
-            "'excite study run' goes on with it"
-        )
-    rows = numbers_of(read_json(folder / "methods.json")["rows"]) if study.methods else []
+    _require_finished(study, folder, seeds)
+    rows = numbers_of(read_json(folder / "methods.json", "rows")["rows"]) if study.methods else []
     rows = [{**r, "viable_seeds": None, "seeds": None, "train_seconds": None} for r in rows]
     for metrics in seeds.values():
         rows += [across_seeds(metrics, e) for e in range(len(study.estimators))]
     return {"rows": rows, "differences": _differences(study, rows, seeds)}
 
 
+def _require_finished(
+    study: Study, folder: Path, seeds: Mapping[str, list[dict[str, Any]]]
+) -> None:
+    missing = sum(study.seeds - len(found) for found in seeds.values())
+    what = f"{missing} of {study.seeds * len(study.agents)} trainings are missing"
+    if not missing and study.methods and not (folder / "methods.json").is_file():
+        what = "its methods are not evaluated yet"
+    elif not missing:
+        return
+    raise ValueError(
+        f"{folder}: the study is not finished, {what}; 'excite study run' goes on with it"
+    )
+
+
 def across_seeds(metrics: list[dict[str, Any]], estimator: int) -> dict[str, Any]:
     """One row of an agent: means over its viable seeds, counts over all of them.
 
     The seed is the unit of replication: standard deviations are those between the seeds'
-    own means. Where no seed is viable, the means do not exist.
+    own means. A seed none of whose estimates succeeded has no mean, and is left out of it;
+    where no seed is viable, there are no means.
     """
     rows = [m["rows"][estimator] for m in metrics]
     viable = [row for m, row in zip(metrics, rows, strict=True) if m["viable"]]
@@ -69,11 +78,11 @@ def across_seeds(metrics: list[dict[str, Any]], estimator: int) -> dict[str, Any
     def error(name: str) -> dict[str, Any]:
         means = [r["relative_error_percent"][name]["mean"] for r in rows]
         own = [r["relative_error_percent"][name] for r in viable]
-        squares = [e["rms"] ** 2 for e in own]
+        finite = [e["mean"] for e in own if not math.isnan(e["mean"])]
         return {
             **_mean_sd([e["mean"] for e in own]),
-            "median": float(np.median([e["mean"] for e in own])) if own else math.nan,
-            "rms": math.sqrt(np.mean(squares)) if squares else math.nan,
+            "median": float(np.median(finite)) if finite else math.nan,
+            "rms": math.sqrt(_mean_sd([e["rms"] ** 2 for e in own])["mean"]),
             "all_seeds": _mean_sd(means),
         }
 
@@ -112,10 +121,11 @@ def _sums(counts: list[dict[str, int]]) -> dict[str, int]:
 
 
 def _mean_sd(values: list[float]) -> dict[str, float]:
-    """Mean and standard deviation; not a number where there is none."""
+    """Mean and standard deviation of the numbers among the values."""
+    numbers = [v for v in values if not math.isnan(v)]
     return {
-        "mean": float(np.mean(values)) if values else math.nan,
-        "sd": float(np.std(values, ddof=1)) if len(values) > 1 else math.nan,
+        "mean": float(np.mean(numbers)) if numbers else math.nan,
+        "sd": float(np.std(numbers, ddof=1)) if len(numbers) > 1 else math.nan,
     }
 
 
@@ -124,14 +134,15 @@ def _differences(
 ) -> list[dict[str, Any]]:
     """Mean error of every agent minus that of every other method, with 95 % intervals.
 
-    Plants and noise are common to all methods, so differences are paired episode by
-    episode; the interval is Student's over the seeds, seed by seed where both have seeds.
+    Plants and noise are common to all methods. The difference is that of the mean errors,
+    seed by seed (a method that is not trained is the same for every seed), over the seeds
+    that are viable and have an estimate in both; the interval is Student's over the seeds.
     """
     differences = []
     names = [*study.methods, *study.agents]
     for i, estimator in enumerate(study.estimators):
         means: dict[str, list[dict[str, Any]]] = {
-            agent: [m["rows"][i]["relative_error_percent"] for m in found]
+            agent: [m["rows"][i]["relative_error_percent"] if m["viable"] else {} for m in found]
             for agent, found in seeds.items()
         }
         for row in rows:
@@ -147,13 +158,15 @@ def _differences(
 
 def _paired(pairs: list[tuple[dict[str, Any], dict[str, Any]]]) -> dict[str, Any]:
     result = {}
-    for name in pairs[0][0]:
-        gaps = [a[name]["mean"] - b[name]["mean"] for a, b in pairs]
-        summary = _mean_sd(gaps)
-        quantile = scipy.stats.t.ppf(0.975, len(gaps) - 1) if len(gaps) > 1 else math.nan
-        half = quantile * summary["sd"] / math.sqrt(len(gaps))
+    names = dict.fromkeys(name for pair in pairs for part in pair for name in part)
+    for name in names:
+        both = [(a[name]["mean"], b[name]["mean"]) for a, b in pairs if name in a and name in b]
+        gaps = [gap for a, b in both if not math.isnan(gap := a - b)]
+        summary, count = _mean_sd(gaps), len(gaps)
+        quantile = scipy.stats.t.ppf(0.975, count - 1) if count > 1 else math.nan
+        half = quantile * summary["sd"] / math.sqrt(max(count, 1))
         mean = summary["mean"]
-        result[name] = {"mean": mean, "ci95": (mean - half, mean + half)}
+        result[name] = {"mean": mean, "ci95": (mean - half, mean + half), "seeds": count}
     return {"relative_error_percent": result}
 
 
@@ -167,22 +180,21 @@ def finished_table(folder: Path) -> dict[str, Any]:
     if not path.is_file():
         study_table(folder)  # says what is missing
         raise ValueError(f"{folder}: the table was not written; 'excite study run' writes it")
-    content = read_json(path)
+    content = read_json(path, "rows")
     without = {"viable_seeds": None, "seeds": None, "train_seconds": None}
     return {**content, "rows": [{**without, **row} for row in content["rows"]]}
 
 
 def best_seeds(study: Study, folder: Path) -> dict[str, int]:
     """By agent, the seed with the highest return in the validation episodes."""
-    return {
-        agent: max(
-            range(study.seeds),
-            key=lambda seed, agent=agent: read_json(
-                seed_folder(folder, agent, seed) / "metrics.json"
-            )["validation"]["return"],
-        )
-        for agent in study.agents
-    }
+
+    def value(agent: str, seed: int) -> float:
+        metrics = read_json(seed_folder(folder, agent, seed) / "metrics.json", "validation")
+        reward = metrics["validation"]["return"]
+        return -math.inf if reward is None else reward
+
+    seeds = range(study.seeds)
+    return {a: max(seeds, key=lambda seed, a=a: value(a, seed)) for a in study.agents}
 
 
 def learning_curves(study: Study, folder: Path) -> dict[str, list[dict[str, np.ndarray]]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -58,15 +59,20 @@ def run(
     from ..study import read_study
 
     chosen = read_study(study_file)
-    if chosen.agents:
+    if engine == "local" and chosen.agents:
         _require_trainer()
     machine = _engine(engine, address, workers)
 
     def finished(name: str) -> None:
         click.echo(f"finished: {name}", err=True)
 
-    with progress_bar(chosen.name) as progress:
-        failures = run_study(chosen, out, machine, progress, finished)
+    try:
+        with progress_bar(chosen.name) as progress:
+            failures = run_study(chosen, out, machine, progress, finished)
+    except KeyboardInterrupt:
+        kept = f"what is finished is kept in {out}, the same command goes on"
+        click.echo(f"excite: interrupted; {kept}", err=True)
+        sys.exit(130)
     if failures:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in failures.items())
         raise RunFailedError(
@@ -122,6 +128,7 @@ def _finish(chosen: Any, folder: Path) -> None:
         benchmark_latex,
         benchmark_markdown,
         curves_figure,
+        differences_csv,
         image,
     )
 
@@ -131,6 +138,7 @@ def _finish(chosen: Any, folder: Path) -> None:
         "table.md": benchmark_markdown(rows, settings).encode(),
         "table.csv": benchmark_csv(rows).encode(),
         "table.tex": benchmark_latex(rows, settings).encode(),
+        "differences.csv": differences_csv(content["differences"]).encode(),
         "errors.png": image(benchmark_figure(rows, title), "png"),
     }
     if chosen.agents:

@@ -123,6 +123,12 @@ def benchmark_csv(rows: Sequence[Mapping[str, Any]]) -> str:
             columns[f"{name}_error_percent_{part}"] = [
                 row["relative_error_percent"][name][part] for row in rows
             ]
+        if "seeds" in rows[0]:
+            for part in ("mean", "sd"):
+                columns[f"{name}_error_percent_all_seeds_{part}"] = [
+                    row["relative_error_percent"][name].get("all_seeds", {}).get(part, math.nan)
+                    for row in rows
+                ]
         columns[f"{name}_cramer_rao_percent"] = [row["cramer_rao_percent"][name] for row in rows]
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
@@ -148,3 +154,15 @@ def _latex_row(cells: Sequence[str]) -> str:
     for plain, latex in (("%", r"\%"), ("±", r"$\pm$"), ("–", "--"), ("&nbsp;", "~")):
         text = text.replace(plain, latex)
     return re.sub(r"([A-Za-z])_([A-Za-z]+)", r"$\1_{\2}$", text) + r" \\"
+
+
+def differences_csv(differences: Sequence[Mapping[str, Any]]) -> str:
+    """Differences between methods in percent, with 95 % intervals, as CSV."""
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow(["method", "minus", "estimator", "parameter", "mean", "low", "high", "seeds"])
+    for pair in differences:
+        for name, gap in pair["relative_error_percent"].items():
+            where = [pair["method"], pair["minus"], pair["estimator"], name]
+            writer.writerow([*where, gap["mean"], *gap["ci95"], gap["seeds"]])
+    return buffer.getvalue()

@@ -26,7 +26,7 @@ class PPOSettings:
     """Hyper-parameters, named as in Stable-Baselines3 and with its defaults where it has one.
 
     Attributes:
-        total_steps: environment steps of the whole training.
+        total_steps: environment steps of the whole training, rounded up to whole rollouts.
         num_envs: plants stepped as one batch.
         n_steps: steps of each plant in a rollout.
         batch_size, n_epochs, gamma, gae_lambda, clip_range, ent_coef, vf_coef,
@@ -74,6 +74,9 @@ class PPOSettings:
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:
                 raise ValueError(f"{name} must be positive: got {value:g}")
+        for name in ("ent_coef", "vf_coef"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must not be negative: got {getattr(self, name):g}")
         for name in ("gamma", "gae_lambda"):
             if not 0 < getattr(self, name) <= 1:
                 raise ValueError(
@@ -99,7 +102,7 @@ class PPOSettings:
     def learning_rate_at(self, remaining: float) -> float:
         """Learning rate at a remaining fraction of the training."""
         end = self.learning_rate if self.learning_rate_end is None else self.learning_rate_end
-        return end + (self.learning_rate - end) * remaining
+        return end + (self.learning_rate - end) * max(remaining, 0.0)  # the last rollout is whole
 
 
 @dataclass(frozen=True)
