@@ -277,8 +277,16 @@ def test_a_contract_with_a_part_missing_is_refused(key):
 
 
 def test_a_layout_of_another_plant_is_refused():
-    other = json.loads(json.dumps(PLANTS["dc_motor"].description.to_dict()))
-    assert "does not belong to the policy's plant" in refusal(file_of(plant=other))
+    motor = PLANTS["dc_motor"].description
+    other = json.loads(json.dumps(motor.to_dict()))
+    sentence = refusal(file_of(plant=other, plant_hash=motor.hash))
+    assert "does not belong to the policy's plant" in sentence
+
+
+def test_a_contract_whose_plant_was_changed_is_refused():
+    other = json.loads(json.dumps(POLICY.plant.to_dict()))
+    other["constants"][0]["value"] *= 2
+    assert "not the one that was written" in refusal(file_of(plant=other))
 
 
 def spoilt_tensors() -> dict[str, dict[str, np.ndarray]]:
