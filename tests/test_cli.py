@@ -22,6 +22,7 @@ from experiments import NUM_STEPS
 from excite.cli import cli, main
 from excite.names import EXCITATIONS, PLANTS
 from excite.plant import Aero2
+from excite.policy import Layout, Policy, read_policy
 from excite.records import read_record
 from excite.report import number
 
@@ -258,6 +259,45 @@ def test_commands_are_those_that_are_promised():
         for single in group.values():
             assert "--json" in {opt for p in single.params for opt in p.opts}
         assert command.help
+
+
+@pytest.fixture
+def policy(tmp_path: Path) -> Path:
+    """The file of a small policy for aero2."""
+    description, rng = Aero2().description, np.random.default_rng(0)
+    layout = Layout.of(description, 3, 40)
+    weights = ((rng.normal(size=(1, layout.size)), np.zeros(1)),)
+    path = tmp_path / "policy.safetensors"
+    path.write_bytes(Policy(description, layout, weights).to_bytes())
+    return path
+
+
+def test_a_policy_is_an_excitation_like_any_other(run, policy, tmp_path):
+    record = tmp_path / "record.csv"
+    words = ("simulate", "aero2", "--excitation", policy, "--steps", 40, "--out", record)
+    assert run(*words).code == 0
+    origin = json.loads(record.with_suffix(".json").read_text())["provenance"]
+    assert origin["policy_hash"] == read_policy(policy).hash
+    assert "warning" not in origin
+    answer = run(*words, "--noise", "pitch=0.001", "--overwrite")
+    assert answer.err.startswith("warning: the policy was trained on another 'aero2'")
+    assert "warning" in json.loads(record.with_suffix(".json").read_text())["provenance"]
+    assert run("information", "aero2", "--excitation", policy, "--steps", 40).code == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("emps",), "trained for the input 'voltage'"),
+        (("aero2", "--steps", 41), "made for 40 steps; the experiment has 41"),
+        (("aero2", "--steps", 40, "--set", "amplitude=3"), "a policy has no options"),
+    ],
+)
+def test_a_policy_that_may_not_excite_is_one_sentence(run, policy, words, sentence):
+    answer = run("simulate", *words, "--excitation", policy)
+    assert answer.code == 2
+    assert sentence in answer.err
+    assert answer.err.count("\n") == 1
 
 
 def test_without_a_command_help_is_shown(run):

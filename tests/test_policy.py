@@ -367,11 +367,11 @@ def aero2_with(**changes: Any) -> PlantDescription:
 
 
 @pytest.mark.parametrize(("changes", "sentence"), [
-    ({"input": {"name": "current"}}, "trained with name 'voltage' of 'voltage'.* has 'current'"),
+    ({"input": {"name": "current"}}, "trained for the input 'voltage'; the plant has 'current'"),
     ({"input": {"unit": "mV"}}, "trained with unit 'V' of 'voltage'; the plant has 'mV'"),
     ({"input": {"lower": -12.0}}, r"trained with lower -24.0 of 'voltage'; the plant has -12.0"),
     ({"input": {"upper": 12.0}}, r"trained with upper 24.0 of 'voltage'; the plant has 12.0"),
-    ({"output": {"name": "yaw"}}, "trained with name 'pitch' of 'pitch'; the plant has 'yaw'"),
+    ({"output": {"name": "yaw"}}, "trained for the output 'pitch'; the plant has 'yaw'"),
     ({"output": {"unit": "deg"}}, "trained with unit 'rad' of 'pitch'; the plant has 'deg'"),
     ({"output": {"warning_level": 0.1}}, "trained with warning_level .* the plant has 0.1"),
     ({"output": {"warning_level": None}}, "trained with warning_level .* the plant has None"),

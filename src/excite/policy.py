@@ -259,8 +259,8 @@ def mismatch(policy: Policy, plant: PlantDescription) -> str | None:
             levels or sampling time.
     """
     own = policy.plant
-    _require_same("inputs", own.inputs, plant.inputs, ("name", "unit", "lower", "upper"))
-    levels = ("name", "unit", "warning_level", "critical_level")
+    _require_same("inputs", own.inputs, plant.inputs, ("unit", "lower", "upper"))
+    levels = ("unit", "warning_level", "critical_level")
     _require_same("outputs", own.outputs, plant.outputs, levels)
     if not math.isclose(own.dt, plant.dt, rel_tol=1e-9):
         raise ValueError(
@@ -281,6 +281,11 @@ def _require_same(
     if len(trained) != len(given):
         raise ValueError(f"the policy has {len(trained)} {kind}; the plant has {len(given)}")
     for ours, theirs in zip(trained, given, strict=True):
+        if ours.name != theirs.name:
+            raise ValueError(
+                f"the policy was trained for the {kind[:-1]} {ours.name!r}; "
+                f"the plant has {theirs.name!r}"
+            )
         for field in fields:
             if getattr(ours, field) != getattr(theirs, field):
                 raise ValueError(
