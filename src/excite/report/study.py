@@ -74,7 +74,7 @@ def agents_figure(
         ):
             below.plot(record.time, values, color=colour, lw=1, label=name)
         below.axhline(1, color="black", lw=0.6)
-        below.set(xlabel="time [s]", ylim=(0, 3), ylabel="estimate / true")
+        below.set(xlabel="time [s]", yscale="log", ylim=(0.1, 30), ylabel="estimate / true")
     add_legend(figure, *axes[:, 0])
     figure.suptitle(title)
     return figure
