@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray
 
-from .objective import AbstractObjective, Sample, default_objective
+from .objective import AbstractObjective, Sample, default_objective, number
 from .plant import AbstractPlant, Params, draw_params
 from .policy import (
     Layout,
@@ -33,10 +33,6 @@ from .policy import (
 )
 from .safety import critical_levels, penalty, watched_levels
 from .simulation import measure, step
-
-
-def _number(value: Any) -> Array:
-    return jnp.asarray(value, float)
 
 
 class EnvState(eqx.Module):
@@ -95,15 +91,16 @@ class Env(eqx.Module):
     plant: AbstractPlant
     objective: AbstractObjective
     layout: Layout = eqx.field(static=True)
-    spread: Float[Array, ""] = eqx.field(converter=_number, default=0.3)
-    penalty_weight: Float[Array, ""] = eqx.field(converter=_number, default=1.0)
+    spread: Float[Array, ""] = eqx.field(converter=number, default=0.3)
+    penalty_weight: Float[Array, ""] = eqx.field(converter=number, default=1.0)
 
     @classmethod
     def of(cls, plant: AbstractPlant, **choices: Any) -> Env:
         """The paper's process for a plant, but for what is chosen."""
-        spread = float(choices.get("spread", 0.3))
-        choices.setdefault("objective", default_objective(plant, spread))
-        choices.setdefault("layout", Layout.of(plant.description))
+        if "objective" not in choices:
+            choices["objective"] = default_objective(plant, float(choices.get("spread", 0.3)))
+        if "layout" not in choices:
+            choices["layout"] = Layout.of(plant.description)
         return cls(plant, **choices)
 
     def reset(self, key: PRNGKeyArray) -> tuple[EnvState, Float[Array, " observation"]]:

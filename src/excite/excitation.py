@@ -45,7 +45,8 @@ _TAPS = {
 }  # fmt: skip
 
 
-def _optional_array(value: Any) -> Array | None:
+def optional_array(value: Any) -> Array | None:
+    """An array of numbers, or None as it is; converts fields."""
     return None if value is None else jnp.asarray(value, float)
 
 
@@ -115,7 +116,7 @@ class Random(AbstractSignal):
         hold: samples for which a value is held.
     """
 
-    amplitude: Float[Array, "..."] | None = eqx.field(converter=_optional_array, default=None)
+    amplitude: Float[Array, "..."] | None = eqx.field(converter=optional_array, default=None)
     hold: int = eqx.field(static=True, default=1)
 
     def sequence(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> Sequence:
@@ -137,7 +138,7 @@ class PRBS(AbstractSignal):
             Identification, 1993).
     """
 
-    amplitude: Float[Array, "..."] | None = eqx.field(converter=_optional_array, default=None)
+    amplitude: Float[Array, "..."] | None = eqx.field(converter=optional_array, default=None)
     clock: int = eqx.field(static=True, default=1)
     register: int = eqx.field(static=True, default=0)
 
@@ -193,9 +194,9 @@ class Chirp(AbstractSignal):
         logarithmic: whether equal times are spent on equal frequency ratios.
     """
 
-    amplitude: Float[Array, "..."] | None = eqx.field(converter=_optional_array, default=None)
-    start_frequency: Float[Array, ""] | None = eqx.field(converter=_optional_array, default=None)
-    stop_frequency: Float[Array, ""] | None = eqx.field(converter=_optional_array, default=None)
+    amplitude: Float[Array, "..."] | None = eqx.field(converter=optional_array, default=None)
+    start_frequency: Float[Array, ""] | None = eqx.field(converter=optional_array, default=None)
+    stop_frequency: Float[Array, ""] | None = eqx.field(converter=optional_array, default=None)
     logarithmic: bool = eqx.field(static=True, default=False)
 
     def sequence(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> Sequence:
@@ -229,9 +230,9 @@ class Multisine(AbstractSignal):
         start_frequency, stop_frequency: band [Hz], default the plant's.
     """
 
-    amplitude: Float[Array, "..."] | None = eqx.field(converter=_optional_array, default=None)
-    start_frequency: Float[Array, ""] | None = eqx.field(converter=_optional_array, default=None)
-    stop_frequency: Float[Array, ""] | None = eqx.field(converter=_optional_array, default=None)
+    amplitude: Float[Array, "..."] | None = eqx.field(converter=optional_array, default=None)
+    start_frequency: Float[Array, ""] | None = eqx.field(converter=optional_array, default=None)
+    stop_frequency: Float[Array, ""] | None = eqx.field(converter=optional_array, default=None)
 
     def sequence(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> Sequence:
         """The same sum for every key; zero where the band holds no harmonic."""
@@ -258,8 +259,8 @@ class Square(AbstractSignal):
         frequency: of the first input [Hz], default the geometric mean of the plant's band.
     """
 
-    amplitude: Float[Array, "..."] | None = eqx.field(converter=_optional_array, default=None)
-    frequency: Float[Array, ""] | None = eqx.field(converter=_optional_array, default=None)
+    amplitude: Float[Array, "..."] | None = eqx.field(converter=optional_array, default=None)
+    frequency: Float[Array, ""] | None = eqx.field(converter=optional_array, default=None)
 
     def sequence(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> Sequence:
         """The same wave for every key, beginning with its upper value."""

@@ -13,6 +13,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .plant import AbstractPlant, Params
@@ -28,6 +29,12 @@ def require_double_precision() -> None:
             "estimation and information need double precision: "
             'call jax.config.update("jax_enable_x64", True) first'
         )
+
+
+def require_noise(plant: AbstractPlant) -> None:
+    """Raises ValueError for a sensor without noise, which has no Cramér-Rao bound."""
+    if not np.all(np.asarray(plant.sensor.sd) > 0):
+        raise ValueError("a sensor without noise has no Cramér-Rao bound; give it a noise_sd")
 
 
 def sensitivity(

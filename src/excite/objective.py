@@ -19,6 +19,7 @@ from jaxtyping import Array, Float, Int
 from .description import PlantDescription, names_of
 from .estimation import ARX
 from .estimation.arx import RLSState, physical_params, regressor
+from .excitation import optional_array
 from .information import relative_size
 from .plant import AbstractARXPlant, AbstractPlant, Params
 from .simulation import step
@@ -27,12 +28,9 @@ MAX_ERROR = 100.0
 """Relative error at which an estimate counts as nothing (10,000 %); also for one not finite."""
 
 
-def _array(value: Any) -> Array:
+def number(value: Any) -> Array:
+    """An array of floating-point numbers, also from whole ones; converts fields."""
     return jnp.asarray(value, float)
-
-
-def _optional_array(value: Any) -> Array | None:
-    return None if value is None else jnp.asarray(value, float)
 
 
 class Sample(eqx.Module):
@@ -97,9 +95,9 @@ class EstimationError(AbstractObjective):
 
     estimator: ARX
     targets: tuple[bool, ...] = eqx.field(static=True)
-    goals: Float[Array, " param"] | None = eqx.field(converter=_optional_array, default=None)
+    goals: Float[Array, " param"] | None = eqx.field(converter=optional_array, default=None)
     logarithmic: bool = eqx.field(static=True, default=False)
-    weight: Float[Array, ""] = eqx.field(converter=_array, default=1.0)
+    weight: Float[Array, ""] = eqx.field(converter=number, default=1.0)
 
     def init(self, plant: AbstractPlant, measured: Float[Array, " output"]) -> ARXMemory:
         """No coefficients yet.
@@ -171,8 +169,8 @@ class InformationGain(AbstractObjective):
     """
 
     targets: tuple[bool, ...] = eqx.field(static=True)
-    prior_sd: Float[Array, ""] = eqx.field(converter=_array)
-    weight: Float[Array, ""] = eqx.field(converter=_array, default=1.0)
+    prior_sd: Float[Array, ""] = eqx.field(converter=number)
+    weight: Float[Array, ""] = eqx.field(converter=number, default=1.0)
 
     def init(self, plant: AbstractPlant, measured: Float[Array, " output"]) -> InformationMemory:
         """The prior's information; the initial state is known."""

@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-import numpy as np
 import pydantic
 import tomlkit
 import tomlkit.exceptions
@@ -20,6 +19,7 @@ from .env import Env
 from .estimation import ARX, AbstractEstimator
 from .excitation import AbstractExcitation
 from .files import folder_word
+from .information import require_noise
 from .names import ESTIMATORS, estimator_named, excitation_named, plant_named, unknown, with_sensor
 from .objective import (
     AbstractObjective,
@@ -290,8 +290,8 @@ class Study(_Settings):
                 self.build_training(name)
             except ValueError as error:
                 raise ValueError(f"agents.{name}: {error}") from None
-        if self.agents and not np.all(np.asarray(plant.sensor.sd) > 0):
-            raise ValueError("a sensor without noise has no Cramér-Rao bound; give it a noise_sd")
+        if self.agents:
+            require_noise(plant)
 
     def check_reference(self, plant: AbstractPlant) -> None:
         """Raises ValueError for published rows of an unknown method or parameter."""

@@ -29,7 +29,7 @@ from ..description import PlantDescription, display_unit, names_of
 from ..estimation import AbstractEstimator, Status, stack_experiments
 from ..excitation import AbstractExcitation
 from ..files import folder_word, new_run_folder, write_json
-from ..information import cramer_rao_bound, experiment_information, relative_size
+from ..information import cramer_rao_bound, experiment_information, relative_size, require_noise
 from ..plant import AbstractPlant, Params, draw_params
 from ..safety import critical_levels, is_violation, max_abs_output, watched_output
 from ..simulation import Trajectory, run_episode
@@ -103,6 +103,11 @@ def estimate_all(
     return jax.vmap(one)(trajectory.inputs, trajectory.measured)
 
 
+def episode_keys(study: Study) -> Key[Array, " episode"]:
+    """Keys of the study's evaluation episodes."""
+    return jax.random.split(jax.random.key(study.seed), study.episodes)
+
+
 @dataclass(frozen=True)
 class _Outcome:
     """All episodes of one method and one estimator, on NumPy arrays."""
@@ -145,11 +150,10 @@ def evaluate_method(
     Raises:
         ValueError: for a sensor without noise, which has no Cramér-Rao bound.
     """
-    if not np.all(np.asarray(plant.sensor.sd) > 0):
-        raise ValueError("a sensor without noise has no Cramér-Rao bound; give it a noise_sd")
+    require_noise(plant)
     estimators = study.build_estimators(plant)
     middle = np.mean(plant.input_limits, axis=0)
-    keys = jax.random.split(jax.random.key(study.seed), study.episodes)
+    keys = episode_keys(study)
     outcomes: dict[str, list[_Outcome]] = {e: [] for e in estimators}
     squares = []
     for c, first in enumerate(range(0, study.episodes, CHUNK)):
@@ -204,10 +208,10 @@ def _row(
         "failed": int(count - good.sum()),
         "failures": {reason: reasons.count(reason) for reason in sorted(set(reasons))},
         "violations": violations,
-        "violation_rate": {"estimate": violations / count, "ci95": wilson(violations, count)},
+        "violation_rate": violation_rate(violations, count),
         "max_abs_output": {
             "output": description.outputs[watched].name,
-            **_mean_sd(factor * outcome.max_abs_output[:, watched]),
+            **mean_sd(factor * outcome.max_abs_output[:, watched]),
             "unit": unit,
         },
         "relative_error_percent": by_name(_error(100 * np.abs(e)) for e in error.T),
@@ -227,7 +231,8 @@ def _fraction(values: np.ndarray) -> Float[np.ndarray, " param"]:
     return values.mean(axis=0) if len(values) else np.full(values.shape[1], np.nan)
 
 
-def _mean_sd(values: np.ndarray) -> dict[str, float]:
+def mean_sd(values: np.ndarray) -> dict[str, float]:
+    """Mean and standard deviation, where there are any."""
     return {
         "mean": float(values.mean()) if values.size else math.nan,
         "sd": float(values.std(ddof=1)) if values.size > 1 else math.nan,
@@ -237,9 +242,14 @@ def _mean_sd(values: np.ndarray) -> dict[str, float]:
 def _error(values: np.ndarray) -> dict[str, float]:
     """Mean and standard deviation of errors, and what a few large ones do not move."""
     if not values.size:
-        return {**_mean_sd(values), "median": math.nan, "rms": math.nan}
+        return {**mean_sd(values), "median": math.nan, "rms": math.nan}
     rms = float(np.sqrt(np.mean(values**2)))
-    return {**_mean_sd(values), "median": float(np.median(values)), "rms": rms}
+    return {**mean_sd(values), "median": float(np.median(values)), "rms": rms}
+
+
+def violation_rate(violations: int, count: int) -> dict[str, Any]:
+    """The rate and its interval, as rows have it."""
+    return {"estimate": violations / count, "ci95": wilson(violations, count)}
 
 
 def wilson(successes: int, count: int) -> tuple[float, float]:
@@ -320,11 +330,8 @@ def unpacked(
 
 def methods_task(study: Mapping[str, Any], plant: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Rows of a study's own methods; what a worker is called for."""
-    with unpacked(study, plant) as (chosen, built):
-        rows = []
-        for name, excitation in chosen.build_methods(built).items():
-            rows += evaluate_method(chosen, built, name, excitation)[0]
-        return rows
+    with unpacked(study, plant) as (chosen, _):
+        return run_benchmark(chosen)
 
 
 def study_of(folder: Path) -> Study:

@@ -11,7 +11,6 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import hashlib
-import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -36,8 +35,10 @@ _TASKS = {
 
 
 @contextlib.contextmanager
-def opened(study: Study, folder: Path) -> Iterator[None]:
+def opened(study: Study, folder: Path) -> Iterator[tuple[AbstractPlant, str | None]]:
     """A run folder of this study, new or begun, for one process at a time.
+
+    Yields the plant, and the source of a user's own.
 
     Raises:
         ValueError: where the folder holds something else, or another study, or is in use.
@@ -58,22 +59,23 @@ def opened(study: Study, folder: Path) -> Iterator[None]:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             raise ValueError(f"{folder}: another process is working on this study") from None
-        plant, text = study.build_plant().description, _plant_text(study)
+        plant, text = study.build_plant(), _plant_text(study)
+        description = plant.description
         mark = None if text is None else hashlib.sha256(text.encode()).hexdigest()
         if marker.is_file():
-            _require_same_study(study, plant.hash, mark, folder)
+            _require_same_study(study, description.hash, mark, folder)
         write_json(folder / "study.json", study.model_dump())
         write_json(
             marker,
             {
                 "kind": KIND,
                 "excite": __version__,
-                "plant": plant.to_dict(),
-                "plant_hash": plant.hash,
+                "plant": description.to_dict(),
+                "plant_hash": description.hash,
                 "plant_file": mark,
             },
         )
-        yield
+        yield plant, text
 
 
 def _plant_text(study: Study) -> str | None:
@@ -134,8 +136,8 @@ def run_study(
     Returns:
         A sentence for every task that failed in spite of all tries.
     """
-    with opened(study, folder):
-        tasks, targets = _missing(study, folder), _names(study)
+    with opened(study, folder) as (plant, text):
+        tasks, targets = _missing(study, plant, text, folder), _names(study)
         if tasks:  # a table of before is not that of this study
             (folder / "table.json").unlink(missing_ok=True)
         before = len(targets) - len(tasks)
@@ -165,10 +167,11 @@ def _names(study: Study) -> dict[str, _Target]:
     return names
 
 
-def _missing(study: Study, folder: Path) -> dict[str, dict[str, Any]]:
+def _missing(
+    study: Study, plant: AbstractPlant, text: str | None, folder: Path
+) -> dict[str, dict[str, Any]]:
     """Arguments of the tasks that are not finished; makes the seeds' folders."""
-    plant = study.build_plant()
-    source = {"text": _plant_text(study), "hash": plant.description.hash}
+    source = {"text": text, "hash": plant.description.hash}
     shared = {"study": json_ready(study.model_dump()), "plant": source}
     tasks = {}
     for name, (kind, agent, seed) in _names(study).items():
@@ -207,9 +210,9 @@ def _live(study: Study, target: _Target, folder: Path) -> tuple[float, str]:
     if (place / "metrics.json").is_file():
         return 1.0, ""
     try:  # it is there to be looked at, and may be anything
-        row = json.loads((place / "progress.json").read_text(encoding="utf-8"))
+        row = read_json(place / "progress.json")
         return row["steps"] / study.build_training(agent).total_steps, _looks(agent, seed, row)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+    except (ValueError, KeyError, TypeError, AttributeError):
         return 0.0, ""
 
 

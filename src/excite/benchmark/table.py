@@ -15,12 +15,22 @@ from ..description import names_of
 from ..estimation import ARX
 from ..estimation.arx import running_params
 from ..excitation import PolicyExcitation
-from ..plant import AbstractARXPlant, AbstractPlant, draw_params
+from ..plant import AbstractARXPlant, AbstractPlant
 from ..policy import read_policy
 from ..records import Record
-from ..simulation import run_episode
 from ..study import Study
-from .base import numbers_of, read_json, seed_folder, study_of, wilson
+from .base import (
+    episode_keys,
+    evaluate,
+    mean_sd,
+    numbers_of,
+    read_json,
+    seed_folder,
+    study_of,
+    violation_rate,
+)
+
+_UNTRAINED = {"viable_seeds": None, "seeds": None, "train_seconds": None}
 
 
 def study_table(folder: Path) -> dict[str, Any]:
@@ -40,7 +50,7 @@ def study_table(folder: Path) -> dict[str, Any]:
     }
     _require_finished(study, folder, seeds)
     rows = numbers_of(read_json(folder / "methods.json", "rows")["rows"]) if study.methods else []
-    rows = [{**r, "viable_seeds": None, "seeds": None, "train_seconds": None} for r in rows]
+    rows = [{**row, **_UNTRAINED} for row in rows]
     for metrics in seeds.values():
         rows += [across_seeds(metrics, e) for e in range(len(study.estimators))]
     return {"rows": rows, "differences": _differences(study, rows, seeds)}
@@ -92,10 +102,7 @@ def across_seeds(metrics: list[dict[str, Any]], estimator: int) -> dict[str, Any
         "failed": _total(rows, "failed"),
         "failures": _sums([r["failures"] for r in rows]),
         "violations": violations,
-        "violation_rate": {
-            "estimate": violations / evaluations,
-            "ci95": wilson(violations, evaluations),
-        },
+        "violation_rate": violation_rate(violations, evaluations),
         "max_abs_output": {
             **rows[0]["max_abs_output"],
             **_mean_sd([r["max_abs_output"]["mean"] for r in viable]),
@@ -122,11 +129,7 @@ def _sums(counts: list[dict[str, int]]) -> dict[str, int]:
 
 def _mean_sd(values: list[float]) -> dict[str, float]:
     """Mean and standard deviation of the numbers among the values."""
-    numbers = [v for v in values if not math.isnan(v)]
-    return {
-        "mean": float(np.mean(numbers)) if numbers else math.nan,
-        "sd": float(np.std(numbers, ddof=1)) if len(numbers) > 1 else math.nan,
-    }
+    return mean_sd(np.array([v for v in values if not math.isnan(v)]))
 
 
 def _differences(
@@ -181,8 +184,7 @@ def finished_table(folder: Path) -> dict[str, Any]:
         study_table(folder)  # says what is missing
         raise ValueError(f"{folder}: the table was not written; 'excite study run' writes it")
     content = read_json(path, "rows")
-    without = {"viable_seeds": None, "seeds": None, "train_seconds": None}
-    return {**content, "rows": [{**without, **row} for row in content["rows"]]}
+    return {**content, "rows": [{**_UNTRAINED, **row} for row in content["rows"]]}
 
 
 def best_seeds(study: Study, folder: Path) -> dict[str, int]:
@@ -215,13 +217,12 @@ def example_episodes(study: Study, folder: Path) -> dict[str, tuple[Record, np.n
     not numbers where there is none.
     """
     plant, episodes = study.build_plant(), {}
-    key = jax.random.split(jax.random.key(study.seed), study.episodes)[0]
-    params_key, episode_key = jax.random.split(key)  # as `evaluate` does
-    params = draw_params(plant, params_key, study.spread)
+    first = episode_keys(study)[:1]
     for agent, seed in best_seeds(study, folder).items():
         policy = read_policy(seed_folder(folder, agent, seed) / "policy.safetensors")
         excitation = PolicyExcitation.of(policy)
-        run = run_episode(plant, params, excitation, study.num_steps, episode_key)
+        batch = evaluate(plant, excitation, study.num_steps, study.spread, first)
+        run, params = jax.tree.map(lambda leaf: leaf[0], (batch.trajectory, batch.params))
         record = Record.of_episode(run.time, run.inputs, run.outputs)
         estimates = _running(study, plant, run.inputs, run.measured)
         episodes[agent] = record, estimates / np.stack(params)

@@ -34,16 +34,7 @@ def benchmark(
     """Compare the methods of STUDY.toml under identical conditions."""
     from ..benchmark import run_benchmark, write_benchmark
     from ..files import require_free_run_folder
-    from ..report import (
-        all_cells,
-        benchmark_csv,
-        benchmark_figure,
-        benchmark_markdown,
-        footnotes,
-        image,
-        save,
-        table_header,
-    )
+    from ..report import benchmark_figure, save
     from ..study import read_study
 
     overwrite = options.pop("overwrite")
@@ -55,19 +46,33 @@ def benchmark(
     with progress_bar(chosen.name) as progress:
         rows = run_benchmark(chosen, progress)
     settings = chosen.model_dump()
-    title = chosen.title or chosen.name
     if plot is not None:
-        save(benchmark_figure(rows, title), plot)
+        save(benchmark_figure(rows, chosen.title or chosen.name), plot)
     if out is not None:
-        shown = {
-            "table.md": benchmark_markdown(rows, settings).encode(),
-            "table.csv": benchmark_csv(rows).encode(),
-            "errors.png": image(benchmark_figure(rows, title), "png"),
-        }
-        write_benchmark(chosen, rows, shown, out, overwrite)
+        write_benchmark(chosen, rows, comparison_files(rows, settings), out, overwrite)
     if as_json:
         show_json({"rows": rows})
-        return
+    else:
+        show_comparison(rows, settings, out)
+
+
+def comparison_files(rows: Any, settings: Any) -> dict[str, bytes]:
+    """Table and figure of a study's rows, by file name; shared with `study`."""
+    from ..report import benchmark_csv, benchmark_figure, benchmark_markdown, image
+
+    figure = benchmark_figure(rows, settings["title"] or settings["name"])
+    return {
+        "table.md": benchmark_markdown(rows, settings).encode(),
+        "table.csv": benchmark_csv(rows).encode(),
+        "errors.png": image(figure, "png"),
+    }
+
+
+def show_comparison(rows: Any, settings: Any, out: Path | None) -> None:
+    """A study's table and footnotes on stdout; shared with `study`."""
+    from ..report import all_cells, footnotes, table_header
+
+    title = settings["title"] or settings["name"]
     show_table(title, table_header(rows), all_cells(rows, settings["reference"]))
     for note in footnotes(settings):
         click.echo(note)

@@ -9,6 +9,7 @@ from typing import Any
 
 import click
 
+from .benchmark import comparison_files, show_comparison
 from .door import (
     OUT_FILE,
     RunFailedError,
@@ -16,7 +17,6 @@ from .door import (
     json_option,
     progress_bar,
     show_json,
-    show_table,
 )
 
 
@@ -123,10 +123,7 @@ def _finish(chosen: Any, folder: Path) -> None:
     from ..files import write_bytes, write_json
     from ..report import (
         agents_figure,
-        benchmark_csv,
-        benchmark_figure,
         benchmark_latex,
-        benchmark_markdown,
         curves_figure,
         differences_csv,
         image,
@@ -135,11 +132,9 @@ def _finish(chosen: Any, folder: Path) -> None:
     content, settings = study_table(folder), chosen.model_dump()
     rows, title = content["rows"], chosen.title or chosen.name
     shown = {
-        "table.md": benchmark_markdown(rows, settings).encode(),
-        "table.csv": benchmark_csv(rows).encode(),
+        **comparison_files(rows, settings),
         "table.tex": benchmark_latex(rows, settings).encode(),
         "differences.csv": differences_csv(content["differences"]).encode(),
-        "errors.png": image(benchmark_figure(rows, title), "png"),
     }
     if chosen.agents:
         plant = chosen.build_plant().description
@@ -155,15 +150,9 @@ def _finish(chosen: Any, folder: Path) -> None:
 def _show(folder: Path, as_json: bool) -> None:
     from ..benchmark.base import study_of
     from ..benchmark.table import finished_table
-    from ..report import all_cells, footnotes, table_header
 
     content, settings = finished_table(folder), study_of(folder).model_dump()
     if as_json:
         show_json(content)
-        return
-    rows = content["rows"]
-    title = settings["title"] or settings["name"]
-    show_table(title, table_header(rows), all_cells(rows, settings["reference"]))
-    for note in footnotes(settings):
-        click.echo(note)
-    click.echo(f"run folder: {folder}")
+    else:
+        show_comparison(content["rows"], settings, folder)

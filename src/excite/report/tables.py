@@ -151,7 +151,7 @@ def benchmark_latex(rows: Sequence[Mapping[str, Any]], study: Mapping[str, Any])
 def _latex_row(cells: Sequence[str]) -> str:
     """One line of a tabular; parameters like K_pu are set as mathematics."""
     text = " & ".join(cells)
-    for plain, latex in (("%", r"\%"), ("±", r"$\pm$"), ("–", "--"), ("&nbsp;", "~")):
+    for plain, latex in (("%", r"\%"), ("±", r"$\pm$"), ("–", "--")):
         text = text.replace(plain, latex)
     return re.sub(r"([A-Za-z])_([A-Za-z]+)", r"$\1_{\2}$", text) + r" \\"
 

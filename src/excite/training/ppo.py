@@ -9,6 +9,7 @@ as tensors and JSON, never as a pickle.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 from typing import Any
@@ -104,19 +105,10 @@ def train(
             checkpoint, and the newest row of the learning curve, if there is one.
         log_folder: for TensorBoard.
     """
-    vec_env = BatchedVecEnv(
-        ExperimentVectorEnv(
-            settings.num_envs,
-            plant=env.plant,
-            objective=env.objective,
-            layout=env.layout,
-            spread=env.spread,
-            penalty_weight=env.penalty_weight,
-        )
-    )
+    choices = {field.name: getattr(env, field.name) for field in dataclasses.fields(env)}
     model = PPO(
         "MlpPolicy",
-        vec_env,
+        BatchedVecEnv(ExperimentVectorEnv(settings.num_envs, **choices)),
         learning_rate=settings.learning_rate_at,
         n_steps=settings.n_steps,
         batch_size=settings.batch_size,
