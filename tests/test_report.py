@@ -19,6 +19,7 @@ from excite.report import (
     benchmark_csv,
     benchmark_figure,
     benchmark_markdown,
+    differences_markdown,
     digits_for,
     episode_figure,
     episodes_figure,
@@ -201,6 +202,24 @@ def test_csv_keeps_names_that_hold_a_comma_together():
     (line,) = csv.DictReader(io.StringIO(benchmark_csv(comma)))
     assert line["method"] == "slow, then fast"
     assert float(line["evaluations"]) == 50
+
+
+def test_differences_of_the_first_estimator_stand_with_their_intervals():
+    def gap(mean: float | None, low: float | None, high: float | None) -> dict[str, Any]:
+        return {"J_p": {"mean": mean, "ci95": (low, high), "seeds": 2}}
+
+    pairs = [
+        ("RL(all)", "chirp", "paper's", gap(-0.5, -0.75, -0.25)),
+        ("RL(K_pu)", "chirp", "paper's", gap(None, None, None)),
+        ("RL(all)", "chirp", "another", gap(9.0, 8.0, 10.0)),
+    ]
+    keys = ("method", "minus", "estimator", "relative_error_percent")
+    section = differences_markdown([dict(zip(keys, pair, strict=True)) for pair in pairs])
+    assert "| RL(all) | chirp | -0.500 (-0.750 to -0.250) |" in section
+    assert "| RL(K_pu) | chirp | – (– to –) |" in section
+    assert "paper's" in section
+    assert "9.00" not in section
+    assert differences_markdown([]) == ""
 
 
 def test_reference_cells_go_with_the_header():

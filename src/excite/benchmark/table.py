@@ -142,7 +142,7 @@ def _differences(
     that are viable and have an estimate in both; the interval is Student's over the seeds.
     """
     differences = []
-    names = [*study.methods, *study.agents]
+    methods, params = [*study.methods, *study.agents], list(rows[0]["relative_error_percent"])
     for i, estimator in enumerate(study.estimators):
         means: dict[str, list[dict[str, Any]]] = {
             agent: [m["rows"][i]["relative_error_percent"] if m["viable"] else {} for m in found]
@@ -152,16 +152,15 @@ def _differences(
             if row["estimator"] == estimator and row["method"] in study.methods:
                 means[row["method"]] = [row["relative_error_percent"]] * study.seeds
         for agent in study.agents:
-            for other in names[: names.index(agent)]:
+            for other in methods[: methods.index(agent)]:
                 pair = {"method": agent, "minus": other, "estimator": estimator}
                 parts = zip(means[agent], means[other], strict=True)
-                differences.append({**pair, **_paired(list(parts))})
+                differences.append({**pair, **_paired(list(parts), params)})
     return differences
 
 
-def _paired(pairs: list[tuple[dict[str, Any], dict[str, Any]]]) -> dict[str, Any]:
+def _paired(pairs: list[tuple[dict[str, Any], dict[str, Any]]], names: list[str]) -> dict[str, Any]:
     result = {}
-    names = dict.fromkeys(name for pair in pairs for part in pair for name in part)
     for name in names:
         both = [(a[name]["mean"], b[name]["mean"]) for a, b in pairs if name in a and name in b]
         gaps = [gap for a, b in both if not math.isnan(gap := a - b)]

@@ -126,6 +126,7 @@ def _finish(chosen: Any, folder: Path) -> None:
         benchmark_latex,
         curves_figure,
         differences_csv,
+        differences_markdown,
         image,
     )
 
@@ -136,6 +137,7 @@ def _finish(chosen: Any, folder: Path) -> None:
         "table.tex": benchmark_latex(rows, settings).encode(),
         "differences.csv": differences_csv(content["differences"]).encode(),
     }
+    shown["table.md"] += differences_markdown(content["differences"]).encode()
     if chosen.agents:
         plant = chosen.build_plant().description
         curves = curves_figure(plant, learning_curves(chosen, folder), title)

@@ -22,6 +22,7 @@ from .tables import benchmark_csv as benchmark_csv
 from .tables import benchmark_latex as benchmark_latex
 from .tables import benchmark_markdown as benchmark_markdown
 from .tables import differences_csv as differences_csv
+from .tables import differences_markdown as differences_markdown
 from .tables import footnotes as footnotes
 from .tables import reference_cells as reference_cells
 from .tables import table_cells as table_cells
