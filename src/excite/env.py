@@ -125,6 +125,13 @@ class Env(eqx.Module):
 
     def step(self, state: EnvState, action: Float[Array, " input"]) -> tuple[EnvState, Transition]:
         """One sampling time with this action held, in [-1, 1] of the input limits."""
+        state, output, gain = self.advance(state, action)
+        return state, self._transition(state, output, gain)
+
+    def advance(
+        self, state: EnvState, action: Float[Array, " input"]
+    ) -> tuple[EnvState, Float[Array, " output"], Float[Array, ""]]:
+        """The experiment one sampling time on: state, true output, and gain of the objective."""
         plant, k = self.plant, state.k + 1
         action = jnp.where(jnp.isfinite(action), jnp.clip(action, -1, 1), 0.0)
         input = scaled_action(jnp, self.layout, action.astype(float))
@@ -147,7 +154,7 @@ class Env(eqx.Module):
             is_finite=is_finite,
             key=state.key,
         )
-        return new, self._transition(new, output, gain)
+        return new, output, jnp.where(is_finite, gain, 0.0)
 
     def _is_visible(self, state: Float[Array, " state"], params: Params) -> Bool[Array, ""]:
         """Whether the outputs are numbers in the single precision of an observation."""
@@ -162,9 +169,9 @@ class Env(eqx.Module):
         cost = penalty(output[np.array(watched, int)], warning, critical)
         terminated = state.k >= self.layout.num_steps
         final = self.objective.final(plant, state.memory, state.params)
-        # A run that cannot be computed costs a breach a step, and no step gains anything.
+        # A run that cannot be computed costs a breach a step; no step of it gains anything.
         cost = jnp.where(state.is_finite, cost, -1.0)
-        worth = jnp.where(state.is_finite, gain, 0.0) + jnp.where(terminated, final, 0.0)
+        worth = gain + jnp.where(terminated, final, 0.0)
         is_over = jnp.any(state.max_abs_output >= critical_levels(plant.definition))
         return Transition(
             observation=observe(jnp, self.layout, state.window, state.k),

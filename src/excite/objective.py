@@ -146,11 +146,11 @@ def _require_arx(plant: AbstractPlant) -> AbstractARXPlant:
 
 
 class InformationMemory(eqx.Module):
-    """Sensitivity of the state, Fisher information so far, and its criterion."""
+    """Sensitivity of the state, Fisher information, and the criterion as last rewarded."""
 
     sensitivity: Float[Array, "state param"]
     information: Float[Array, "param param"]
-    criterion: Float[Array, ""]
+    value: Float[Array, ""]
 
 
 class InformationGain(AbstractObjective):
@@ -166,11 +166,16 @@ class InformationGain(AbstractObjective):
         targets: which parameters count.
         prior_sd: standard deviation of each relative parameter before the experiment.
         weight: factor of the reward.
+        criterion: of the targets' covariance bound: minus the logarithm of its determinant
+            (`D`), of its trace (`A`), or of its largest eigenvalue (`E`).
+        dense: whether every step is rewarded by its increment, or the last by all of it.
     """
 
     targets: tuple[bool, ...] = eqx.field(static=True)
     prior_sd: Float[Array, ""] = eqx.field(converter=number)
     weight: Float[Array, ""] = eqx.field(converter=number, default=1.0)
+    criterion: str = eqx.field(static=True, default="D")
+    dense: bool = eqx.field(static=True, default=True)
 
     def init(self, plant: AbstractPlant, measured: Float[Array, " output"]) -> InformationMemory:
         """The prior's information; the initial state is known."""
@@ -178,7 +183,7 @@ class InformationGain(AbstractObjective):
         num_params = len(self.targets)
         information = jnp.eye(num_params) / self.prior_sd**2
         sensitivity = jnp.zeros((len(plant.definition.states), num_params))
-        return InformationMemory(sensitivity, information, self._criterion(information))
+        return InformationMemory(sensitivity, information, self._value(information))
 
     def update(
         self, plant: AbstractPlant, memory: InformationMemory, sample: Sample, k: Int[Array, ""]
@@ -200,16 +205,20 @@ class InformationGain(AbstractObjective):
         sensitivity, of_outputs = jax.vmap(derivative, (1, 0), 1)(*directions)
         weighted = of_outputs / plant.sensor.sd[:, None]
         information = memory.information + weighted.T @ weighted
-        criterion = self._criterion(information)
-        gain = self.weight * (criterion - memory.criterion)
-        return InformationMemory(sensitivity, information, criterion), gain
+        if not self.dense:
+            return InformationMemory(sensitivity, information, memory.value), jnp.zeros(())
+        value = self._value(information)
+        gain = self.weight * (value - memory.value)
+        return InformationMemory(sensitivity, information, value), gain
 
     def final(
         self, plant: AbstractPlant, memory: InformationMemory, params: Params
     ) -> Float[Array, ""]:
-        """Nothing: all of it was rewarded on the way."""
-        del plant, memory, params
-        return jnp.zeros(())
+        """What was gained, unless it was rewarded on the way."""
+        del plant, params
+        if self.dense:
+            return jnp.zeros(())
+        return self.weight * (self._value(memory.information) - memory.value)
 
     def relative_errors(
         self, plant: AbstractPlant, memory: InformationMemory, params: Params
@@ -218,10 +227,15 @@ class InformationGain(AbstractObjective):
         del plant, params
         return jnp.sqrt(jnp.diagonal(jnp.linalg.inv(memory.information)))
 
-    def _criterion(self, information: Float[Array, "param param"]) -> Float[Array, ""]:
-        others = np.flatnonzero(~np.array(self.targets))
-        nuisance = information[np.ix_(others, others)]
-        return jnp.linalg.slogdet(information)[1] - jnp.linalg.slogdet(nuisance)[1]
+    def _value(self, information: Float[Array, "param param"]) -> Float[Array, ""]:
+        chosen = np.flatnonzero(self.targets)
+        if self.criterion == "D":
+            others = np.flatnonzero(~np.array(self.targets))
+            nuisance = information[np.ix_(others, others)]
+            return jnp.linalg.slogdet(information)[1] - jnp.linalg.slogdet(nuisance)[1]
+        bound = jnp.linalg.inv(information)[np.ix_(chosen, chosen)]
+        size = jnp.trace(bound) if self.criterion == "A" else jnp.linalg.eigvalsh(bound)[-1]
+        return -jnp.log(size)
 
 
 def target_mask(description: PlantDescription, targets: Sequence[str] | None) -> tuple[bool, ...]:

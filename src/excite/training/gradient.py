@@ -1,0 +1,202 @@
+"""Training by the gradient of the whole experiment: policy, plant, sensor, objective.
+
+The decision process is one differentiable function of the policy's weights, so that the
+gradient of what an experiment is worth follows from one backward pass through it. Every
+update takes a fresh batch of plants. Safety is a quadratic penalty on the true outputs
+from a margin below the critical level, whose weight grows after a batch with a violation
+and slowly decays otherwise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray
+
+from ..env import Env
+from ..policy import Weights, forward, observe
+from ..safety import watched_levels
+from .base import WATCH_SEED, Trained
+
+
+@dataclass(frozen=True)
+class GradientSettings:
+    """Hyper-parameters of training by gradient.
+
+    Attributes:
+        num_updates: steps of Adam.
+        num_plants: plants of each step.
+        learning_rate: of Adam, decaying to zero by a cosine.
+        max_grad_norm: the gradient is scaled down to this norm.
+        hidden: widths of the hidden layers, tanh.
+        last_gain: scale of the last layer's first weights; a loud first policy runs away.
+        margin: the penalty begins at this fraction of a critical level.
+        penalty_weight: of the penalty, at the beginning.
+        penalty_growth, penalty_decay: its change in the logarithm after a batch with a
+            violation, and after one without.
+        watch_every: updates between two looks at the policy.
+        watch_episodes: episodes of such a look.
+    """
+
+    num_updates: int = 1000
+    num_plants: int = 32
+    learning_rate: float = 2e-3
+    max_grad_norm: float = 1.0
+    hidden: tuple[int, ...] = (64, 64)
+    last_gain: float = 0.02
+    margin: float = 0.9
+    penalty_weight: float = 1.0
+    penalty_growth: float = 0.05
+    penalty_decay: float = 0.005
+    watch_every: int = 50
+    watch_episodes: int = 100
+
+
+class Batch(eqx.Module):
+    """Experiments of one policy on a batch of plants.
+
+    Attributes:
+        worth: of each, by the objective.
+        excess: of each, the mean square of how far outputs lie beyond the margin; one is
+            the critical level.
+        is_violation: of each.
+    """
+
+    worth: Float[Array, "*plant"]
+    excess: Float[Array, "*plant"]
+    is_violation: Bool[Array, "*plant"]
+
+
+@eqx.filter_jit
+def experiments(
+    env: Env, weights: Weights, keys: Key[Array, " plant"], margin: Float[Array, ""] | float
+) -> Batch:
+    """One experiment for every key, differentiable in the weights.
+
+    Only the states at every step are kept for the backward pass; the rest of a step is
+    computed again.
+    """
+    watched, _, critical = watched_levels(env.plant.definition)
+
+    @jax.checkpoint
+    def advance(carry: tuple, _: None) -> tuple[tuple, tuple]:
+        state, observation = carry
+        state, output, gain = env.advance(state, forward(jnp, weights, observation))
+        size = jnp.abs(output[np.array(watched, int)]) / critical
+        over = jnp.maximum(size - margin, 0.0) / (1 - margin)
+        observation = observe(jnp, env.layout, state.window, state.k)
+        return (state, observation), (gain, jnp.sum(over**2), jnp.any(size >= 1))
+
+    def experiment(key: PRNGKeyArray) -> Batch:
+        (state, _), (gains, excess, is_over) = jax.lax.scan(
+            advance, env.reset(key), None, length=env.layout.num_steps
+        )
+        final = env.objective.final(env.plant, state.memory, state.params)
+        is_violation = jnp.any(is_over) | ~state.is_finite
+        return Batch(jnp.sum(gains) + final, jnp.mean(excess), is_violation)
+
+    return jax.vmap(experiment)(keys)
+
+
+class _Progress(eqx.Module):
+    """What changes from update to update."""
+
+    weights: Weights
+    adam: Any
+    penalty_weight: Float[Array, ""]
+
+
+def train(
+    env: Env,
+    settings: GradientSettings,
+    seed: int,
+    *,
+    on_look: Callable[[dict[str, float]], None] = lambda _: None,
+) -> Trained:
+    """Trains a policy; the same seed gives the same weights.
+
+    Args:
+        on_look: called with every row of the learning curve.
+
+    Raises:
+        ValueError: where gradients are no longer finite.
+    """
+    first, key = jax.random.split(jax.random.key(seed))
+    weights = _first_weights(env, settings, first)
+    penalty_weight = jnp.asarray(settings.penalty_weight, float)
+    now = _Progress(weights, _optimiser(settings).init(weights), penalty_weight)
+    watch_keys = jax.random.split(jax.random.key(WATCH_SEED), settings.watch_episodes)
+    curve = []
+    for i in range(settings.num_updates + 1):
+        if i % settings.watch_every == 0 or i == settings.num_updates:
+            _require_finite(now, settings, i)
+            curve.append({"updates": float(i), **_look(env, settings, now, watch_keys)})
+            on_look(curve[-1])
+        if i < settings.num_updates:
+            now = _update(env, settings, now, jax.random.fold_in(key, i))
+    return Trained(jax.tree.map(np.asarray, now.weights), curve)
+
+
+def _optimiser(settings: GradientSettings) -> optax.GradientTransformation:
+    """Adam on clipped gradients; one that is not finite is left out and counted."""
+    rate = optax.cosine_decay_schedule(settings.learning_rate, settings.num_updates)
+    adam = optax.chain(optax.clip_by_global_norm(settings.max_grad_norm), optax.adam(rate))
+    return optax.apply_if_finite(adam, max_consecutive_errors=settings.num_updates)
+
+
+def _first_weights(env: Env, settings: GradientSettings, key: PRNGKeyArray) -> Weights:
+    """Glorot's (X. Glorot, Y. Bengio, 2010), those of the last layer made small."""
+    widths = [env.layout.size, *settings.hidden, len(env.layout.input_half)]
+    gains = [1.0] * len(settings.hidden) + [settings.last_gain]
+    keys = jax.random.split(key, len(gains))
+    glorot = jax.nn.initializers.glorot_uniform()
+    return tuple(
+        (gain * glorot(own, (after, before), jnp.float32), jnp.zeros(after, jnp.float32))
+        for own, gain, before, after in zip(keys, gains, widths[:-1], widths[1:], strict=True)
+    )
+
+
+@eqx.filter_jit
+def _update(env: Env, settings: GradientSettings, now: _Progress, key: PRNGKeyArray) -> _Progress:
+    keys = jax.random.split(key, settings.num_plants)
+
+    def loss(weights: Weights) -> tuple[Array, Array]:
+        batch = experiments(env, weights, keys, settings.margin)
+        cost = now.penalty_weight * jnp.mean(batch.excess) - jnp.mean(batch.worth)
+        return cost, jnp.any(batch.is_violation)
+
+    (cost, is_unsafe), gradient = jax.value_and_grad(loss, has_aux=True)(now.weights)
+    gradient = jax.tree.map(lambda leaf: jnp.where(jnp.isfinite(cost), leaf, jnp.nan), gradient)
+    step, adam = _optimiser(settings).update(gradient, now.adam, now.weights)
+    change = jnp.where(is_unsafe, settings.penalty_growth, -settings.penalty_decay)
+    weights = optax.apply_updates(now.weights, step)
+    return _Progress(weights, adam, now.penalty_weight * jnp.exp(change))
+
+
+def _require_finite(now: _Progress, settings: GradientSettings, num_updates: int) -> None:
+    in_a_row = int(now.adam.notfinite_count)
+    if in_a_row >= min(settings.watch_every, settings.num_updates) and num_updates:
+        raise ValueError(
+            f"the gradient was not finite in the last {in_a_row} updates: the plant or its "
+            "sensitivities grow without bound under this policy; give the plant a critical "
+            "level, a shorter experiment, or a smaller spread"
+        )
+
+
+def _look(
+    env: Env, settings: GradientSettings, now: _Progress, keys: Key[Array, " episode"]
+) -> dict[str, float]:
+    seen = experiments(env, now.weights, keys, settings.margin)
+    return {
+        "return": float(jnp.mean(seen.worth)),
+        "violation_rate": float(jnp.mean(seen.is_violation)),
+        "penalty_weight": float(now.penalty_weight),
+        "not_finite": float(now.adam.total_notfinite),
+    }

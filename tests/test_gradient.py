@@ -1,0 +1,184 @@
+"""Training by gradient: the derivative of a whole experiment, safety, and failures."""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxtyping import Array
+
+from excite.description import Input, Output, Parameter, PlantDescription, State
+from excite.env import Env
+from excite.estimation import ARX
+from excite.information import a_optimality, d_optimality, e_optimality, experiment_information
+from excite.objective import AbstractObjective, EstimationError, InformationGain, prior_sd_of
+from excite.plant import AbstractPlant, Aero2
+from excite.policy import Layout, Weights, forward, observe
+from excite.simulation import simulate
+from excite.training.gradient import GradientSettings, experiments, train
+
+ALL = (True, True, True)
+KEYS = jax.random.split(jax.random.key(1), 3)
+FEW = GradientSettings(num_updates=6, num_plants=4, watch_every=3, watch_episodes=4)
+
+
+def env_of(objective: AbstractObjective, plant: AbstractPlant | None = None, num_steps: int = 60):
+    plant = Aero2() if plant is None else plant
+    layout = Layout.of(plant.description, window=10, num_steps=num_steps)
+    scale = tuple(0.3 for _ in layout.output_scale)
+    return Env.of(
+        plant, objective=objective, layout=dataclasses.replace(layout, output_scale=scale)
+    )
+
+
+def weights_of(env: Env) -> Weights:
+    """A policy that is neither silent nor saturated."""
+    rng = np.random.default_rng(2)
+    first = 0.3 * rng.standard_normal((8, env.layout.size))
+    last = 0.3 * rng.standard_normal((1, 8))
+    layers = ((first, np.full(8, 0.1)), (last, np.full(1, 0.05)))
+    return tuple((jnp.asarray(m, jnp.float32), jnp.asarray(b, jnp.float32)) for m, b in layers)
+
+
+def run(env: Env, weights: Weights, key: jax.Array) -> tuple[Any, jax.Array]:
+    """The same experiment step by step: last state, and inputs."""
+    state, _ = env.reset(key)
+    inputs = []
+    for _ in range(env.layout.num_steps):
+        action = forward(jnp, weights, observe(jnp, env.layout, state.window, state.k))
+        inputs.append(action * jnp.asarray(env.layout.input_half))
+        state, _, _ = eqx.filter_jit(env.advance)(state, action)
+    return state, jnp.stack(inputs).astype(float)
+
+
+OBJECTIVES = {
+    "relative": EstimationError(ARX(), ALL),
+    "log": EstimationError(ARX(), ALL, [0.01, 0.004, 1.0], logarithmic=True),
+    "D": InformationGain(ALL, prior_sd_of(0.3), dense=False),
+    "D dense": InformationGain(ALL, prior_sd_of(0.3)),
+    "A": InformationGain(ALL, prior_sd_of(0.3), criterion="A", dense=False),
+    "E of two": InformationGain((True, True, False), prior_sd_of(0.3), criterion="E", dense=False),
+}
+
+
+@pytest.mark.parametrize("name", OBJECTIVES)
+def test_the_gradient_is_that_of_the_whole_experiment(name):
+    env = env_of(OBJECTIVES[name])
+    weights = weights_of(env)
+
+    def worth(last_bias: Array) -> Array:
+        changed = (weights[0], (weights[1][0], last_bias))
+        return jnp.mean(experiments(env, changed, KEYS, 0.9).worth)
+
+    # In double precision from the last layer on: no rounding of its change.
+    bias = jnp.full(1, 0.05)
+    gradient = jax.grad(worth)(bias)
+    h = 1e-4
+    difference = (worth(bias + h) - worth(bias - h)) / (2 * h)
+    assert abs(float(difference)) > 1e-3
+    np.testing.assert_allclose(gradient[0], difference, rtol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("criterion", "expected"),
+    [
+        ("D", d_optimality),
+        ("A", lambda m: -jnp.log(a_optimality(m))),
+        ("E", lambda m: jnp.log(e_optimality(m))),
+    ],
+)
+def test_the_worth_is_the_criterion_of_the_information(criterion, expected):
+    sd = prior_sd_of(0.3)
+    env = env_of(InformationGain(ALL, sd, criterion=criterion, dense=False))
+    weights = weights_of(env)
+    state, inputs = run(env, weights, KEYS[0])
+    prior = jnp.eye(3) / sd**2
+    information = experiment_information(env.plant, state.params, inputs) + prior
+    worth = experiments(env, weights, KEYS[:1], 0.9).worth[0]
+    np.testing.assert_allclose(worth, expected(information) - expected(prior), rtol=1e-6)
+
+
+def test_dense_and_terminal_information_are_worth_the_same():
+    dense, terminal = (env_of(OBJECTIVES[name]) for name in ("D dense", "D"))
+    weights = weights_of(dense)
+    both = [experiments(env, weights, KEYS, 0.9).worth for env in (dense, terminal)]
+    np.testing.assert_allclose(both[0], both[1], rtol=1e-9)
+
+
+def test_excess_counts_from_the_margin_to_the_critical_level():
+    env = env_of(OBJECTIVES["D"])
+    weights = weights_of(env)
+    state, inputs = run(env, weights, KEYS[0])
+    outputs = np.abs(simulate(env.plant, state.params, inputs)[1:, 0])
+    critical = env.plant.definition.outputs[0].critical_level
+    margin = 0.5 * float(outputs.max()) / critical  # so that some samples lie beyond
+    over = np.maximum(outputs / critical - margin, 0) / (1 - margin)
+    batch = experiments(env, weights, KEYS[:1], margin)
+    assert over.max() > 0
+    np.testing.assert_allclose(batch.excess[0], np.mean(over**2), rtol=1e-6)
+    assert not batch.is_violation[0]
+
+
+def test_training_learns_and_one_seed_gives_one_policy():
+    env = env_of(OBJECTIVES["D"])
+    settings = dataclasses.replace(FEW, num_updates=30, watch_every=10, last_gain=0.1)
+    first, again = train(env, settings, 0), train(env, settings, 0)
+    for a, b in zip(jax.tree.leaves(first.weights), jax.tree.leaves(again.weights), strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert [row["updates"] for row in first.curve] == [0, 10, 20, 30]
+    assert first.curve[-1]["return"] > first.curve[0]["return"] + 5
+    other = train(env, settings, 1)
+    assert not np.array_equal(first.weights[0][0], other.weights[0][0])
+
+
+def test_the_penalty_grows_while_plants_are_in_danger():
+    definition = Aero2.definition
+    pitch = dataclasses.replace(definition.outputs[0], warning_level=5e-5, critical_level=1e-4)
+    narrow = type(
+        "Narrow", (Aero2,), {"definition": dataclasses.replace(definition, outputs=(pitch,))}
+    )
+    rows = []
+    for plant in (Aero2(), narrow()):
+        env = env_of(OBJECTIVES["D"], plant)
+        rows.append(train(env, dataclasses.replace(FEW, last_gain=0.1), 0).curve[-1])
+    calm, dangerous = rows
+    assert calm["penalty_weight"] == pytest.approx(np.exp(-0.005 * 6))
+    assert dangerous["penalty_weight"] == pytest.approx(np.exp(0.05 * 6))
+
+
+class Runaway(AbstractPlant):
+    """x' = a x + u, so fast that its state soon overflows."""
+
+    definition = PlantDescription(
+        name="runaway",
+        states=(State("x", "m"),),
+        inputs=(Input("u", "m/s", -1.0, 1.0),),
+        outputs=(Output("x", "m", 1.0, noise_sd=0.1),),
+        parameters=(Parameter("a", "1/s", 200.0),),
+        dt=0.1,
+        band=(0.1, 2.0),
+    )
+
+    def derivative(self, state, input, params):
+        return params.a * state + input
+
+    def output(self, state, params):
+        return state
+
+
+def test_a_plant_that_runs_away_ends_in_a_sentence():
+    plant = Runaway()
+    env = env_of(InformationGain((True,), prior_sd_of(0.3), dense=False), plant, num_steps=200)
+    with pytest.raises(ValueError, match="gradient was not finite in the last 3 updates"):
+        train(env, FEW, 0)
+
+
+def test_updates_that_are_not_finite_are_counted_and_never_reach_the_weights():
+    plant = Runaway().changed(dt=0.034)  # some of its plants overflow, others do not
+    env = env_of(InformationGain((True,), prior_sd_of(0.3), dense=False), plant)
+    trained = train(env, dataclasses.replace(FEW, num_updates=12), 0)
+    assert 0 < trained.curve[-1]["not_finite"] < 12
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(trained.weights))
