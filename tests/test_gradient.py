@@ -1,6 +1,7 @@
 """Training by gradient: the derivative of a whole experiment, safety, and failures."""
 
 import dataclasses
+import math
 from typing import Any
 
 import equinox as eqx
@@ -18,6 +19,7 @@ from excite.objective import AbstractObjective, EstimationError, InformationGain
 from excite.plant import AbstractPlant, Aero2
 from excite.policy import Layout, Weights, forward, observe
 from excite.simulation import simulate
+from excite.training.base import Checkpoint
 from excite.training.gradient import GradientSettings, experiments, train
 
 ALL = (True, True, True)
@@ -128,7 +130,7 @@ def test_training_learns_and_one_seed_gives_one_policy():
     first, again = train(env, settings, 0), train(env, settings, 0)
     for a, b in zip(jax.tree.leaves(first.weights), jax.tree.leaves(again.weights), strict=True):
         np.testing.assert_array_equal(a, b)
-    assert [row["updates"] for row in first.curve] == [0, 10, 20, 30]
+    assert [row["steps"] for row in first.curve] == [0, 2400, 4800, 7200]  # 4 plants, 60 steps
     assert first.curve[-1]["return"] > first.curve[0]["return"] + 5
     other = train(env, settings, 1)
     assert not np.array_equal(first.weights[0][0], other.weights[0][0])
@@ -147,6 +149,32 @@ def test_the_penalty_grows_while_plants_are_in_danger():
     calm, dangerous = rows
     assert calm["penalty_weight"] == pytest.approx(np.exp(-0.005 * 6))
     assert dangerous["penalty_weight"] == pytest.approx(np.exp(0.05 * 6))
+
+
+def test_a_training_that_was_interrupted_ends_with_the_same_policy():
+    env, files = env_of(OBJECTIVES["D"]), []
+    whole = train(env, FEW, 0, on_boundary=lambda make, _: files.append(make().to_bytes()))
+    for at in (2, 3):  # between two looks, and at one
+        saved = Checkpoint.from_bytes(files[at], "checkpoint")
+        rest = train(env, FEW, 0, resume=saved)
+        assert rest.curve == whole.curve
+        for a, b in zip(jax.tree.leaves(whole.weights), jax.tree.leaves(rest.weights), strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "allowed"),
+    [
+        ("num_updates", 0, "at least 1"),
+        ("learning_rate", math.inf, "positive"),
+        ("penalty_decay", -0.1, "not be negative"),
+        ("margin", 1.0, r"\[0, 1\)"),
+        ("hidden", (), "widths"),
+    ],
+)
+def test_settings_that_are_not_allowed_are_refused(name, value, allowed):
+    with pytest.raises(ValueError, match=f"{name}.*{allowed}"):
+        GradientSettings(**{name: value})
 
 
 class Runaway(AbstractPlant):

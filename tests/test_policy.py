@@ -439,6 +439,27 @@ def test_an_observation_is_equation_2_and_the_same_in_numpy_and_jax(plant):
         np.testing.assert_array_equal(seen[np], seen[jnp])
 
 
+def test_clocks_follow_equation_2_and_travel_with_the_policy():
+    layout = dataclasses.replace(LAYOUT, clocks=(0.02, 0.5))
+    for xp in (np, jnp):
+        plain = observe(xp, LAYOUT, empty_window(xp, LAYOUT), 7)
+        seen = observe(xp, layout, empty_window(xp, layout), 7)
+        phase = 2 * np.pi * 7 * np.array([0.02, 0.5])
+        np.testing.assert_array_equal(seen[: LAYOUT.size], plain)
+        expected = [*np.sin(phase), *np.cos(phase)]
+        np.testing.assert_allclose(seen[LAYOUT.size :], expected, atol=1e-6)
+        assert seen.shape == (layout.size,)
+    policy = policy_of(layout=layout)
+    assert Policy.from_bytes(policy.to_bytes()).layout == layout
+
+
+@pytest.mark.parametrize("clocks", [(0.6,), (0.0,), (-0.1,), (np.nan,)])
+def test_a_clock_that_cannot_be_is_refused(clocks):
+    policy = policy_of(layout=dataclasses.replace(LAYOUT, clocks=clocks))
+    with pytest.raises(ValueError, match="clocks of a layout are above 0 and at most half"):
+        Policy.from_bytes(policy.to_bytes())
+
+
 def test_the_paper_observes_161_numbers():
     layout = Layout.of(AERO2)
     assert (layout.window, layout.num_steps, layout.size) == (80, 500, 161)

@@ -136,7 +136,7 @@ def run() -> tuple[Any, dict[int, bytes]]:
         checkpoint = make()
         files[checkpoint.state["num_steps"]] = checkpoint.to_bytes()
 
-    return train(aero2(), TINY, 3, on_rollout=keep), files
+    return train(aero2(), TINY, 3, on_boundary=keep), files
 
 
 def test_training_twice_gives_the_same_weights(run):
@@ -166,7 +166,7 @@ def test_an_episode_goes_on_across_rollouts_and_interruptions():
     )  # T is 30
     files = []
     whole = train(
-        aero2(), settings, 0, on_rollout=lambda make, row: files.append(make().to_bytes())
+        aero2(), settings, 0, on_boundary=lambda make, row: files.append(make().to_bytes())
     )
     half = Checkpoint.from_bytes(files[2], "checkpoint")
     assert same(train(aero2(), settings, 0, resume=half).weights, whole.weights)
@@ -216,7 +216,7 @@ def test_the_policy_is_the_average_of_the_last_ones():
         tensors = make().tensors
         made.append([tensors[f"policy.mlp_extractor.policy_net.{i}.weight"] for i in (0, 2)])
 
-    averaged = train(aero2(), settings, 3, on_rollout=keep)
+    averaged = train(aero2(), settings, 3, on_boundary=keep)
     assert len(made) == 5
     for i in (0, 1):
         expected = np.mean([m[i] for m in made[2:]], axis=0)

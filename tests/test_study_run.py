@@ -329,6 +329,64 @@ def test_a_full_disk_is_a_sentence_and_loses_nothing(run, tmp_path):
 # Refusals
 
 
+TRAIN = (
+    *(
+        "train",
+        "aero2",
+        "--steps",
+        40,
+        "--window",
+        5,
+        "--episodes",
+        4,
+        "--output-scale",
+        "pitch=0.3",
+    ),
+    *("--output-scale", "pitch=0.3"),
+    *("--set", "num_updates=4,num_plants=2,watch_every=2,watch_episodes=2"),
+)
+
+
+@pytest.mark.parametrize(
+    "choice", [(), ("--objective", "log", "--goal", "J_p=0.01", "--target", "J_p", "--clock", 0.5)]
+)
+def test_one_command_trains_a_policy_by_gradient(choice, tmp_path):
+    done = excite(*TRAIN, *choice, "--out", tmp_path / "mine", "--json")
+    assert done.returncode == 0, done.stderr
+    rows = json.loads(done.stdout)["rows"]
+    name = "gradient(log)" if choice else "gradient(D)"
+    assert [(r["method"], r["estimator"]) for r in rows] == [
+        (m, e) for m in ("chirp", name) for e in ("nls", "arx-rls")
+    ]
+    policy = read_policy(seed_folder(tmp_path / "mine", name, 0) / "policy.safetensors")
+    assert policy.layout.clocks == ((0.05,) if choice else ())
+    assert policy.provenance["method"] == "gradient"
+    assert policy.provenance["training"]["num_updates"] == 4
+    assert policy.provenance["targets"] == (["J_p"] if choice else ["J_p", "K_pu", "D_p"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--objective", "X"), "'X' is not one of 'D', 'A', 'E', 'relative', 'log'"),
+        (("--target", "J_q"), "no parameter 'J_q'"),
+        (("--goal", "J_p=-1", "--objective", "log"), "goals.J_p"),
+        (("--goal", "J_p=1"), "the reward 'information' has no 'goals'"),
+        (("--clock", 6), "at most 5 Hz"),
+        (("--set", "num_update=3"), "num_updates"),
+        (("--set", "margin=1"), "margin must lie in [0, 1)"),
+        (("--output-scale", "yaw=1"), "yaw"),
+        (("--method", "ppo", "--set", "batch_size=7"), "batch_size 7 does not divide"),
+    ],
+)
+def test_an_option_of_training_that_is_not_allowed_is_a_sentence(arguments, words, tmp_path):
+    done = excite("train", "aero2", *arguments, "--out", tmp_path / "mine")
+    assert done.returncode == 2
+    assert words in done.stderr
+    assert done.stderr.count("\n") <= 4  # click adds its usage
+    assert not (tmp_path / "mine").exists()
+
+
 def test_another_study_in_the_folder_is_refused(run, tmp_path):
     other = write_study(tmp_path, TINY.replace("total_steps = 1920", "total_steps = 2400"))
     done = excite("study", "run", other, "--out", run)

@@ -48,7 +48,7 @@ def _spaces(env: Env) -> tuple[spaces.Box, spaces.Box]:
     high = np.ones(layout.size, np.float32)
     high[:num_outputs] = largest
     low = -high
-    low[-1] = 0.0  # k / T
+    low[layout.size - 1 - 2 * len(layout.clocks)] = 0.0  # k / T
     observation = spaces.Box(low, high, dtype=np.float32)
     return observation, spaces.Box(-1.0, 1.0, (len(layout.input_half),), np.float32)
 

@@ -42,12 +42,14 @@ class Layout:
     The last `window` measurements over `output_scale`, the last `window` inputs over the
     input limits, oldest first, and k / num_steps. The newest input is the one of the step
     before: the next is what the policy is asked for. Samples before the first are zero.
+    Beyond Eq. 2, sine and cosine of clocks that run with k may follow.
 
     Attributes:
         window: samples remembered.
         num_steps: T, steps of the experiment the policy was made for.
         output_scale: y_max of each output, in its unit.
         input_middle, input_half: middle and half width of each input's limits.
+        clocks: frequencies of the clocks, in cycles a step, at most one half.
     """
 
     window: int
@@ -55,6 +57,7 @@ class Layout:
     output_scale: tuple[float, ...]
     input_middle: tuple[float, ...]
     input_half: tuple[float, ...]
+    clocks: tuple[float, ...] = ()
 
     @classmethod
     def of(cls, description: PlantDescription, window: int = 80, num_steps: int = 500) -> Layout:
@@ -78,7 +81,8 @@ class Layout:
     @property
     def size(self) -> int:
         """Numbers in an observation."""
-        return self.window * (len(self.output_scale) + len(self.input_half)) + 1
+        width = len(self.output_scale) + len(self.input_half)
+        return self.window * width + 1 + 2 * len(self.clocks)
 
 
 class Window(NamedTuple):
@@ -109,9 +113,12 @@ def with_input(xp: Any, layout: Layout, window: Window, input: AnyArray) -> Wind
 
 
 def observe(xp: Any, layout: Layout, window: Window, k: AnyArray) -> AnyArray:
-    """Observation of step k, in single precision: outputs, inputs, k / T."""
+    """Observation of step k, in single precision: outputs, inputs, k / T, sines, cosines."""
     progress = xp.reshape(xp.asarray(k / layout.num_steps), (1,))
     parts = [xp.ravel(window.outputs), xp.ravel(window.inputs), progress]
+    if layout.clocks:
+        phase = 2 * math.pi * k * xp.asarray(layout.clocks)
+        parts += [xp.sin(phase), xp.cos(phase)]
     return xp.concatenate(parts).astype(xp.float32)
 
 
@@ -225,10 +232,13 @@ def _check_layout(layout: Layout, plant: PlantDescription) -> None:
     numbers = (*layout.output_scale, *layout.input_middle, *layout.input_half)
     if not all(type(n) is int and n < _MAX_COUNT for n in (layout.window, layout.num_steps)):
         raise ValueError("window and num_steps of a layout are whole numbers")
+    free = {"output_scale": layout.output_scale, "clocks": layout.clocks}
     if layout != dataclasses.replace(
-        Layout.of(plant, layout.window, layout.num_steps), output_scale=layout.output_scale
+        Layout.of(plant, layout.window, layout.num_steps), **free
     ) or not all(math.isfinite(n) for n in numbers):
         raise ValueError("the observation layout does not belong to the policy's plant")
+    if not all(0 < n <= 0.5 for n in layout.clocks):
+        raise ValueError("the clocks of a layout are above 0 and at most half a cycle a step")
     if len(layout.output_scale) != len(plant.outputs) or min(layout.output_scale) <= 0:
         raise ValueError("the observation layout does not belong to the policy's plant")
 

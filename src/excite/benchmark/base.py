@@ -294,9 +294,15 @@ def seed_folder(folder: Path, agent: str, seed: int) -> Path:
     return folder / "seeds" / folder_word(agent) / str(seed)
 
 
+def agent_settings(study: Study, plant: AbstractPlant, agent: str) -> dict[str, Any]:
+    """All that decides what a seed of an agent becomes but the plant, JSON-ready."""
+    own = study.agent(agent).settings(plant)
+    return {**own, "spread": study.spread, "num_steps": study.num_steps}
+
+
 def fingerprint(study: Study, plant: AbstractPlant, agent: str) -> str:
-    """SHA-256 of all that decides what a seed of an agent becomes."""
-    settings = {**study.agent_settings(plant, agent), "plant": plant.description.hash}
+    """SHA-256 of those settings and the plant's hash."""
+    settings = {**agent_settings(study, plant, agent), "plant": plant.description.hash}
     return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
 
 

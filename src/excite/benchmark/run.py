@@ -211,7 +211,8 @@ def _live(study: Study, target: _Target, folder: Path) -> tuple[float, str]:
         return 1.0, ""
     try:  # it is there to be looked at, and may be anything
         row = read_json(place / "progress.json")
-        return row["steps"] / study.build_training(agent).total_steps, _looks(agent, seed, row)
+        total = study.agent(agent).total_steps(study.num_steps)
+        return row["steps"] / total, _looks(agent, seed, row)
     except (ValueError, KeyError, TypeError, AttributeError):
         return 0.0, ""
 

@@ -8,6 +8,7 @@ seed repeated gives the same result.
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import os
 import time
 from collections.abc import Callable, Mapping
@@ -17,14 +18,14 @@ from typing import Any
 import numpy as np
 
 from .. import __version__
+from ..env import Env
 from ..excitation import PolicyExcitation
 from ..files import write_bytes, write_json
 from ..plant import AbstractPlant
 from ..policy import Policy
-from ..study import Study
-from ..training.base import Checkpoint
-from ..training.ppo import train
-from .base import evaluate_method, fingerprint, unpacked
+from ..study import Agent, Study
+from ..training.base import Checkpoint, Trained
+from .base import agent_settings, evaluate_method, fingerprint, unpacked
 
 CHECKPOINT_SECONDS = float(os.environ.get("EXCITE_CHECKPOINT_SECONDS", "20"))
 """Least time between two checkpoints of a seed."""
@@ -51,22 +52,15 @@ def seed_task(
     with unpacked(study, plant) as (chosen, built):
         mark = fingerprint(chosen, built, agent)
         keeper = _Keeper(Path(folder) if folder and Path(folder).is_dir() else None, mark)
-        env, settings = chosen.build_env(built, agent), chosen.build_training(agent)
-        trained = train(
-            env,
-            settings,
-            seed,
-            resume=keeper.saved(),
-            on_rollout=keeper.on_rollout,
-            log_folder=keeper.log_folder,
-        )
+        env = chosen.agent(agent).env(built, chosen.spread, chosen.num_steps)
+        trained = _trained(env, chosen.agent(agent), seed, keeper)
         seconds = keeper.seconds()
         provenance = {
             "excite": __version__,
             "study": chosen.name,
             "agent": agent,
             "seed": seed,
-            **chosen.agent_settings(built, agent),
+            **agent_settings(chosen, built, agent),
         }
         policy = Policy(built.description, env.layout, trained.weights, provenance)
         metrics = {
@@ -79,6 +73,13 @@ def seed_task(
             "fingerprint": mark,
         }
         return {"policy": policy.to_bytes(), "curve": trained.curve, "metrics": metrics}
+
+
+def _trained(env: Env, agent: Agent, seed: int, keeper: _Keeper) -> Trained:
+    """By name, because the libraries of one trainer come with an extra."""
+    own = {"log_folder": keeper.log_folder} if agent.method == "ppo" else {}
+    train = importlib.import_module(f"excite.training.{agent.method}").train
+    return train(env, agent.training, seed, resume=keeper.saved(), on_boundary=keeper.keep, **own)
 
 
 def _evaluated(study: Study, plant: AbstractPlant, agent: str, policy: Policy) -> dict[str, Any]:
@@ -120,10 +121,8 @@ class _Keeper:
             raise ValueError(f"{error}{hint}") from None
         return checkpoint
 
-    def on_rollout(
-        self, checkpoint: Callable[[], Checkpoint], row: dict[str, float] | None
-    ) -> None:
-        """At every rollout boundary."""
+    def keep(self, checkpoint: Callable[[], Checkpoint], row: dict[str, float] | None) -> None:
+        """At every boundary."""
         if self.folder is None or self.path is None:
             return
         if row is not None:

@@ -21,6 +21,7 @@ from .information import information
 from .plants import plants
 from .simulate import simulate
 from .study import study
+from .train import train
 
 _DEBUG = "--debug"
 
@@ -33,7 +34,7 @@ def cli(debug: bool) -> None:
     del debug  # read from the arguments in `main`, where errors arrive
 
 
-for command in (plants, simulate, information, identify, benchmark, study, doctor):
+for command in (plants, simulate, information, identify, train, benchmark, study, doctor):
     cli.add_command(command)
 
 

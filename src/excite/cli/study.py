@@ -55,11 +55,24 @@ def run(
 
     Interrupted at any moment, the same command goes on where it was.
     """
-    from ..benchmark.run import run_study
     from ..study import read_study
 
     chosen = read_study(study_file)
-    if engine == "local" and chosen.agents:
+    run_study_here(chosen, out, as_json, engine, address, workers)
+
+
+def run_study_here(
+    chosen: Any,
+    out: Path,
+    as_json: bool,
+    engine: str = "local",
+    address: str | None = None,
+    workers: int | None = None,
+) -> None:
+    """Runs a study, writes and shows its table; shared with `train`."""
+    from ..benchmark.run import run_study
+
+    if engine == "local" and any(agent.method == "ppo" for agent in chosen.agents.values()):
         _require_trainer()
     machine = _engine(engine, address, workers)
 

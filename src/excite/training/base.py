@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray
 
+from ..description import names_of
 from ..env import Env
 from ..policy import Weights, forward, tensors_from_bytes, tensors_to_bytes
 
@@ -135,6 +136,11 @@ class Trained:
     curve: list[dict[str, float]]
 
 
+OnBoundary: TypeAlias = Callable[[Callable[[], Checkpoint], dict[str, float] | None], None]
+"""Called where a training can be interrupted, with a function that makes a checkpoint, and
+the newest row of the learning curve, if there is one."""
+
+
 class Watched(eqx.Module):
     """Episodes of a policy without exploration noise; the leading axis is the episode.
 
@@ -172,3 +178,16 @@ def watch(env: Env, weights: Weights, keys: Key[Array, " episode"]) -> Watched:
         return Watched(jnp.sum(rewards), errors[-1], violations[-1], rms)
 
     return jax.vmap(episode)(keys)
+
+
+def look(env: Env, weights: Weights, num_episodes: int) -> dict[str, float]:
+    """What a learning curve shows of the deterministic policy, in the validation episodes."""
+    seen = watch(env, weights, jax.random.split(jax.random.key(WATCH_SEED), num_episodes))
+    names = names_of(env.plant.definition.parameters)
+    errors = np.asarray(seen.relative_errors).mean(axis=0)
+    return {
+        "return": float(np.mean(seen.total_reward)),
+        "violation_rate": float(np.mean(seen.is_violation)),
+        "rms_action": float(np.sqrt(np.mean(np.asarray(seen.rms_action) ** 2))),
+        **{f"relative_error_{n}": float(e) for n, e in zip(names, errors, strict=True)},
+    }

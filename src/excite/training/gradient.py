@@ -9,7 +9,8 @@ and slowly decays otherwise.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import functools
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,7 +24,7 @@ from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray
 from ..env import Env
 from ..policy import Weights, forward, observe
 from ..safety import watched_levels
-from .base import WATCH_SEED, Trained
+from .base import Checkpoint, OnBoundary, Trained, look
 
 
 @dataclass(frozen=True)
@@ -34,13 +35,13 @@ class GradientSettings:
         num_updates: steps of Adam.
         num_plants: plants of each step.
         learning_rate: of Adam, decaying to zero by a cosine.
-        max_grad_norm: the gradient is scaled down to this norm.
+        max_grad_norm: a longer gradient is scaled down to this norm.
         hidden: widths of the hidden layers, tanh.
         last_gain: scale of the last layer's first weights; a loud first policy runs away.
         margin: the penalty begins at this fraction of a critical level.
         penalty_weight: of the penalty, at the beginning.
-        penalty_growth, penalty_decay: its change in the logarithm after a batch with a
-            violation, and after one without.
+        penalty_growth, penalty_decay: what is added to its logarithm after a batch with a
+            violation, and taken away after one without.
         watch_every: updates between two looks at the policy.
         watch_episodes: episodes of such a look.
     """
@@ -57,6 +58,22 @@ class GradientSettings:
     penalty_decay: float = 0.005
     watch_every: int = 50
     watch_episodes: int = 100
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for a value that is not allowed."""
+        for name in ("num_updates", "num_plants", "watch_every", "watch_episodes"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1: got {getattr(self, name)}")
+        for name in ("learning_rate", "max_grad_norm", "last_gain", "penalty_weight"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must be positive: got {getattr(self, name):g}")
+        for name in ("penalty_growth", "penalty_decay"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must not be negative: got {getattr(self, name):g}")
+        if not 0 <= self.margin < 1:
+            raise ValueError(f"margin must lie in [0, 1): got {self.margin:g}")
+        if not self.hidden or min(self.hidden) < 1:
+            raise ValueError(f"hidden needs widths of at least 1: got {list(self.hidden)}")
 
 
 class Batch(eqx.Module):
@@ -118,12 +135,14 @@ def train(
     settings: GradientSettings,
     seed: int,
     *,
-    on_look: Callable[[dict[str, float]], None] = lambda _: None,
+    resume: Checkpoint | None = None,
+    on_boundary: OnBoundary = lambda *_: None,
 ) -> Trained:
-    """Trains a policy; the same seed gives the same weights.
+    """Trains a policy; the same seed gives the same weights, interrupted or not.
 
     Args:
-        on_look: called with every row of the learning curve.
+        resume: where to continue.
+        on_boundary: called after every update.
 
     Raises:
         ValueError: where gradients are no longer finite.
@@ -132,13 +151,17 @@ def train(
     weights = _first_weights(env, settings, first)
     penalty_weight = jnp.asarray(settings.penalty_weight, float)
     now = _Progress(weights, _optimiser(settings).init(weights), penalty_weight)
-    watch_keys = jax.random.split(jax.random.key(WATCH_SEED), settings.watch_episodes)
-    curve = []
-    for i in range(settings.num_updates + 1):
-        if i % settings.watch_every == 0 or i == settings.num_updates:
+    start, curve = 0, []
+    if resume is not None:
+        now, start, curve = _restored(now, resume)
+    for i in range(start, settings.num_updates + 1):
+        row, steps = None, float(i * settings.num_plants * env.layout.num_steps)
+        is_due = i % settings.watch_every == 0 or i == settings.num_updates
+        if is_due and (not curve or curve[-1]["steps"] < steps):  # not twice after a resume
             _require_finite(now, settings, i)
-            curve.append({"updates": float(i), **_look(env, settings, now, watch_keys)})
-            on_look(curve[-1])
+            row = {"steps": steps, **look(env, now.weights, settings.watch_episodes), **_state(now)}
+            curve.append(row)
+        on_boundary(functools.partial(_checkpoint, now, i, steps, curve), row)
         if i < settings.num_updates:
             now = _update(env, settings, now, jax.random.fold_in(key, i))
     return Trained(jax.tree.map(np.asarray, now.weights), curve)
@@ -190,13 +213,26 @@ def _require_finite(now: _Progress, settings: GradientSettings, num_updates: int
         )
 
 
-def _look(
-    env: Env, settings: GradientSettings, now: _Progress, keys: Key[Array, " episode"]
-) -> dict[str, float]:
-    seen = experiments(env, now.weights, keys, settings.margin)
+def _state(now: _Progress) -> dict[str, float]:
     return {
-        "return": float(jnp.mean(seen.worth)),
-        "violation_rate": float(jnp.mean(seen.is_violation)),
         "penalty_weight": float(now.penalty_weight),
         "not_finite": float(now.adam.total_notfinite),
     }
+
+
+def _checkpoint(
+    now: _Progress, num_updates: int, num_steps: float, curve: list[dict[str, float]]
+) -> Checkpoint:
+    tensors = {f"leaf.{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(now))}
+    state = {"num_updates": num_updates, "num_steps": num_steps, "curve": list(curve)}
+    return Checkpoint(tensors, state)
+
+
+def _restored(first: _Progress, saved: Checkpoint) -> tuple[_Progress, int, list[dict[str, float]]]:
+    """Progress, the update that comes next, and the curve before it."""
+    old, structure = jax.tree.flatten(first)
+    leaves = [  # a file has no scalars
+        jnp.asarray(saved.tensors[f"leaf.{i}"], x.dtype).reshape(x.shape) for i, x in enumerate(old)
+    ]
+    now = jax.tree.unflatten(structure, leaves)
+    return now, saved.state["num_updates"], list(saved.state["curve"])

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -21,11 +20,10 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-from ..description import names_of
 from ..env import Env
 from ..gymnasium_env import ExperimentVectorEnv
 from ..policy import Weights
-from .base import WATCH_SEED, Checkpoint, PPOSettings, Trained, watch
+from .base import Checkpoint, OnBoundary, PPOSettings, Trained, look
 
 
 class BatchedVecEnv(VecEnv):
@@ -94,15 +92,14 @@ def train(
     seed: int,
     *,
     resume: Checkpoint | None = None,
-    on_rollout: Callable[[Callable[[], Checkpoint], dict[str, float] | None], None] | None = None,
+    on_boundary: OnBoundary = lambda *_: None,
     log_folder: str | None = None,
 ) -> Trained:
     """Trains a policy; the same seed gives the same weights, interrupted or not.
 
     Args:
         resume: where to continue.
-        on_rollout: called at every rollout boundary with a function that makes a
-            checkpoint, and the newest row of the learning curve, if there is one.
+        on_boundary: called at every rollout boundary.
         log_folder: for TensorBoard.
     """
     choices = {field.name: getattr(env, field.name) for field in dataclasses.fields(env)}
@@ -127,7 +124,7 @@ def train(
         seed=seed,
         device="cpu",
     )
-    watcher = _Watcher(env, settings, on_rollout)
+    watcher = _Watcher(env, settings, on_boundary)
     watcher.model = model
     if resume is not None:
         _restore(model, watcher, resume)
@@ -150,10 +147,9 @@ def policy_weights(model: PPO) -> Weights:
 class _Watcher(BaseCallback):
     """At every rollout boundary: anneals the noise, looks at the policy, offers a checkpoint."""
 
-    def __init__(self, env: Env, settings: PPOSettings, on_rollout: Any) -> None:
+    def __init__(self, env: Env, settings: PPOSettings, on_boundary: OnBoundary) -> None:
         super().__init__()
-        self.env, self.settings, self.on_rollout = env, settings, on_rollout
-        self.keys = jax.random.split(jax.random.key(WATCH_SEED), settings.watch_episodes)
+        self.env, self.settings, self.on_boundary = env, settings, on_boundary
         self.curve: list[dict[str, float]] = []
         self.num_averaged, self.averaged_at, self.average = 0, -1, ()
 
@@ -165,14 +161,12 @@ class _Watcher(BaseCallback):
             model.policy.log_std.requires_grad_(False).fill_(math.log(noise))
         self._add_to_average()
         row = self._look() if num_rollouts % self.settings.watch_every == 0 else None
-        if self.on_rollout is not None:
-            self.on_rollout(lambda: _checkpoint(model, self), row)
+        self.on_boundary(lambda: _checkpoint(model, self), row)
 
     def _on_training_end(self) -> None:
         self._add_to_average()
         row = self._look()
-        if self.on_rollout is not None:
-            self.on_rollout(lambda: _checkpoint(self.model, self), row)
+        self.on_boundary(lambda: _checkpoint(self.model, self), row)
 
     def _on_step(self) -> bool:
         return True
@@ -198,17 +192,11 @@ class _Watcher(BaseCallback):
         model: Any = self.model
         if self.curve and self.curve[-1]["steps"] == model.num_timesteps:
             return None
-        seen = watch(self.env, self.weights, self.keys)
-        names = names_of(self.env.plant.definition.parameters)
-        errors = np.asarray(seen.relative_errors).mean(axis=0)
         row = {
             "steps": float(model.num_timesteps),
-            "return": float(np.mean(seen.total_reward)),
+            **look(self.env, self.weights, self.settings.watch_episodes),
             "sampled_return": float(np.mean(model.env.last_returns)),
-            "violation_rate": float(np.mean(seen.is_violation)),
-            "rms_action": float(np.sqrt(np.mean(np.asarray(seen.rms_action) ** 2))),
             "noise_sd": float(model.policy.log_std.detach().exp().mean()),
-            **{f"relative_error_{n}": float(e) for n, e in zip(names, errors, strict=True)},
         }
         self.curve.append(row)
         for name, value in row.items():
