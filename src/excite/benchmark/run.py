@@ -95,7 +95,7 @@ def _require_same_study(
     own = json_ready(study.model_dump())
     # Agents may be added to a study, or left out; every seed says itself what it was.
     for key, value in own.items():
-        is_free = key in (*WORDS, "agents", "decision", "training", "seeds")
+        is_free = key in (*WORDS, "agents", "decision", "training", "gradient", "seeds")
         if not is_free and saved.get(key) != value and not (key == "plant" and ":" in value):
             raise ValueError(
                 f"{folder} holds another study: its {key!r} differs; choose another name"
