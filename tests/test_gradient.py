@@ -115,7 +115,7 @@ def test_excess_counts_from_the_margin_to_the_critical_level():
     weights = weights_of(env)
     state, inputs = run(env, weights, KEYS[0])
     outputs = np.abs(simulate(env.plant, state.params, inputs)[1:, 0])
-    critical = env.plant.definition.outputs[0].critical_level
+    critical = env.plant.definition.outputs[0].critical_level or 0.0
     margin = 0.5 * float(outputs.max()) / critical  # so that some samples lie beyond
     over = np.maximum(outputs / critical - margin, 0) / (1 - margin)
     batch = experiments(env, weights, KEYS[:1], margin)

@@ -139,7 +139,8 @@ def benchmark_figure(rows: Sequence[Mapping[str, Any]], title: str) -> matplotli
             bound = next(r for r in rows if r["method"] == method)["cramer_rao_percent"][name]
             label = "attainable (0.80 of the bound)" if m == 0 else None
             axis.hlines(0.798 * bound, m - 0.35, m + 0.35, color=GREY, lw=2, label=label)
-        axis.set_xticks(range(len(methods)), methods)
+        slant = {"rotation": 40, "ha": "right"} if len(methods) > 4 else {}  # or they overlap
+        axis.set_xticks(range(len(methods)), methods, **slant)
         axis.set(yscale="log", title=name)
     axes[0, 0].set(ylabel="mean relative error [%]")
     add_legend(figure, axes[0, 0])

@@ -199,7 +199,7 @@ def _update(env: Env, settings: GradientSettings, now: _Progress, key: PRNGKeyAr
     gradient = jax.tree.map(lambda leaf: jnp.where(jnp.isfinite(cost), leaf, jnp.nan), gradient)
     step, adam = _optimiser(settings).update(gradient, now.adam, now.weights)
     change = jnp.where(is_unsafe, settings.penalty_growth, -settings.penalty_decay)
-    weights = optax.apply_updates(now.weights, step)
+    weights: Any = optax.apply_updates(now.weights, step)
     return _Progress(weights, adam, now.penalty_weight * jnp.exp(change))
 
 
