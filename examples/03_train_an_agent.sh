@@ -3,5 +3,5 @@
 here=$(dirname "$0")
 excite study run "$here/first_agent.toml" --out first_agent
 excite study table first_agent
-excite simulate aero2 --excitation first_agent/seeds/RL_all/0/policy.safetensors --out learned.csv
+excite simulate aero2 --excitation first_agent/seeds/RL_all/0/policy.safetensors --out learned.csv --overwrite
 excite identify learned.csv --plant aero2

@@ -237,9 +237,11 @@ def test_an_agent_that_comes_back_with_other_settings_is_refused(run, tmp_path):
     without = TINY[:start] + TINY[end:]
     assert excite("study", "run", write_study(tmp_path, without), "--out", folder).returncode == 0
     other = TINY.replace("learning_rate = 1e-3", "learning_rate = 2e-3")
+    before = (folder / "study.json").read_bytes()
     done = excite("study", "run", write_study(tmp_path, other), "--out", folder)
     assert done.returncode == 2
     assert "other settings of 'RL(K_pu)'" in done.stderr
+    assert (folder / "study.json").read_bytes() == before
     done = excite("study", "run", write_study(tmp_path), "--out", folder)
     assert done.returncode == 0
     assert table_of(folder) == table_of(run)

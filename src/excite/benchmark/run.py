@@ -64,6 +64,8 @@ def opened(study: Study, folder: Path) -> Iterator[tuple[AbstractPlant, str | No
         mark = None if text is None else hashlib.sha256(text.encode()).hexdigest()
         if marker.is_file():
             _require_same_study(study, description.hash, mark, folder)
+            for target in _names(study).values():  # refused before anything is written
+                _is_finished(study, plant, target, folder)
         write_json(folder / "study.json", study.model_dump())
         write_json(
             marker,

@@ -82,18 +82,18 @@ def run_study_here(
     try:
         with progress_bar(chosen.name) as progress:
             failures = run_study(chosen, out, machine, progress, finished)
+        if failures:
+            reasons = "; ".join(f"{name}: {reason}" for name, reason in failures.items())
+            raise RunFailedError(
+                f"{len(failures)} tasks failed ({reasons}); what is finished is kept in {out}, "
+                "the same command tries the rest again"
+            )
+        _finish(chosen, out)
+        _show(out, as_json)
     except KeyboardInterrupt:
         kept = f"what is finished is kept in {out}, the same command goes on"
         click.echo(f"excite: interrupted; {kept}", err=True)
         sys.exit(130)
-    if failures:
-        reasons = "; ".join(f"{name}: {reason}" for name, reason in failures.items())
-        raise RunFailedError(
-            f"{len(failures)} tasks failed ({reasons}); what is finished is kept in {out}, "
-            "the same command tries the rest again"
-        )
-    _finish(chosen, out)
-    _show(out, as_json)
 
 
 @study.command()
