@@ -24,7 +24,7 @@ results: .venv/core ## the committed results, afresh (minutes in studies/README.
 	done
 
 agents: .venv/dev ## the trained agents of the studies, afresh (hours; goes on where it was interrupted)
-	for study in table1 paper; do \
+	for study in table1; do \
 	  $(BIN)/excite study run studies/$$study.toml --out runs/$$study || exit 1; \
 	done
 
