@@ -3,7 +3,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo test lint types results agents clean
+.PHONY: demo test lint types results agents policies clean
 
 demo: .venv/core ## the baseline rows of the paper's Table 1, with three estimators, in runs/baselines
 	$(BIN)/excite benchmark studies/baselines.toml --out runs/baselines --overwrite
@@ -19,14 +19,26 @@ types: .venv/dev
 	$(BIN)/basedpyright --pythonpath $(BIN)/python
 
 results: .venv/core ## the committed results, afresh (minutes in studies/README.md)
-	for study in baselines nls nls_quantised; do \
+	for study in baselines nls nls_quantised decay; do \
 	  $(BIN)/excite benchmark studies/$$study.toml --out results/$$study --overwrite || exit 1; \
 	done
 
 agents: .venv/dev ## the trained agents of the studies, afresh (hours; goes on where it was interrupted)
-	for study in table1; do \
+	for study in table1 paper frontier emps dc_motor cart_pole half amplitude nls_reward spread reward; do \
 	  $(BIN)/excite study run studies/$$study.toml --out runs/$$study || exit 1; \
 	done
+
+policies: ## what is shipped in src/excite/policies, from the results of the studies
+	cp results/frontier/seeds/gradient_D/0/policy.safetensors src/excite/policies/aero2.safetensors
+	cp results/frontier/seeds/gradient_goals/0/policy.safetensors src/excite/policies/aero2-goals.safetensors
+	cp results/frontier/seeds/gradient_D_p/0/policy.safetensors src/excite/policies/aero2-damping.safetensors
+	cp results/table1/seeds/RL_all/2/policy.safetensors src/excite/policies/aero2-ppo-all.safetensors
+	cp results/table1/seeds/RL_J_p/7/policy.safetensors src/excite/policies/aero2-ppo-J_p.safetensors
+	cp results/table1/seeds/RL_K_pu/1/policy.safetensors src/excite/policies/aero2-ppo-K_pu.safetensors
+	cp results/table1/seeds/RL_D_p/6/policy.safetensors src/excite/policies/aero2-ppo-D_p.safetensors
+	cp results/emps/seeds/gradient_D/0/policy.safetensors src/excite/policies/emps.safetensors
+	cp results/dc_motor/seeds/gradient_D/0/policy.safetensors src/excite/policies/dc_motor.safetensors
+	cp results/cart_pole/seeds/gradient_D/0/policy.safetensors src/excite/policies/cart_pole.safetensors
 
 .venv/core: pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed")'
@@ -35,7 +47,7 @@ agents: .venv/dev ## the trained agents of the studies, afresh (hours; goes on w
 	touch $@
 
 .venv/dev: .venv/core
-	$(INSTALL) --editable '.[dev,ppo,dask]'
+	$(INSTALL) --editable '.[dev,ppo,dask,tune,fmu,onnx]'
 	touch $@
 
 clean:

@@ -1,5 +1,6 @@
 # Train an agent, look at its table, play its policy on a simulated plant, identify from the record.
-# Needs the extra: pip install --constraint constraints.txt '.[ppo]'
+# Needs the extra: python -m pip install -e '.[ppo]'
+# After a minute of training the policy is far worse than the chirp in its table.
 here=$(dirname "$0")
 excite study run "$here/first_agent.toml" --out first_agent
 excite study table first_agent

@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 
 from excite.description import Constant, Input, Output, Parameter, PlantDescription, State
-from excite.excitation import PRBS, AbstractSignal, Chirp, Multisine, Random, Square
-from excite.plant import EMPS, AbstractPlant, Aero2, CartPole, DCMotor
+from excite.excitation import PRBS, AbstractShape, Chirp, Decay, Multisine, Random, Square
+from excite.plant import EMPS, AbstractPlant, Aero2, Aero2Detailed, Aero2Lag, CartPole, DCMotor
 
 
 class TwoMasses(AbstractPlant):
@@ -44,10 +44,19 @@ class TwoMasses(AbstractPlant):
 
 
 PLANTS: dict[str, AbstractPlant] = {
-    plant.definition.name: plant for plant in (Aero2(), CartPole(), DCMotor(), EMPS(), TwoMasses())
+    plant.definition.name: plant
+    for plant in (
+        Aero2(),
+        Aero2Lag(),
+        Aero2Detailed(),
+        CartPole(),
+        DCMotor(),
+        EMPS(),
+        TwoMasses(),
+    )
 }
 
-EXCITATIONS: dict[str, AbstractSignal] = {
+EXCITATIONS: dict[str, AbstractShape] = {
     "random": Random(),
     "random held": Random(hold=7),
     "random clipped": Random(amplitude=1e4),
@@ -61,4 +70,6 @@ EXCITATIONS: dict[str, AbstractSignal] = {
     "multisine": Multisine(),
     "multisine weak": Multisine(amplitude=0.3),
     "square": Square(),
+    "decay": Decay(),
+    "decay late": Decay(pump=0.8),
 }

@@ -26,11 +26,10 @@ class Cluster:
     def __init__(self, folder: Path, num_workers: int = 3) -> None:
         self.processes: list[subprocess.Popen] = []
         file = folder / "scheduler.json"
-        here = ("--no-dashboard", "--host", "127.0.0.1", "--scheduler-file", str(file))
-        self.start("scheduler", *here, "--port", "0")
-        options = ("--no-nanny", "--nthreads", "1", "--local-directory", str(folder))
+        self.here = ("--no-dashboard", "--host", "127.0.0.1", "--scheduler-file", str(file))
+        self.start("scheduler", *self.here, "--port", "0")
         for _ in range(num_workers):
-            self.start("worker", *here, *options)
+            self.start_worker()
 
         def address() -> str:
             return json.loads(file.read_text())["address"] if file.exists() else ""
@@ -39,6 +38,10 @@ class Cluster:
             self.close()
             pytest.fail("the scheduler does not start")
         self.address = address()
+
+    def start_worker(self) -> None:
+        options = ("--no-nanny", "--nthreads", "1", "--local-directory", self.here[-1] + ".d")
+        self.start("worker", *self.here, *options)
 
     def start(self, name: str, *options: str) -> None:
         """Dask's own command; it tells a lot that nobody asks for."""

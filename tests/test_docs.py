@@ -1,15 +1,20 @@
 """Commands, options, files and examples that the documentation shows exist and run."""
 
+import math
 import os
 import re
 import shutil
+import socket
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 
 import click
 import pytest
 
+import excite
 from excite.cli import cli
 from excite.names import ESTIMATORS, EXCITATIONS, PLANTS
 from excite.study import read_study
@@ -85,6 +90,61 @@ def test_the_quick_start_runs(tmp_path: Path):
     )
     assert run.returncode == 0, run.stderr
     assert "J_p" in run.stdout
+
+
+def test_a_policy_runs_on_a_rig_as_documented(tmp_path: Path):
+    """With NumPy alone, on a rig that does not move."""
+    page = (ROOT / "docs" / "learned-excitation.md").read_text()
+    [loop] = re.findall(r"```python\n(.*?)```", page, re.S)
+    trained = ROOT / "results" / "table1" / "seeds" / "RL_all" / "0" / "policy.safetensors"
+    shutil.copy(trained, tmp_path)
+    (tmp_path / "rig.py").write_text(
+        "import sys\n\nimport numpy as np\n\napplied = []\napply = applied.append\n\n\n"
+        f"def measure():\n    return np.zeros(1)\n\n\n{loop}\n"
+        "assert np.shape(applied) == (500, 1)\n"
+        "assert 1 < np.max(np.abs(applied)) <= 24\n"
+        "assert 'jax' not in sys.modules\n"
+    )
+    run = subprocess.run(
+        [sys.executable, "rig.py"], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert run.returncode == 0, run.stderr
+
+
+def controller(server: socket.socket) -> None:
+    """Answers every line, as the rig in docs/real-time.md expects; its pitch is a slow swing."""
+    start, (line, _) = time.monotonic(), server.accept()
+    with line:
+        while line.recv(64):
+            line.sendall(b"%.6f\n" % (0.2 * math.sin(time.monotonic() - start)))
+
+
+def test_a_rig_of_ones_own_is_short_and_runs_as_documented(tmp_path: Path):
+    page = (ROOT / "docs" / "real-time.md").read_text()
+    [rig] = re.findall(r"```python\n(.*?)```", page, re.S)
+    assert len(rig[rig.index("class ") :].splitlines()) <= 40
+    with socket.create_server(("localhost", 0)) as server:
+        (tmp_path / "seesaw.py").write_text(rig.replace("5000", str(server.getsockname()[1])))
+        threading.Thread(target=controller, args=(server,), daemon=True).start()
+        run = shell(
+            "excite run --rig seesaw.py:Seesaw --plant aero2 --steps 10 --out r.csv", tmp_path
+        )
+    # On a busy machine its deadlines may be lost; it is a rig all the same.
+    assert run.returncode == 0 or "deadlines" in run.stdout, run.stderr
+    assert (tmp_path / "r.csv").read_text().startswith("time,voltage,pitch,clock\n")
+
+
+def test_a_rigs_computer_needs_little_and_in_the_tested_versions():
+    needed = (ROOT / "requirements-rig.txt").read_text().splitlines()[1:]
+    assert {line.split("==")[0] for line in needed} == {"numpy", "safetensors", "click", "rich"}
+    assert set(needed) <= set((ROOT / "constraints.txt").read_text().splitlines())
+
+
+def test_the_floor_plan_has_every_room():
+    rooms = {p.stem for p in (ROOT / "src" / "excite").iterdir() if p.stem[0] != "_"}
+    told = re.findall(r"^    (\w+) +\S", excite.__doc__ or "", re.M)
+    assert set(told) == rooms
+    assert len(told) == len(rooms)
 
 
 def test_the_commands_before_an_experiment_run(tmp_path: Path):

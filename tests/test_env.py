@@ -16,14 +16,12 @@ from plain_env import PlainAero2Env
 
 from excite import safety
 from excite.description import Input, Output, Parameter, PlantDescription, State
-from excite.env import Env, EnvState, Transition, reset_batch, step_batch
-from excite.estimation import ARX
+from excite.env import Env, EnvState, Transition, default_objective, reset_batch, step_batch
 from excite.information import experiment_information
 from excite.objective import (
     EstimationError,
     InformationGain,
     Sample,
-    default_objective,
     target_mask,
 )
 from excite.plant import AbstractPlant, Aero2
@@ -229,15 +227,15 @@ def test_an_episode_that_begins_over_the_critical_level_is_a_violation():
 
 
 def estimation(**settings: Any) -> Env:
-    return short(AERO2, 12, objective=EstimationError(ARX(), **settings), penalty_weight=0)
+    return short(AERO2, 12, objective=EstimationError(**settings), penalty_weight=0)
 
 
 @pytest.mark.parametrize("targets", [ALL, (True, False, False), (False, True, True)])
 @pytest.mark.parametrize("goals", [None, (0.5, 2.0, 10.0)])
-@pytest.mark.parametrize("logarithmic", [False, True])
+@pytest.mark.parametrize("form", ["relative", "log"])
 @pytest.mark.parametrize("weight", [1.0, 2.5])
-def test_the_estimation_error_is_rewarded_at_the_end_only(targets, goals, logarithmic, weight):
-    env = estimation(targets=targets, goals=goals, logarithmic=logarithmic, weight=weight)
+def test_the_estimation_error_is_rewarded_at_the_end_only(targets, goals, form, weight):
+    env = estimation(targets=targets, goals=goals, form=form, weight=weight)
     state, _ = env.reset(KEY)
     errors = np.array([0.3, 40.0, 2.0])
     # The memory of an estimate with these errors: the coefficients of such a plant.
@@ -246,7 +244,7 @@ def test_the_estimation_error_is_rewarded_at_the_end_only(targets, goals, logari
     reward = env.objective.final(AERO2, memory, state.params)
     expected = 0.0
     for error, goal, target in zip(errors, goals or (1, 1, 1), targets, strict=True):
-        expected -= target * weight * (np.log(1 + error / goal) if logarithmic else error / goal)
+        expected -= target * weight * (np.log(1 + error / goal) if form == "log" else error / goal)
     assert float(reward) == pytest.approx(expected, rel=1e-6)
     sample = Sample(state.params, state.plant_state, jnp.ones(1), jnp.ones(1))
     assert env.objective.update(AERO2, memory, sample, jnp.asarray(3))[1] == 0
@@ -317,7 +315,7 @@ def test_the_default_objective_is_the_papers_where_the_plant_has_a_mapping(plant
 def test_the_estimation_error_needs_a_mapping(name):
     plant = PLANTS[name]
     targets = target_mask(plant.definition, None)
-    env = short(plant, objective=EstimationError(ARX(), targets))
+    env = short(plant, objective=EstimationError(targets))
     sentence = f"plant '{name}' has no mapping from ARX .* reward the information gained instead"
     with pytest.raises(ValueError, match=sentence):
         env.reset(KEY)

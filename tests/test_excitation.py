@@ -15,8 +15,10 @@ from excite.excitation import (
     PRBS,
     AbstractSignal,
     Chirp,
+    Decay,
     Multisine,
     PolicyExcitation,
+    PositionLoop,
     Random,
     Replay,
     Square,
@@ -60,7 +62,7 @@ def test_values_stay_within_the_input_limits(plant, excitation):
 @excitations
 @plants
 def test_values_stay_within_the_amplitude_around_the_middle_of_the_limits(plant, excitation):
-    amplitude = EXCITATIONS[excitation].amplitude  # pyright: ignore[reportAttributeAccessIssue]
+    amplitude = EXCITATIONS[excitation].amplitude
     for column, part in zip(of(plant, excitation).T, PLANTS[plant].definition.inputs, strict=True):
         largest = part.amplitude if amplitude is None else float(amplitude)
         distance = np.abs(column - (part.lower + part.upper) / 2).max()
@@ -372,3 +374,29 @@ def test_an_experiment_longer_than_the_policy_was_made_for_is_refused():
     excitation = PolicyExcitation.of(policy_of(AERO2))
     with pytest.raises(ValueError, match="made for 30 steps; the experiment has 31"):
         run_episode(AERO2, AERO2.nominal, excitation, 31, KEY)
+
+
+def test_a_decay_is_a_square_wave_and_then_rests():
+    signal = of_aero2(Decay(amplitude=3.0, frequency=0.15, pump=0.4))
+    wave = of_aero2(Square(amplitude=3.0, frequency=0.15))
+    np.testing.assert_array_equal(signal[:80], wave[:80])
+    np.testing.assert_array_equal(signal[80:], 0.0)
+
+
+def test_a_position_loop_is_the_law_it_states():
+    loop = PositionLoop(Square(frequency=0.1), amplitude=0.2, gain=3.0, damping=0.5)
+    run = run_episode(AERO2, AERO2.nominal, loop, NUM_STEPS, KEY)
+    reference = 0.2 * np.asarray(Square(frequency=0.1).shape(AERO2, NUM_STEPS, KEY)[:, 0])
+    y = np.asarray(run.measured[:-1, 0])
+    rate = np.diff(y, prepend=y[0]) / 0.1
+    np.testing.assert_allclose(run.inputs[:, 0], 3.0 * (reference - y) - 0.5 * rate, atol=1e-9)
+
+
+def test_a_position_loop_keeps_a_plant_with_an_integrator_near_its_reference():
+    plant = PLANTS["emps"]
+    loop = PositionLoop(Chirp(start_frequency=0.1, stop_frequency=0.3), amplitude=0.05,
+                        gain=20_000.0, damping=1500.0)  # fmt: skip
+    run = run_episode(plant, plant.nominal, loop, 500, KEY)
+    assert 0.03 < np.abs(run.outputs[:, 0]).max() < 0.07
+    with pytest.raises(ValueError, match="drives one input; 'two_masses' has 2"):
+        PositionLoop(Chirp()).init(TWO, 10, KEY)

@@ -135,6 +135,17 @@ def test_a_step_before_the_first_reset_is_refused(env):
         env.step(env.action_space.sample())
 
 
+def test_a_step_after_the_last_is_refused_until_the_next_reset():
+    env = make(layout=SHORT).unwrapped
+    env.reset(seed=0)
+    action = np.zeros(1, np.float32)
+    assert [env.step(action)[2] for _ in range(3)] == [False, False, True]
+    with pytest.raises(gymnasium.error.ResetNeeded, match="no episode is running"):
+        env.step(action)
+    env.reset()
+    assert not env.step(action)[2]
+
+
 # ---------------------------------------------------------------------------- vectors
 
 
@@ -212,6 +223,28 @@ def test_choices_reach_the_process(kind):
         kind(spraed=0.05)
 
 
+@pytest.mark.parametrize("kind", [make, make_vec])
+@pytest.mark.parametrize(
+    ("choices", "sentence"),
+    [
+        ({"spread": -1}, r"spread must lie in \[0, 1\): got -1"),
+        ({"spread": 2.0}, r"spread must lie in \[0, 1\): got 2"),
+        ({"spread": np.nan}, "spread must lie in"),
+        ({"penalty_weight": -1}, r"penalty_weight must lie in \[0, inf\): got -1"),
+        ({"penalty_weight": np.inf}, r"penalty_weight must lie in \[0, inf\): got inf"),
+    ],
+)
+def test_a_choice_that_is_not_allowed_is_told_in_a_sentence(kind, choices, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        kind(**choices)
+
+
+@pytest.mark.parametrize("num_envs", [0, -1])
+def test_a_batch_needs_an_environment(num_envs):
+    with pytest.raises(ValueError, match=f"num_envs must be at least 1: got {num_envs}"):
+        make_vec(num_envs=num_envs)
+
+
 def test_a_smaller_spread_draws_closer_plants():
     env = make_vec(num_envs=64, spread=0.05)
     env.reset(seed=0)
@@ -265,3 +298,34 @@ def test_a_program_in_single_precision_sees_the_same_and_stays_in_it(tmp_path):
             rounding = 0.0 if i < 7 else 1e-6
             np.testing.assert_allclose(single[name], double[name], rtol=0, atol=rounding)
         assert np.any(single[name] != 0)
+
+
+FORKED = """
+import sys
+import gymnasium
+import numpy as np
+
+if __name__ == "__main__":
+    env = gymnasium.make_vec(
+        "excite.gymnasium_env:excite/Aero2-v0",
+        num_envs=1, vectorization_mode="async", vector_kwargs={"context": sys.argv[1]},
+    )
+    env.reset(seed=0)
+    print(env.step(np.zeros((1, 1), np.float32))[0].shape)
+    env.close()
+"""
+
+
+@pytest.mark.parametrize("context", ["fork", "spawn"])
+def test_a_process_for_each_environment_is_spawned_or_refused(context, tmp_path):
+    """A fork would hang in JAX."""
+    program = tmp_path / "program.py"  # spawned processes import it
+    program.write_text(FORKED)
+    done = subprocess.run(
+        [sys.executable, program, context], capture_output=True, text=True, timeout=300
+    )
+    if context == "spawn":
+        assert done.stdout == "(1, 161)\n", done.stderr
+    else:
+        assert done.returncode == 1
+        assert "JAX does not survive a fork" in done.stderr

@@ -180,6 +180,24 @@ def aero2_motion(c, p, x, u):
     return [x[1], 2 * p.K_pu * u[0] - torque / p.J_p]
 
 
+def aero2_lag_motion(c, p, x, u):
+    rate, acceleration = aero2_motion(c, p, x, [x[2]])
+    return [rate, acceleration, (u[0] - x[2]) / p.tau]
+
+
+def aero2_detailed_motion(c, p, x, u):
+    speed = x[2] / np.hypot(x[2], 0.1)
+    over = np.hypot(x[2], 0.1) - c.dead_zone
+    over = (over + np.hypot(over, 0.1)) / 2
+    curve = 7.2 * speed * over**2 / (7.2 - c.dead_zone) ** 2
+    thrust = (c.curvature * curve + (1 - c.curvature) * x[2]) * (1 + c.asymmetry * speed / 2)
+    rate, acceleration = aero2_motion(c, p, x, [thrust])
+    if abs(x[0]) > c.stop:
+        depth = abs(x[0]) - c.stop
+        acceleration -= 1000 * np.sign(x[0]) * depth + 20 * x[1] * min(100 * depth, 1)
+    return [rate, acceleration, (u[0] - x[2]) / c.tau]
+
+
 def cart_pole_motion(c, p, x, u):
     # Both equations of motion, solved for the accelerations as a linear system.
     _, a, v, w = x
@@ -206,6 +224,8 @@ def two_masses_motion(c, p, x, u):
 
 MOTION = {
     "aero2": aero2_motion,
+    "aero2_lag": aero2_lag_motion,
+    "aero2_detailed": aero2_detailed_motion,
     "cart_pole": cart_pole_motion,
     "dc_motor": dc_motor_motion,
     "emps": emps_motion,
@@ -252,6 +272,8 @@ def two_masses_energy(c, p, x):
 # Energy, and a start far from rest.
 ENERGY = {
     "aero2": (aero2_energy, [1.2, 0.5]),
+    "aero2_lag": (aero2_energy, [1.2, 0.5, 0.0]),
+    "aero2_detailed": (aero2_energy, [0.8, 0.1, 0.0]),
     "cart_pole": (cart_pole_energy, [0.0, 1.0, 0.5, -2.0]),
     "dc_motor": (dc_motor_energy, [150.0, -3.0]),
     "emps": (emps_energy, [0.0, 0.3]),

@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import json
 import pickle
+import re
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -252,7 +253,9 @@ HUGE = 10**400  # JSON has no largest number
     ("layout__output_scale", [0.0]), ("layout__output_scale", [-1.0]),
     ("layout__output_scale", [float("nan")]), ("layout__output_scale", [float("inf")]),
     ("layout__output_scale", [HUGE]), ("layout__output_scale", [None]),
-    ("layout__input_half", [1.0]), ("layout__input_half", [24.0, 24.0]),
+    ("layout__input_half", [24.1]), ("layout__input_half", [24.0, 24.0]),
+    ("layout__input_half", [0.0]), ("layout__input_half", [-1.0]),
+    ("layout__input_half", [float("nan")]),
     ("layout__input_half", []), ("layout__input_half", [None]), ("layout__input_half", 24.0),
     ("layout__input_middle", [1.0]), ("layout__input_middle", [float("nan")]),
     ("layout__window", 0), ("layout__window", -4), ("layout__window", 4.0),
@@ -498,6 +501,24 @@ def test_the_network_is_that_of_double_precision(hidden):
         np.testing.assert_allclose(action, np.clip(x, -1, 1), atol=1e-5)
         np.testing.assert_allclose(of_jax(observation), action, atol=1e-5)
     assert 0 < num_clipped < 60
+
+
+@pytest.mark.parametrize("spoilt", [np.nan, np.inf, -np.inf])
+def test_what_cannot_be_seen_is_answered_with_no_action(spoilt):
+    """As the environment takes an action that is not finite."""
+    policy = policy_of(hidden=())
+    observation = np.zeros(policy.layout.size, np.float32)
+    observation[0] = spoilt
+    action = policy(observation)
+    np.testing.assert_array_equal(action, [0.0])
+    assert action.dtype == np.float32
+    np.testing.assert_array_equal(forward(jnp, policy.weights, jnp.asarray(observation)), action)
+
+
+@pytest.mark.parametrize("shape", [(8,), (10,), (9, 1), ()])
+def test_an_observation_of_another_size_is_refused_with_both(shape):
+    with pytest.raises(ValueError, match=rf"has shape \(9,\); got {re.escape(str(shape))}$"):
+        POLICY(np.zeros(shape, np.float32))
 
 
 def test_actions_of_one_are_the_limits():

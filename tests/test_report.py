@@ -1,4 +1,5 @@
 import csv
+import dataclasses
 import io
 import math
 import subprocess
@@ -11,18 +12,21 @@ import pytest
 from catalogue import TwoMasses
 
 from excite.description import PlantDescription
-from excite.plant import EMPS, Aero2
+from excite.plant import EMPS, Aero2, CartPole
 from excite.records import Record
 from excite.report import (
     PLOT_ENDINGS,
+    agents_figure,
     all_cells,
     benchmark_csv,
     benchmark_figure,
     benchmark_markdown,
+    curves_figure,
     differences_markdown,
     digits_for,
     episode_figure,
     episodes_figure,
+    fitting_tables,
     footnotes,
     identification_figure,
     information_figure,
@@ -168,6 +172,22 @@ def test_a_published_number_stands_in_the_column_of_its_parameter():
     cells = all_cells(ROWS, {"random": part})[2]
     assert len(cells) == len(table_header(ROWS))
     assert cells[2:7] == ["–", "–", "–", "–", "3026 ± 2067"]
+
+
+def test_a_table_is_broken_between_columns_where_it_is_too_wide():
+    header, cells = table_header(ROWS), all_cells(ROWS, STUDY["reference"])
+    assert fitting_tables(header, cells, 1000) == [(header, cells)]
+    for width in (10, 60, 80, 120):
+        tables = fitting_tables(header, cells, width)
+        assert len(tables) > 1
+        assert [name for names, _ in tables for name in names[2:]] == header[2:]
+        for names, part in tables:
+            assert names[:2] == header[:2]
+            assert names[2] != "bound %"
+            lines = zip(names, *part, strict=True)
+            assert sum(3 + max(map(len, line)) for line in lines) <= max(width, 60)
+        for i, row in enumerate(cells):
+            assert [cell for _, part in tables for cell in part[i][2:]] == row[2:]
 
 
 def test_footnotes_tell_what_was_inferred_and_where_rows_were_published():
@@ -357,6 +377,82 @@ def test_figures_bear_what_has_no_number(tmp_path):
     result["fit_percent"]["pitch"] = math.nan
     save(identification_figure(AERO2, result, record, simulated), tmp_path / "c.svg")
     assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_a_method_without_an_error_says_why():
+    collapsed = [{**row("RL(all)", e, 1.0, failed=50), "viable_seeds": 0} for e in ("a", "nls")]
+    rows = [row("chirp", "a", 1.0), row("chirp", "nls", 1.0, failed=50), *collapsed]
+    for axis in benchmark_figure(rows, "A title").axes:
+        names = [label.get_text() for label in axis.get_xticklabels()]
+        assert names == ["chirp (nls failed)", "RL(all) (collapsed)"]
+
+
+def curve_of(d: PlantDescription, size: float = 1.0) -> dict[str, np.ndarray]:
+    falls = size * np.geomspace(1.0, 0.01, 5)
+    errors = {f"relative_error_{p.name}": falls for p in d.parameters}
+    return {"steps": 1e5 * np.arange(5.0), "violation_rate": np.zeros(5), **errors}
+
+
+def agents_of(d: PlantDescription, size: float = 1.0) -> matplotlib.figure.Figure:
+    """One agent moves the plant, another a tenth as far."""
+    record = dataclasses.replace(record_of(d), metadata={"seed": 3, "estimator": "arx-rls"})
+    small = dataclasses.replace(record, outputs=record.outputs / 10)
+    estimates = np.full((len(record.time), len(d.parameters)), size)
+    return agents_figure(d, {"big": (record, estimates), "small": (small, estimates)}, "A title")
+
+
+def pairs(figure: matplotlib.figure.Figure) -> np.ndarray:
+    return np.array(figure.axes, object).reshape(-1, 2)
+
+
+def test_learning_curves_say_seeds_and_bounds_and_share_their_scales():
+    d = TwoMasses.definition
+    curves = {"PPO": [curve_of(d)] * 2, "gradient_D": [curve_of(d, 1e-3)]}
+    axes = pairs(curves_figure(d, curves, "A", bounds=["gradient_D"]))
+    assert [axis.get_title() for axis in axes[0]] == ["PPO, 2 seeds", "gradient_D, 1 seed"]
+    for p, (error, bound) in zip(d.parameters, axes, strict=False):
+        assert error.get_ylabel() == f"{p.name} error [%]"
+        assert bound.get_ylabel() == f"{p.name} bound [%]"
+    assert all(left.get_ylim() == right.get_ylim() for left, right in axes)
+
+
+def test_an_agents_episode_says_seed_and_estimator_and_names_every_parameter():
+    d = CartPole.definition
+    figure = agents_of(d)
+    axes = pairs(figure)
+    assert [axis.get_title() for axis in axes[0]] == ["big, seed 3", "small, seed 3"]
+    assert axes[-1, 0].get_ylabel() == "arx-rls / true"
+    assert all(left.get_ylim() == right.get_ylim() for left, right in axes)
+    shown = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert [p.name for p in d.parameters] == [name for name in shown if "level" not in name]
+    colours = {line.get_color() for line in axes[-1, 0].get_lines()}
+    assert len(colours) == len(d.parameters) + 1
+
+
+def test_where_there_are_no_running_estimates_there_is_no_axis_for_them():
+    d = CartPole.definition
+    assert len(agents_of(d, math.nan).axes) == len(agents_of(d).axes) - 2
+    assert "true" not in "".join(labels_of(agents_of(d, math.nan)))
+
+
+@pytest.mark.parametrize("d", [AERO2, CartPole.definition], ids=lambda d: d.name)
+def test_nothing_of_a_figure_with_one_agent_lies_beyond_its_edge(d):
+    title = "A title that says everything there is to be said about what is seen below it"
+    alone = {"an agent with a long name": [curve_of(d)]}
+    one = {"an agent with a long name": (record_of(d), np.ones((60, len(d.parameters))))}
+    rows = [row("chirp", name, 1.0) for name in ("arx-rls", "arx-rls-wide", "nls")]
+    errors = [{**r, "relative_error_percent": {"J_p": r["relative_error_percent"]["J_p"]}}
+              for r in rows]  # fmt: skip
+    for figure in (
+        curves_figure(d, alone, title),
+        agents_figure(d, one, title),
+        benchmark_figure(errors, title),
+    ):  # fmt: skip
+        figure.canvas.draw()
+        for part in (*figure.legends, *figure.texts):
+            box = part.get_window_extent()
+            assert box.x0 >= 0
+            assert box.x1 <= figure.bbox.x1
 
 
 def test_an_estimate_of_zero_can_be_drawn(tmp_path):

@@ -18,7 +18,14 @@ from cluster import Cluster, wait_for
 
 from excite.benchmark.base import seed_folder, study_of
 from excite.benchmark.run import _live, opened, run_study
-from excite.benchmark.table import across_seeds, best_seeds, finished_table, study_table
+from excite.benchmark.table import (
+    across_seeds,
+    best_seeds,
+    finished_table,
+    learning_curves,
+    study_table,
+)
+from excite.cli.study import _require_trainer
 from excite.engine import local_engine
 from excite.policy import read_policy
 from excite.study import read_study
@@ -247,13 +254,34 @@ def test_an_agent_that_comes_back_with_other_settings_is_refused(run, tmp_path):
     assert table_of(folder) == table_of(run)
 
 
-@pytest.mark.parametrize("name", ["methods.json", "table.json", "run.json", "study.json"])
-@pytest.mark.parametrize("content", ["{}", "[]", '{"agents": null}', "\x00"])
+FILES = ["methods.json", "table.json", "run.json", "study.json"]
+FILES += ["seeds/RL_all/1/metrics.json", "seeds/RL_all/1/curve.csv"]
+ROWS = '{"rows": [{"relative_error_percent": 3}], "viable": true, "fingerprint": 1}'
+
+
+@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("content", ["{}", "[]", '{"agents": null}', "\x00", ROWS, "[" * 10**5])
 def test_a_damaged_file_is_one_sentence(run, tmp_path, name, content):
     folder = tmp_path / "run"
     shutil.copytree(run, folder)
     (folder / name).write_text(content)
-    with pytest.raises(ValueError, match=r"damaged|cannot be read|another study|malformed|study"):
+    study = read_study(run.parent / "tiny.toml")
+    with pytest.raises(ValueError, match=r"damaged; .*'excite study run'|other settings") as error:
+        read_all(study, folder)
+    assert type(error.value) is ValueError
+    assert str(folder / name) in str(error.value)
+    (folder / name).unlink()
+    with opened(study, folder):  # what the sentence says is a way out
+        assert (folder / "study.json").is_file()
+        assert (folder / "run.json").is_file()
+
+
+def test_a_curve_that_ends_early_is_damaged(run, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(run, folder)
+    path = seed_folder(folder, "RL(all)", 1) / "curve.csv"
+    path.write_text("".join(path.read_text().splitlines(True)[:-1]))
+    with pytest.raises(ValueError, match=rf"{path} is damaged"):
         read_all(read_study(run.parent / "tiny.toml"), folder)
 
 
@@ -262,6 +290,50 @@ def read_all(study: Any, folder: Path) -> None:
     with opened(study, folder):
         study_table(folder)
         finished_table(folder)
+        learning_curves(study, folder)
+
+
+def test_a_file_in_the_way_of_a_folder_is_said_and_nothing_is_written(run, tmp_path):
+    (tmp_path / "run.json").write_bytes((run / "run.json").read_bytes())
+    (tmp_path / "seeds").write_text("mine")
+    study = read_study(run.parent / "tiny.toml")
+    with pytest.raises(ValueError, match=r"/seeds is a file where a folder is needed"):
+        run_study(study, tmp_path, local_engine(1))
+    assert not (tmp_path / "study.json").exists()
+
+
+@pytest.mark.parametrize("text", ["abc", "-1", "nan", ""])
+def test_a_time_between_checkpoints_that_is_none_is_said(run, tmp_path, monkeypatch, text):
+    monkeypatch.setenv("EXCITE_CHECKPOINT_SECONDS", text)
+    study = read_study(run.parent / "tiny.toml")
+    with pytest.raises(ValueError, match=f"EXCITE_CHECKPOINT_SECONDS must be .* got '{text}'"):
+        run_study(study, tmp_path / "run", local_engine(1))
+    assert not (tmp_path / "run").exists()
+
+
+def test_only_what_is_left_to_train_needs_the_trainer(run, tmp_path, monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
+    study = read_study(run.parent / "tiny.toml")
+    _require_trainer(study, run)
+    with pytest.raises(ValueError, match="training needs stable_baselines3, torch"):
+        _require_trainer(study, tmp_path)
+
+
+def test_rows_of_another_policy_are_not_taken_over(run, tmp_path):
+    policies = [seed_folder(run, "RL(all)", seed) / "policy.safetensors" for seed in range(2)]
+    shutil.copy(policies[0], tmp_path / "mine.safetensors")
+    text = TINY[: TINY.index("[decision]")] + TINY[TINY.index("[methods.chirp]") :]
+    text += '[methods.mine]\nexcitation = "mine.safetensors"\n'
+    study = read_study(write_study(tmp_path, text.replace("seeds = 2", "")))
+    with opened(study, tmp_path / "run") as tasks:
+        assert list(tasks) == ["methods"]
+        (tmp_path / "run" / "methods.json").write_text("{}")
+    shutil.copy(policies[1], tmp_path / "mine.safetensors")
+    with (
+        pytest.raises(ValueError, match="holds a study of another policy"),
+        opened(study, tmp_path / "run"),
+    ):
+        pass
 
 
 def test_progress_may_be_anything(run, tmp_path):
@@ -303,8 +375,9 @@ def test_a_broken_checkpoint_is_a_sentence_and_loses_nothing(run, tmp_path):
     (place / "metrics.json").unlink()
     (place / "checkpoint.safetensors").write_bytes(b"not a checkpoint")
     done = excite("study", "run", run.parent / "tiny.toml", "--out", folder)
-    assert done.returncode == 1
-    assert "RL(all) seed 1" in done.stderr
+    assert done.returncode == 2
+    assert "1 task failed (RL(all) seed 1: /" in done.stderr
+    assert "ValueError" not in done.stderr
     assert "checkpoint.safetensors" in done.stderr
     assert "Traceback" not in done.stderr
     assert len(list(folder.glob("seeds/*/*/metrics.json"))) == 3
@@ -322,7 +395,7 @@ def test_a_full_disk_is_a_sentence_and_loses_nothing(run, tmp_path):
         env={**os.environ, "EXCITE_CHECKPOINT_SECONDS": "0", "EXCITE_CACHE": str(tmp_path)},
         capture_output=True, text=True, timeout=300, check=False,
     )  # fmt: skip
-    assert done.returncode == 1
+    assert done.returncode == 2
     assert "checkpoint.safetensors: cannot be written (File too large)" in done.stderr
     assert "Traceback" not in done.stderr
     assert len(list(folder.glob("seeds/*/*/metrics.json"))) == 3
@@ -332,18 +405,7 @@ def test_a_full_disk_is_a_sentence_and_loses_nothing(run, tmp_path):
 
 
 TRAIN = (
-    *(
-        "train",
-        "aero2",
-        "--steps",
-        40,
-        "--window",
-        5,
-        "--episodes",
-        4,
-        "--output-scale",
-        "pitch=0.3",
-    ),
+    *("train", "aero2", "--steps", 40, "--window", 5, "--episodes", 4),
     *("--output-scale", "pitch=0.3"),
     *("--set", "num_updates=4,num_plants=2,watch_every=2,watch_episodes=2"),
 )
@@ -394,7 +456,7 @@ def test_another_study_in_the_folder_is_refused(run, tmp_path):
     done = excite("study", "run", other, "--out", run)
     assert done.returncode == 2
     assert "holds another study" in done.stderr
-    assert "other settings of 'RL(all)'" in done.stderr
+    assert "other settings of 'RL(all)' (total_steps)" in done.stderr
     other = write_study(tmp_path, TINY.replace("episodes = 5", "episodes = 6"))
     done = excite("study", "run", other, "--out", run)
     assert "holds another study: its 'episodes' differs" in done.stderr
@@ -430,6 +492,7 @@ def test_a_folder_in_use_is_refused(run):
         (["--engine", "dask", "--address", "nowhere"], ["'nowhere'", "tcp://"]),
         (["--engine", "dask", "--address", "tcp://127.0.0.1:9"], ["no Dask scheduler"]),
         (["--workers", "0"], ["--workers"]),
+        (["--workers", "abc"], ["'abc' is not a valid whole number"]),
     ],
 )
 def test_an_engine_that_cannot_be_is_one_sentence(arguments, words, tmp_path):
@@ -449,6 +512,9 @@ def test_no_study_is_one_sentence(tmp_path):
     done = excite("study", "table", tmp_path)
     assert done.returncode == 2
     assert "holds no study" in done.stderr
+    done = excite("study", "table", tmp_path / "nowhere")
+    assert done.returncode == 2
+    assert "nowhere: no such folder" in done.stderr
 
 
 # Rows across seeds

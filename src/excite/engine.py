@@ -46,11 +46,11 @@ def call(target: str, version: str, arguments: Mapping[str, Any]) -> Any:
     """What a worker runs: the function `target`, "package.module:function", by keyword.
 
     Raises:
-        RuntimeError: where the worker has another version of excite, and in place of an
-            error of the function that cannot travel.
+        ValueError: where the worker has another version of excite, or lacks a library.
+        RuntimeError: in place of an error of the function that cannot travel.
     """
     if version != __version__:
-        raise RuntimeError(
+        raise ValueError(
             f"the worker runs excite {__version__}, the study was started by {version}"
         )
     # The function comes as a word and is imported here: sent as itself, unpickling it would
@@ -174,19 +174,22 @@ class _Cluster(Executor):
     What runs on a cluster cannot be stopped: a task that is cancelled comes to its end there.
     """
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, address: str, on_wait: Callable[[], Any]) -> None:
         with contextlib.ExitStack() as stack:
             # A lost scheduler is told by an error, not by lines all over our terminal.
             stack.enter_context(distributed.utils.silence_logging_cmgr("CRITICAL"))
             warnings.simplefilter("ignore", distributed.versions.VersionMismatchWarning)
             self._client = _connected(address)
-            if max(self._client.nthreads().values(), default=1) > 1:
+            threads = self._client.nthreads().values()
+            if max(threads, default=1) > 1:
                 self._client.close()
                 raise ValueError(
                     f"workers at {address} have several threads, which trainings would share; "
                     "start them with --nthreads 1"
                 )
             self._quiet = stack.pop_all()
+        if not threads:
+            on_wait()
         self._executor = self._client.get_executor(pure=False, retries=0)
 
     def num_slots(self) -> int:
@@ -262,23 +265,25 @@ def local_engine(num_workers: int) -> Engine:
     return partial(_Processes, num_workers)
 
 
-def dask_engine(address: str) -> Engine:
+def dask_engine(address: str, on_wait: Callable[[], Any] = lambda: None) -> Engine:
     """The workers of a Dask cluster, by the address of its scheduler.
 
-    Opening it raises ValueError where no scheduler answers.
+    Opening it raises ValueError where no scheduler answers, and calls `on_wait` where the
+    scheduler has no workers yet.
 
     Raises:
         ValueError: for a malformed address, or where Dask is not installed.
     """
     if distributed is None:
-        raise ValueError("the engine 'dask' needs the extra: pip install 'excite[dask]'")
-    is_good = False
-    with contextlib.suppress(ValueError):  # of a port that is no number
-        parts = urlsplit(address if "://" in address else f"tcp://{address}")
-        is_good = bool(parts.scheme == "tcp" and parts.hostname and parts.port)
+        raise ValueError("the engine 'dask' needs the extra: python -m pip install -e '.[dask]'")
+    is_good, url = False, address if "://" in address else f"tcp://{address}"
+    with contextlib.suppress(ValueError):  # of a port that is no number, a host that is no name
+        parts = urlsplit(url)
+        host = (parts.hostname or "").encode("idna")
+        is_good = bool(host and parts.port and url == f"tcp://{parts.netloc}")
     if not is_good:
         raise ValueError(f"{address!r} is no address of a scheduler, like tcp://10.0.0.5:8786")
-    return partial(_Cluster, address)
+    return partial(_Cluster, address, on_wait)
 
 
 def run(
@@ -289,7 +294,7 @@ def run(
     on_done: Callable[[str, Any], Any],
     on_tick: Callable[[], Any] = lambda: None,
     num_tries: int = 3,
-) -> dict[str, str]:
+) -> dict[str, Exception]:
     """Calls `target` once a task, with its arguments, and gives every result to `on_done`.
 
     A task whose worker dies, or that raises, is tried again later; but for a ValueError,
@@ -304,7 +309,7 @@ def run(
         num_tries: how often a task is tried in all.
 
     Returns:
-        Why, in a sentence, by the name of each task that failed.
+        Why, by the name of each task that failed: ValueError is a mistake of the user's.
 
     Raises:
         ValueError: where the engine cannot be opened.
@@ -332,7 +337,8 @@ class _Work:
     def __init__(
         self, target: str, tasks: Mapping[str, Mapping[str, Any]], engine: Engine, num_tries: int
     ) -> None:
-        self.queue, self.running, self.failures = deque(tasks), {}, {}
+        self.queue, self.running = deque(tasks), {}
+        self.failures: dict[str, Exception] = {}
         self._target, self._tasks, self._engine = target, tasks, engine
         self._num_tries, self._tries, self._deaths = num_tries, Counter(), Counter()
         self._executor: _Processes | _Cluster | None = None
@@ -388,6 +394,7 @@ class _Work:
             self.queue.append(name)
         elif num_deaths:
             times = "once" if self._deaths[name] == 1 else f"{self._deaths[name]} times"
-            self.failures[name] = f"its worker died {times}"
-        else:
-            self.failures[name] = _sentence(error)
+            self.failures[name] = RuntimeError(f"its worker died {times}")
+        else:  # subclasses of ValueError come from libraries
+            is_users = type(error) is ValueError
+            self.failures[name] = error if is_users else RuntimeError(_sentence(error))

@@ -20,8 +20,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray
 
-from .objective import AbstractObjective, Sample, default_objective, number
-from .plant import AbstractPlant, Params, draw_params
+from .objective import (
+    AbstractObjective,
+    EstimationError,
+    InformationGain,
+    Sample,
+    number,
+    prior_sd_of,
+    target_mask,
+)
+from .plant import AbstractARXPlant, AbstractPlant, Params, draw_params
 from .policy import (
     Layout,
     Window,
@@ -40,6 +48,7 @@ class EnvState(eqx.Module):
 
     Attributes:
         params: true parameters of this episode's plant.
+        constants: its true constants.
         plant_state: true state.
         window: what the policy remembers.
         memory: of the objective.
@@ -50,6 +59,7 @@ class EnvState(eqx.Module):
     """
 
     params: Params
+    constants: Any
     plant_state: Float[Array, " state"]
     window: Window
     memory: Any
@@ -86,6 +96,9 @@ class Env(eqx.Module):
         layout: what is observed, and T.
         spread: parameters are uniform in nominal value ± spread times their scale.
         penalty_weight: factor of the safety penalty; 1 / T normalises it by length.
+        constants: of the plant, from where to where each is drawn for every episode, which
+            makes what is learnt robust against what identification holds to be known; by
+            default they are the plant's own.
     """
 
     plant: AbstractPlant
@@ -93,6 +106,7 @@ class Env(eqx.Module):
     layout: Layout = eqx.field(static=True)
     spread: Float[Array, ""] = eqx.field(converter=number, default=0.3)
     penalty_weight: Float[Array, ""] = eqx.field(converter=number, default=1.0)
+    constants: tuple[Any, Any] | None = None
 
     @classmethod
     def of(cls, plant: AbstractPlant, **choices: Any) -> Env:
@@ -106,13 +120,15 @@ class Env(eqx.Module):
     def reset(self, key: PRNGKeyArray) -> tuple[EnvState, Float[Array, " observation"]]:
         """A plant drawn at random, at its initial state, and its first observation."""
         params_key, key = jax.random.split(key)
-        plant = self.plant
+        constants = self._draw_constants(params_key)
+        plant = self.plant.changed(**constants._asdict())
         params = draw_params(plant, params_key, self.spread)
         output = plant.output(plant.initial_state, params)
         measured = measure(plant, output, jax.random.fold_in(key, 0))
         window = with_measurement(jnp, self.layout, empty_window(jnp, self.layout), measured)
         state = EnvState(
             params=params,
+            constants=constants,
             plant_state=plant.initial_state,
             window=window,
             memory=self.objective.init(plant, measured),
@@ -132,7 +148,7 @@ class Env(eqx.Module):
         self, state: EnvState, action: Float[Array, " input"]
     ) -> tuple[EnvState, Float[Array, " output"], Float[Array, ""]]:
         """The experiment one sampling time on: state, true output, and gain of the objective."""
-        plant, k = self.plant, state.k + 1
+        plant, k = self.plant.changed(**state.constants._asdict()), state.k + 1
         action = jnp.where(jnp.isfinite(action), jnp.clip(action, -1, 1), 0.0)
         input = scaled_action(jnp, self.layout, action.astype(float))
         after = step(plant, state.plant_state, input, state.params)
@@ -146,6 +162,7 @@ class Env(eqx.Module):
         window = with_input(jnp, self.layout, state.window, input)
         new = EnvState(
             params=state.params,
+            constants=state.constants,
             plant_state=after,
             window=with_measurement(jnp, self.layout, window, measured),
             memory=memory,
@@ -155,6 +172,17 @@ class Env(eqx.Module):
             key=state.key,
         )
         return new, output, jnp.where(is_finite, gain, 0.0)
+
+    def _draw_constants(self, key: PRNGKeyArray) -> Any:
+        """Constants of one episode's plant, each uniform between its ends."""
+        if self.constants is None:
+            return self.plant.constants
+        low, high = self.constants
+        keys = jax.random.split(jax.random.fold_in(key, 1), len(low))
+        drawn = [
+            jax.random.uniform(k, (), float, a, b) for a, b, k in zip(low, high, keys, strict=True)
+        ]
+        return type(low)(*drawn)
 
     def _is_visible(self, state: Float[Array, " state"], params: Params) -> Bool[Array, ""]:
         """Whether the outputs are numbers in the single precision of an observation."""
@@ -180,6 +208,14 @@ class Env(eqx.Module):
             is_violation=is_over | ~state.is_finite,
             relative_errors=self.objective.relative_errors(plant, state.memory, state.params),
         )
+
+
+def default_objective(plant: AbstractPlant, spread: float) -> AbstractObjective:
+    """The paper's for a plant with a mapping from ARX, else the information gained."""
+    targets = target_mask(plant.definition, None)
+    if isinstance(plant, AbstractARXPlant):
+        return EstimationError(targets)
+    return InformationGain(targets, prior_sd_of(spread))
 
 
 class Batch(eqx.Module):

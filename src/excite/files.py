@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import importlib.util
 import io
 import json
 import math
 import os
 import re
 import shutil
+import sys
 import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -118,3 +120,34 @@ def new_run_folder(path: Path, overwrite: bool = False) -> Iterator[Path]:
         unfinished.rename(path)
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
+
+
+def class_at(path: Path, word: str, base: type, kind: str) -> Any:
+    """A class derived from `base` in a user's file, which is run.
+
+    Args:
+        kind: what such a class is called in a message.
+
+    Raises:
+        ValueError: for a file that cannot be imported, or without such a class.
+    """
+    if not path.is_file():
+        raise ValueError(f"{path}: no such file")
+    found = getattr(_module_at(path), word, None)
+    if not (isinstance(found, type) and issubclass(found, base)):
+        raise ValueError(f"{path} has no {kind} class {word!r}")
+    return found
+
+
+def _module_at(path: Path) -> Any:
+    name = f"excite_file_{path.stem}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise ValueError(f"{path} cannot be imported")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # Equinox looks a class's module up by name
+    try:
+        spec.loader.exec_module(module)
+    except (Exception, SystemExit) as error:
+        raise ValueError(f"{path} cannot be imported: {type(error).__name__}: {error}") from error
+    return module

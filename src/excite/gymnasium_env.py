@@ -6,10 +6,15 @@
 Both run the same pure functions of `env`, compiled, in double precision whatever the
 program around them uses. Any choice of `Env.of` is a keyword argument (`objective`,
 `layout`, `spread`, `penalty_weight`), and `plant` another plant of the class.
+
+JAX does not survive a fork: processes of one environment each (`vectorization_mode="async"`)
+must be spawned, `vector_kwargs={"context": "spawn"}`. The batch is far quicker.
 """
 
 from __future__ import annotations
 
+import math
+import multiprocessing
 from typing import Any
 
 import equinox as eqx
@@ -35,7 +40,21 @@ _step = eqx.filter_jit(Env.step)
 def _process(
     plant_class: type[AbstractPlant], plant: AbstractPlant | None, choices: dict[str, Any]
 ) -> Env:
-    """The process in double precision, whatever the given parts of it were made in."""
+    """The process in double precision, whatever the given parts of it were made in.
+
+    Raises:
+        ValueError: for a spread or a penalty weight that is not allowed.
+        RuntimeError: in a forked process, where JAX would hang.
+    """
+    if type(multiprocessing.current_process()).__name__ == "ForkProcess":
+        raise RuntimeError(
+            "JAX does not survive a fork: spawn the processes, as with vector_kwargs="
+            '{"context": "spawn"}, or step all environments as one batch, make_vec\'s default'
+        )
+    if not 0 <= choices.get("spread", 0.3) < 1:
+        raise ValueError(f"spread must lie in [0, 1): got {choices['spread']}")
+    if not 0 <= choices.get("penalty_weight", 1.0) < math.inf:
+        raise ValueError(f"penalty_weight must lie in [0, inf): got {choices['penalty_weight']}")
     with jax.enable_x64(True):
         env = Env.of(plant_class() if plant is None else plant, **choices)
         return jax.tree.map(lambda leaf: jnp.asarray(leaf, float), env)
@@ -137,9 +156,12 @@ class ExperimentEnv(gymnasium.Env[Observation, Action]):
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """One sampling time."""
         if self._state is None:
-            raise gymnasium.error.ResetNeeded("call reset before step")
+            raise gymnasium.error.ResetNeeded(
+                "no episode is running: call reset before the first step and after the last"
+            )
         with jax.enable_x64(True):
-            self._state, transition = _step(self.process, self._state, jnp.asarray(action))
+            state, transition = _step(self.process, self._state, jnp.asarray(action))
+            self._state = None if transition.terminated else state
             info = {k: v.item() for k, v in _info(self.process, transition).items()}
             observation = np.array(transition.observation)
             return observation, float(transition.reward), bool(transition.terminated), False, info
@@ -163,6 +185,8 @@ class ExperimentVectorEnv(VectorEnv[Observation, Action, np.ndarray]):
         render_mode: None = None,
         **choices: Any,
     ) -> None:
+        if num_envs < 1:
+            raise ValueError(f"num_envs must be at least 1: got {num_envs}")
         self.num_envs, self.render_mode = num_envs, render_mode
         self.process = _process(plant_class, plant, choices)
         self.single_observation_space, self.single_action_space = _spaces(self.process)

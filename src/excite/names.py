@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import importlib.util
+import hashlib
 import math
-import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -19,41 +18,62 @@ import jax
 import jax.numpy as jnp
 
 from .description import names_of
-from .estimation import ARX, NLS, AbstractEstimator
+from .estimation import ARX, NLS, AbstractEstimator, Decrement
 from .excitation import (
     PRBS,
     AbstractExcitation,
+    AbstractShape,
     Chirp,
+    Decay,
     Multisine,
     PolicyExcitation,
+    PositionLoop,
     Random,
+    Replay,
     Square,
     maximum_length_sequence,
 )
-from .plant import EMPS, AbstractPlant, Aero2, CartPole, DCMotor, Sensor
-from .policy import Policy, mismatch, read_policy
+from .files import class_at
+from .plant import (
+    EMPS,
+    AbstractPlant,
+    Aero2,
+    Aero2Detailed,
+    Aero2Lag,
+    CartPole,
+    DCMotor,
+    Sensor,
+)
+from .policy import POLICY_ENDING, mismatch, policy_path, read_policy, shipped_policies
+from .records import read_signal
 
 PLANTS: Mapping[str, type[AbstractPlant]] = {
     "aero2": Aero2,
+    "aero2_lag": Aero2Lag,
+    "aero2_detailed": Aero2Detailed,
     "dc_motor": DCMotor,
     "cart_pole": CartPole,
     "emps": EMPS,
 }
-EXCITATIONS: Mapping[str, type[AbstractExcitation]] = {
+EXCITATIONS: Mapping[str, type[AbstractShape]] = {
     "random": Random,
     "prbs": PRBS,
     "chirp": Chirp,
     "multisine": Multisine,
     "square": Square,
+    "decay": Decay,
 }
+LOOP = "loop-"
+"""Before the name of an excitation: it is the reference of a position loop."""
+
 ESTIMATORS: Mapping[str, AbstractEstimator] = {
     "arx-rls": ARX(),
     "arx-rls-wide": ARX(start_covariance=1e8, name="arx-rls-wide"),
     "nls": NLS(),
+    "decrement": Decrement(),
 }
 
-
-POLICY_ENDING = ".safetensors"
+SIGNAL_ENDINGS = (".csv", ".mat")
 
 
 def unknown(kind: str, word: str, allowed: Iterable[str]) -> ValueError:
@@ -78,11 +98,7 @@ def plant_named(name: str) -> AbstractPlant:
     path, colon, class_name = name.rpartition(":")
     if not colon or not path.endswith(".py"):
         raise unknown("plant", name, [*PLANTS, "path/to/file.py:ClassName"])
-    if not Path(path).is_file():
-        raise ValueError(f"{path}: no such file")
-    plant_class = getattr(_module(Path(path)), class_name, None)
-    if not (isinstance(plant_class, type) and issubclass(plant_class, AbstractPlant)):
-        raise ValueError(f"{path} has no plant class {class_name!r}")
+    plant_class = class_at(Path(path), class_name, AbstractPlant, "plant")
     try:
         plant = plant_class()
     except (TypeError, AttributeError) as error:  # a method or the definition is missing
@@ -127,59 +143,68 @@ def with_sensor(
     return plant.changed(sensor=Sensor(*(jnp.asarray(v) for v in numbers.values())))
 
 
-def _module(path: Path) -> Any:
-    name = f"excite_plant_{path.stem}"
-    spec = importlib.util.spec_from_file_location(name, path)
-    if spec is None or spec.loader is None:
-        raise ValueError(f"{path} cannot be imported")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # Equinox looks a class's module up by name
-    try:
-        spec.loader.exec_module(module)
-    except (Exception, SystemExit) as error:
-        raise ValueError(f"{path} cannot be imported: {type(error).__name__}: {error}") from error
-    return module
-
-
 def excitation_named(
     name: str, options: Mapping[str, Any], plant: AbstractPlant
 ) -> AbstractExcitation:
-    """An excitation by name, or a trained policy by its file, checked against the plant.
+    """An excitation by name, or a trained policy, checked against the plant.
+
+    Raises:
+        ValueError: as `excitation_and_origin`.
+    """
+    return excitation_and_origin(name, options, plant)[0]
+
+
+def excitation_and_origin(
+    name: str, options: Mapping[str, Any], plant: AbstractPlant
+) -> tuple[AbstractExcitation, dict[str, str]]:
+    """An excitation, and what a record must say of the policy that it is.
+
+    That is `policy_hash`, and a `warning` where the policy was trained on another plant;
+    nothing for other excitations.
 
     Raises:
         ValueError: for an unknown name or option, a value that is not allowed, or a policy
             that may not excite this plant.
     """
-    if name.endswith(POLICY_ENDING):
+    path = policy_path(name)
+    if path is not None:
         if options:
             raise ValueError(f"a policy has no options: got {', '.join(options)}")
-        policy = read_policy(Path(name))
-        _check_policy(policy, name, plant)
-        return PolicyExcitation.of(policy)
-    if name not in EXCITATIONS:
-        raise unknown("excitation", name, [*EXCITATIONS, f"path/to/policy{POLICY_ENDING}"])
-    excitation = _build(EXCITATIONS[name](), name, options)
+        policy = read_policy(path)
+        try:
+            warning = mismatch(policy, plant.description)
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from None
+        origin = {"policy_hash": policy.hash} | ({} if warning is None else {"warning": warning})
+        return PolicyExcitation.of(policy), origin
+    if name.endswith(SIGNAL_ENDINGS):
+        signal = _recorded(name, options, plant)
+        return signal, {"signal_hash": hashlib.sha256(Path(name).read_bytes()).hexdigest()}
+    excitation = _classical(name, options, plant)
     _check_excitation(excitation, plant)
-    return excitation
+    return excitation, {}
 
 
-def policy_origin(name: str, plant: AbstractPlant) -> dict[str, str]:
-    """What a record must say of the policy that made it; nothing for other excitations.
-
-    `policy_hash`, and a `warning` where the policy was trained on another plant.
-    """
-    if not name.endswith(POLICY_ENDING):
-        return {}
-    policy = read_policy(Path(name))
-    warning = _check_policy(policy, name, plant)
-    return {"policy_hash": policy.hash} | ({} if warning is None else {"warning": warning})
+def _recorded(name: str, options: Mapping[str, Any], plant: AbstractPlant) -> Replay:
+    """The designed or recorded input in a file."""
+    if options:
+        raise ValueError(f"a signal from a file has no options: got {', '.join(options)}")
+    return Replay(jnp.asarray(read_signal(Path(name), plant.description).inputs))
 
 
-def _check_policy(policy: Policy, name: str, plant: AbstractPlant) -> str | None:
-    try:
-        return mismatch(policy, plant.description)
-    except ValueError as error:
-        raise ValueError(f"{name}: {error}") from None
+def _classical(name: str, options: Mapping[str, Any], plant: AbstractPlant) -> AbstractExcitation:
+    """A signal, or one as the reference of a position loop, which shares its options."""
+    shape = name.removeprefix(LOOP)
+    if shape not in EXCITATIONS:
+        known = [*EXCITATIONS, *(LOOP + word for word in EXCITATIONS), *shipped_policies()]
+        raise unknown("excitation", name, [*known, f"path/to/policy{POLICY_ENDING}"])
+    if shape == name:
+        return _build(EXCITATIONS[name](), name, options)
+    own = {k: v for k, v in options.items() if k in ("amplitude", "gain", "damping")}
+    rest = {k: v for k, v in options.items() if k not in own}
+    signal = _build(EXCITATIONS[shape](), shape, rest)
+    _check_excitation(signal, plant)
+    return _build(PositionLoop(signal), name, own)
 
 
 def estimator_named(name: str, options: Mapping[str, Any] | None = None) -> AbstractEstimator:
@@ -206,7 +231,7 @@ def estimator_named(name: str, options: Mapping[str, Any] | None = None) -> Abst
 
 def _build(default: Any, name: str, options: Mapping[str, Any]) -> Any:
     """`default` with other options, their names and types checked."""
-    hidden = ("name", "horizons", "inputs")
+    hidden = ("name", "horizons", "inputs", "signal")
     fields = {f.name: f for f in dataclasses.fields(default) if f.name not in hidden}
     for option, value in options.items():
         if option not in fields:
@@ -226,19 +251,11 @@ def _build(default: Any, name: str, options: Mapping[str, Any]) -> Any:
 
 def _check_excitation(excitation: Any, plant: AbstractPlant) -> None:
     """Values of an excitation that the plant does not allow."""
-    d, nyquist = plant.definition, 0.5 / float(plant.dt)
-    amplitude = getattr(excitation, "amplitude", None)
-    if amplitude is not None:
-        values = amplitude.tolist() if amplitude.ndim else [float(amplitude)] * len(d.inputs)
-        if len(values) != len(d.inputs):
-            raise ValueError(f"{len(values)} amplitudes were given for {len(d.inputs)} inputs")
-        for value, part in zip(values, d.inputs, strict=True):
-            half = (part.upper - part.lower) / 2
-            if not 0 <= value <= half * (1 + 1e-9):
-                raise ValueError(
-                    f"amplitude {value:g} {part.unit} is not allowed for {part.name!r}: "
-                    f"from 0 to {half:g} {part.unit}"
-                )
+    if isinstance(excitation, PositionLoop):
+        _check_loop(excitation)
+    else:
+        _check_amplitude(excitation, plant)
+    nyquist = 0.5 / float(plant.dt)
     for option in ("start_frequency", "stop_frequency", "frequency"):
         value = getattr(excitation, option, None)
         if value is not None and not 0 < float(value) <= nyquist * (1 + 1e-9):
@@ -249,5 +266,31 @@ def _check_excitation(excitation: Any, plant: AbstractPlant) -> None:
     for option in ("hold", "clock"):
         if getattr(excitation, option, 1) < 1:
             raise ValueError(f"{option} is a number of samples, at least 1")
-    if getattr(excitation, "register", 0):
-        maximum_length_sequence(excitation.register)
+    pump, register = getattr(excitation, "pump", 0.5), getattr(excitation, "register", 0)
+    if not 0 < float(pump) < 1:
+        raise ValueError(f"pump must lie between 0 and 1: got {float(pump):g}")
+    if register:
+        maximum_length_sequence(register)
+
+
+def _check_amplitude(excitation: Any, plant: AbstractPlant) -> None:
+    inputs, amplitude = plant.definition.inputs, getattr(excitation, "amplitude", None)
+    if amplitude is None:
+        return
+    values = amplitude.tolist() if amplitude.ndim else [float(amplitude)] * len(inputs)
+    if len(values) != len(inputs):
+        raise ValueError(f"{len(values)} amplitudes were given for {len(inputs)} inputs")
+    for value, part in zip(values, inputs, strict=True):
+        half = (part.upper - part.lower) / 2
+        if not 0 <= value <= half * (1 + 1e-9):
+            raise ValueError(
+                f"amplitude {value:g} {part.unit} is not allowed for {part.name!r}: "
+                f"from 0 to {half:g} {part.unit}"
+            )
+
+
+def _check_loop(loop: PositionLoop) -> None:
+    for option in ("amplitude", "gain", "damping"):
+        value = getattr(loop, option)
+        if value is not None and not (value.ndim == 0 and 0 <= float(value) < math.inf):
+            raise ValueError(f"{option} of a position loop must not be negative: got {value}")

@@ -25,6 +25,8 @@ from .description import Input, Output, PlantDescription
 from .files import json_text
 
 FORMAT = "excite policy 1"
+POLICY_ENDING = ".safetensors"
+SHIPPED = Path(__file__).parent / "policies"
 _NUM_HEADER_BYTES = 8  # a safetensors file begins with the length of its JSON header
 _MAX_COUNT = 2**31  # of samples, in a file of unknown origin
 
@@ -48,7 +50,8 @@ class Layout:
         window: samples remembered.
         num_steps: T, steps of the experiment the policy was made for.
         output_scale: y_max of each output, in its unit.
-        input_middle, input_half: middle and half width of each input's limits.
+        input_middle, input_half: middle of each input's limits, and how far from it the
+            policy may go: half their width, or less.
         clocks: frequencies of the clocks, in cycles a step, at most one half.
     """
 
@@ -123,12 +126,13 @@ def observe(xp: Any, layout: Layout, window: Window, k: AnyArray) -> AnyArray:
 
 
 def forward(xp: Any, weights: Weights, observation: AnyArray) -> AnyArray:
-    """Action in [-1, 1]: hyperbolic tangents, a linear last layer, clipped."""
+    """Action in [-1, 1]: hyperbolic tangents, a linear last layer, clipped; 0 if not finite."""
     x = observation
     for matrix, bias in weights[:-1]:
         x = xp.tanh(matrix @ x + bias)
     matrix, bias = weights[-1]
-    return xp.clip(matrix @ x + bias, -1.0, 1.0)
+    action = matrix @ x + bias
+    return xp.where(xp.isfinite(action), xp.clip(action, -1.0, 1.0), 0.0)
 
 
 def scaled_action(xp: Any, layout: Layout, action: AnyArray) -> AnyArray:
@@ -161,7 +165,16 @@ class Policy:
         _check_layers(layers, self.layout.size, len(self.layout.input_half))
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Action in [-1, 1] for one observation."""
+        """Action in [-1, 1] for one observation.
+
+        Raises:
+            ValueError: for an observation of another size.
+        """
+        if np.shape(observation) != (self.layout.size,):
+            raise ValueError(
+                f"an observation of this policy has shape {(self.layout.size,)}; "
+                f"got {np.shape(observation)}"
+            )
         return forward(np, self.weights, observation)
 
     @property
@@ -228,15 +241,30 @@ def read_policy(path: Path) -> Policy:
     return Policy.from_bytes(content, str(path))
 
 
+def shipped_policies() -> dict[str, Path]:
+    """Policies that come with the package, by name; a plant's default has the plant's name."""
+    return {path.stem: path for path in sorted(SHIPPED.glob(f"*{POLICY_ENDING}"))}
+
+
+def policy_path(name: str) -> Path | None:
+    """File of the policy a user names: a path, or a shipped policy; None for other words."""
+    return Path(name) if name.endswith(POLICY_ENDING) else shipped_policies().get(name)
+
+
 def _check_layout(layout: Layout, plant: PlantDescription) -> None:
     numbers = (*layout.output_scale, *layout.input_middle, *layout.input_half)
     if not all(type(n) is int and n < _MAX_COUNT for n in (layout.window, layout.num_steps)):
         raise ValueError("window and num_steps of a layout are whole numbers")
-    free = {"output_scale": layout.output_scale, "clocks": layout.clocks}
-    if layout != dataclasses.replace(
-        Layout.of(plant, layout.window, layout.num_steps), **free
-    ) or not all(math.isfinite(n) for n in numbers):
+    usual = Layout.of(plant, layout.window, layout.num_steps)
+    own = ("output_scale", "input_half", "clocks")  # may differ from policy to policy
+    if layout != dataclasses.replace(usual, **{n: getattr(layout, n) for n in own}) or not all(
+        math.isfinite(n) for n in numbers
+    ):
         raise ValueError("the observation layout does not belong to the policy's plant")
+    if len(layout.input_half) != len(plant.inputs) or not all(
+        0 < own <= whole for own, whole in zip(layout.input_half, usual.input_half, strict=True)
+    ):
+        raise ValueError("the layout's inputs go beyond the limits of the policy's plant")
     if not all(0 < n <= 0.5 for n in layout.clocks):
         raise ValueError("the clocks of a layout are above 0 and at most half a cycle a step")
     if len(layout.output_scale) != len(plant.outputs) or min(layout.output_scale) <= 0:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -18,8 +19,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy.io
-from jaxtyping import Float
+
+try:  # a laboratory computer runs experiments without it, on CSV files
+    import scipy.io as matlab
+except ImportError:
+    matlab = None
 
 from .description import Input, Output, PlantDescription, names_of
 from .files import csv_text, write_bytes, write_json
@@ -37,15 +41,15 @@ class Record:
 
     Attributes:
         time: sampling instants [s].
-        inputs: row k is held from time[k] on; the last row acts after the record's end.
-        outputs: measured outputs.
+        inputs: by sample and input; row k is held from time[k] on, the last acts after the end.
+        outputs: measured, by sample and output.
         metadata: what the sidecar says; empty without one.
         source: where the record came from, for messages.
     """
 
-    time: Float[np.ndarray, " sample"]
-    inputs: Float[np.ndarray, "sample input"]
-    outputs: Float[np.ndarray, "sample output"]
+    time: np.ndarray
+    inputs: np.ndarray
+    outputs: np.ndarray
     metadata: Mapping[str, Any] = field(default_factory=dict)
     source: str = ""
 
@@ -140,6 +144,32 @@ def read_record(
     )
 
 
+def read_signal(path: Path, description: PlantDescription) -> Record:
+    """The designed input in a file, to be played on a plant as it is.
+
+    Raises:
+        ValueError: as `read_record`, and for another sampling time or inputs beyond the limits.
+    """
+    record = read_record(path, description, inputs_only=True)
+    if not math.isclose(record.dt, description.dt, rel_tol=1e-6):
+        raise ValueError(
+            f"{path}: its sampling time is {record.dt:g} s; {description.name!r} has "
+            f"{description.dt:g} s"
+        )
+    require_playable(record, description)
+    return record
+
+
+def require_playable(record: Record, description: PlantDescription) -> None:
+    """Raises ValueError for inputs beyond the limits: they would be clipped into others."""
+    for part, values in zip(description.inputs, record.inputs.T, strict=True):
+        if values.min() < part.lower - 1e-9 or values.max() > part.upper + 1e-9:
+            raise ValueError(
+                f"{record.source}: {part.name!r} runs from {values.min():g} to {values.max():g} "
+                f"{part.unit}; the plant's limits are {part.lower:g} to {part.upper:g} {part.unit}"
+            )
+
+
 def _read_table(path: Path) -> dict[str, np.ndarray | list[str]]:
     """Columns by name; those of a CSV file still as text."""
     _require_record_ending(path)
@@ -200,9 +230,18 @@ def _delimiter(header: str) -> str:
     return next((d for d in (",", ";", "\t") if d in header), ",")
 
 
+def _require_matlab(path: Path) -> Any:
+    if matlab is None:
+        raise ValueError(
+            f"{path}: MAT files need SciPy (python -m pip install scipy); CSV does not"
+        )
+    return matlab
+
+
 def _read_mat(path: Path) -> dict[str, np.ndarray | list[str]]:
+    reader = _require_matlab(path)
     try:
-        content = scipy.io.loadmat(path)
+        content = reader.loadmat(path)
     except NotImplementedError:
         raise ValueError(
             f"{path}: MAT files of version 7.3 are HDF5; save it with -v7 or as CSV"
@@ -220,7 +259,7 @@ def _read_mat(path: Path) -> dict[str, np.ndarray | list[str]]:
 
 def _column(
     table: Mapping[str, np.ndarray | list[str]], name: str, meaning: str, path: Path
-) -> Float[np.ndarray, " sample"]:
+) -> np.ndarray:
     if name not in table:
         raise ValueError(
             f"{path}: no column {name!r}; the file has {', '.join(table) or 'none'} "
@@ -325,7 +364,9 @@ def write_record(
     )
     buffer = io.BytesIO()
     if path.suffix.lower() == ".mat":
-        scipy.io.savemat(buffer, {name: values[:, None] for name, values in columns.items()})
+        _require_matlab(path).savemat(
+            buffer, {name: values[:, None] for name, values in columns.items()}
+        )
     else:
         buffer.write(csv_text(columns).encode())
     # What an earlier sidecar says of the record's origin outlives later uses of it.

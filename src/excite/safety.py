@@ -1,18 +1,23 @@
-"""Warning and critical level of an output, as pure functions over arrays.
+"""Warning and critical level of an output, and a supervisor's rules, over arrays.
 
-The functions use only what NumPy and JAX arrays share, so that a batch of thousands of
-simulated episodes and a loop in real time are judged by the same lines. A level of
-infinity is a level not watched. Axis 0 of one episode is time, axis 1 output; JAX maps
-over episodes with `vmap`, NumPy by broadcasting.
+The functions are pure and use only what NumPy and JAX arrays share (`xp` is the module of
+array functions), so that a batch of thousands of simulated runs and a loop in real time
+are judged by the same lines. A level of infinity is a level not watched. Axis 0 of one
+episode is time, axis 1 output; JAX maps over episodes with `vmap`, NumPy by broadcasting.
+
+The supervisor is independent of the excitation. `check_reading` looks at every reading,
+`check_sample` at those of sampling instants, `allowed` at every input. The first reason to
+trip is latched, and from then on the safe input is all that is allowed.
 """
 
 from __future__ import annotations
 
+import enum
 import math
-from typing import Any, TypeAlias
+from dataclasses import dataclass
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-from jaxtyping import Float
 
 from .description import PlantDescription
 
@@ -20,12 +25,19 @@ AnyArray: TypeAlias = Any
 """A NumPy or a JAX array."""
 
 
-def critical_levels(description: PlantDescription) -> Float[np.ndarray, " output"]:
+def critical_levels(description: PlantDescription) -> np.ndarray:
     """Critical level of each output's magnitude, in its unit; infinity for none."""
     levels = [
         math.inf if o.critical_level is None else o.critical_level for o in description.outputs
     ]
     return np.array(levels)
+
+
+def safe_input(description: PlantDescription) -> np.ndarray:
+    """Input that ends an experiment: zero, or the limit nearest to it."""
+    return np.clip(
+        0.0, [i.lower for i in description.inputs], [i.upper for i in description.inputs]
+    )
 
 
 def watched_output(description: PlantDescription) -> int:
@@ -36,7 +48,7 @@ def watched_output(description: PlantDescription) -> int:
 
 def watched_levels(
     description: PlantDescription,
-) -> tuple[tuple[int, ...], Float[np.ndarray, " watched"], Float[np.ndarray, " watched"]]:
+) -> tuple[tuple[int, ...], np.ndarray, np.ndarray]:
     """Indices of the outputs with a critical level, their warning and critical levels.
 
     Where an output has no warning level, the critical one takes its place.
@@ -78,3 +90,190 @@ def is_violation(outputs: AnyArray, levels: AnyArray) -> AnyArray:
     A value that is not a number counts: a run that cannot be computed is not a safe run.
     """
     return ~(max_abs_output(outputs) < levels).all(axis=-1)
+
+
+class Trip(enum.IntEnum):
+    """Why an experiment was ended; none while it runs."""
+
+    NONE = 0
+    LEVEL = 1
+    PREDICTED_LEVEL = 2
+    NOT_FINITE = 3
+    JUMP = 4
+    STALE = 5
+    INPUT_NOT_FINITE = 6
+    DEADLINES = 7
+    DURATION = 8
+
+    @property
+    def sentence(self) -> str:
+        """What happened, in words."""
+        return _TRIPS[self]
+
+
+_TRIPS = {
+    Trip.NONE: "",
+    Trip.LEVEL: "an output reached its critical level",
+    Trip.PREDICTED_LEVEL: "an output was about to reach its critical level",
+    Trip.NOT_FINITE: "a measurement was not a finite number",
+    Trip.JUMP: "a measurement jumped",
+    Trip.STALE: "a measurement stood still while the plant was moving or driven",
+    Trip.INPUT_NOT_FINITE: "the excitation asked for an input that is not a finite number",
+    Trip.DEADLINES: "deadlines were lost",
+    Trip.DURATION: "the experiment lasted longer than allowed",
+}
+
+
+@dataclass(frozen=True, eq=False)  # a compiled batch knows it by identity
+class Supervision:
+    """What a supervisor allows; arrays are by input or output, in their units.
+
+    Attributes:
+        dt: sampling time [s].
+        lower, upper: input limits.
+        slew: largest change of an input in one dt; infinite for any.
+        safe_input: what is applied after a trip.
+        critical: critical levels.
+        resolution: smallest change of a reading that is more than the sensor's.
+        fastest: plausible change of an output in one second.
+        driven: distance of an input from the safe one that must move the plant.
+        num_still: samples for which a reading may stand still when the plant just moved.
+        num_dead: and when it was driven all the time.
+    """
+
+    dt: float
+    lower: np.ndarray
+    upper: np.ndarray
+    slew: np.ndarray
+    safe_input: np.ndarray
+    critical: np.ndarray
+    resolution: np.ndarray
+    fastest: np.ndarray
+    driven: np.ndarray
+    num_still: int = 4
+    num_dead: int = 20
+
+    @classmethod
+    def of(cls, description: PlantDescription, slew: float = math.inf) -> Supervision:
+        """The rules for a plant.
+
+        Args:
+            slew: largest change of every input in one second, in its unit.
+
+        Raises:
+            ValueError: for a slew that is not positive.
+        """
+        if not slew > 0:
+            raise ValueError(f"the slew limit must be positive: got {slew:g}")
+        d = description
+        lower, upper = (np.array([getattr(i, n) for i in d.inputs]) for n in ("lower", "upper"))
+        critical = critical_levels(d)
+        size = np.where(np.isfinite(critical), critical, [o.scale for o in d.outputs])
+        return cls(
+            dt=d.dt,
+            lower=lower,
+            upper=upper,
+            slew=np.full(len(d.inputs), slew * d.dt),
+            safe_input=safe_input(d),
+            critical=critical,
+            resolution=np.array([max(o.resolution, o.noise_sd) for o in d.outputs]),
+            fastest=10 * size,
+            driven=np.array([i.amplitude / 4 for i in d.inputs]),
+        )
+
+
+class Watch(NamedTuple):
+    """What a supervisor remembers.
+
+    Attributes:
+        input: applied last.
+        reading: last outputs.
+        samples: outputs at the last three sampling instants, newest last.
+        num_samples: sampling instants so far.
+        num_still: by output, samples for which it has stood still.
+        last_move: by output, size of the last change from sample to sample.
+        num_driven: samples since an output moved in which inputs were large.
+        trip: a `Trip`.
+    """
+
+    input: AnyArray
+    reading: AnyArray
+    samples: AnyArray
+    num_samples: AnyArray
+    num_still: AnyArray
+    last_move: AnyArray
+    num_driven: AnyArray
+    trip: AnyArray
+
+    @classmethod
+    def start(cls, xp: Any, rules: Supervision, measured: AnyArray) -> Watch:
+        """Before the first sample, at the first reading."""
+        count = len(rules.critical)
+        return cls(
+            input=xp.asarray(rules.safe_input, float),
+            reading=xp.asarray(measured),
+            samples=xp.stack([measured] * 3),
+            num_samples=xp.asarray(0),
+            num_still=xp.zeros(count, int),
+            last_move=xp.zeros(count),
+            num_driven=xp.zeros(count, int),
+            trip=xp.asarray(int(Trip.NONE)),
+        )
+
+
+def tripped(xp: Any, watch: Watch, condition: AnyArray, trip: Trip) -> Watch:
+    """The watch after a condition to trip was looked at; the first reason stays."""
+    is_first = condition & (watch.trip == int(Trip.NONE))
+    return watch._replace(trip=xp.where(is_first, int(trip), watch.trip))
+
+
+def check_reading(
+    xp: Any, rules: Supervision, watch: Watch, measured: AnyArray, elapsed: AnyArray
+) -> Watch:
+    """After one reading.
+
+    Args:
+        measured: outputs.
+        elapsed: time since the last reading [s].
+    """
+    is_finite = xp.isfinite(measured)
+    change = abs(xp.where(is_finite, measured, 0.0) - watch.reading)
+    watch = tripped(xp, watch, ~is_finite.all(), Trip.NOT_FINITE)
+    allowed_change = rules.fastest * elapsed + 8 * rules.resolution
+    watch = tripped(xp, watch, (is_finite & (change > allowed_change)).any(), Trip.JUMP)
+    watch = tripped(xp, watch, (abs(measured) >= rules.critical).any(), Trip.LEVEL)
+    return watch._replace(reading=xp.where(is_finite, measured, watch.reading))
+
+
+def check_sample(xp: Any, rules: Supervision, watch: Watch) -> Watch:
+    """At a sampling instant, after its reading: prediction one step ahead, and staleness."""
+    newest, last = watch.reading, watch.samples[2]
+    samples = xp.concatenate([watch.samples[1:], newest[None]])
+    # A parabola through three samples knows that a swing slows down before it turns.
+    predicted = 3 * samples[2] - 3 * samples[1] + samples[0]
+    is_over = (abs(predicted) >= rules.critical) & (abs(newest) >= 0.9 * rules.critical)
+    watch = tripped(xp, watch, is_over.any() & (watch.num_samples >= 2), Trip.PREDICTED_LEVEL)
+    is_still = (newest == last) & (watch.num_samples > 0)
+    is_driven = (abs(watch.input - rules.safe_input) > rules.driven).any()
+    watch = watch._replace(
+        samples=samples,
+        num_samples=watch.num_samples + 1,
+        num_still=xp.where(is_still, watch.num_still + 1, 0),
+        last_move=xp.where(is_still, watch.last_move, abs(newest - last)),
+        num_driven=xp.where(is_still, watch.num_driven + is_driven, 0),
+    )
+    # A swing that turns slows down first: what stops at once is the sensor, not the plant.
+    is_stuck = (watch.num_still >= rules.num_still) & (watch.last_move > 4 * rules.resolution)
+    is_dead = watch.num_driven >= rules.num_dead
+    return tripped(xp, watch, (is_stuck | is_dead).any(), Trip.STALE)
+
+
+def allowed(
+    xp: Any, rules: Supervision, watch: Watch, proposed: AnyArray
+) -> tuple[Watch, AnyArray]:
+    """The watch and the input after an input was proposed: within limits and slew, or safe."""
+    watch = tripped(xp, watch, ~xp.isfinite(proposed).all(), Trip.INPUT_NOT_FINITE)
+    near = xp.clip(proposed, watch.input - rules.slew, watch.input + rules.slew)
+    near = xp.clip(near, rules.lower, rules.upper)
+    input = xp.where(watch.trip == int(Trip.NONE), near, xp.asarray(rules.safe_input))
+    return watch._replace(input=input), input

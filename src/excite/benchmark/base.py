@@ -23,16 +23,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Key, PRNGKeyArray
+from jaxtyping import Array, Float, Key
 
 from ..description import PlantDescription, display_unit, names_of
 from ..estimation import AbstractEstimator, Status, stack_experiments
+from ..evaluation import Episodes, evaluate
 from ..excitation import AbstractExcitation
 from ..files import folder_word, new_run_folder, write_json
-from ..information import cramer_rao_bound, experiment_information, relative_size, require_noise
-from ..plant import AbstractPlant, Params, draw_params
-from ..safety import critical_levels, is_violation, max_abs_output, watched_output
-from ..simulation import Trajectory, run_episode
+from ..information import d_optimality, require_noise
+from ..plant import AbstractPlant
+from ..safety import watched_output
+from ..simulation import Trajectory
 from ..study import Study, study_from
 
 CHUNK = 100
@@ -40,52 +41,6 @@ CHUNK = 100
 
 Progress = Callable[[str, int, int], None]
 """Called with what is being computed, how much of it is done, and how much there is."""
-
-
-class Episodes(eqx.Module):
-    """A batch of evaluation episodes of one method; the leading axis is the episode.
-
-    Attributes:
-        params: true parameters.
-        trajectory: inputs and outputs.
-        is_violation: whether the critical level was reached.
-        max_abs_output: largest magnitude of each output.
-        bound: least relative standard deviation of each parameter (Cramér-Rao).
-    """
-
-    params: Params
-    trajectory: Trajectory
-    is_violation: Array
-    max_abs_output: Float[Array, "*episode output"]
-    bound: Float[Array, "*episode param"]
-
-
-@eqx.filter_jit
-def evaluate(
-    plant: AbstractPlant,
-    excitation: AbstractExcitation,
-    num_steps: int,
-    spread: float,
-    keys: Key[Array, " episode"],
-) -> Episodes:
-    """One episode a key. The plant and the noise of a key are the same for any excitation."""
-
-    def episode(key: PRNGKeyArray) -> Episodes:
-        params_key, episode_key = jax.random.split(key)
-        params = draw_params(plant, params_key, spread)
-        trajectory = run_episode(plant, params, excitation, num_steps, episode_key)
-        information = experiment_information(plant, params, trajectory.inputs)
-        true = jnp.stack(params)
-        relative = relative_size(plant, params) / jnp.abs(true)
-        return Episodes(
-            params=params,
-            trajectory=trajectory,
-            is_violation=is_violation(trajectory.outputs, critical_levels(plant.definition)),
-            max_abs_output=max_abs_output(trajectory.outputs),
-            bound=cramer_rao_bound(information) * relative,
-        )
-
-    return jax.vmap(episode)(keys)
 
 
 @eqx.filter_jit
@@ -109,7 +64,7 @@ def episode_keys(study: Study) -> Key[Array, " episode"]:
 
 
 @dataclass(frozen=True)
-class _Outcome:
+class Outcome:
     """All episodes of one method and one estimator, on NumPy arrays."""
 
     true: Float[np.ndarray, "episode param"]
@@ -119,6 +74,7 @@ class _Outcome:
     is_violation: np.ndarray
     max_abs_output: Float[np.ndarray, "episode output"]
     bound: Float[np.ndarray, "episode param"]
+    log_det: Float[np.ndarray, " episode"]
 
 
 def run_benchmark(study: Study, progress: Progress = lambda *_: None) -> list[dict[str, Any]]:
@@ -154,7 +110,7 @@ def evaluate_method(
     estimators = study.build_estimators(plant)
     middle = np.mean(plant.input_limits, axis=0)
     keys = episode_keys(study)
-    outcomes: dict[str, list[_Outcome]] = {e: [] for e in estimators}
+    outcomes: dict[str, list[Outcome]] = {e: [] for e in estimators}
     squares = []
     for c, first in enumerate(range(0, study.episodes, CHUNK)):
         progress(c)
@@ -163,14 +119,37 @@ def evaluate_method(
         inputs = np.asarray(episodes.trajectory.inputs) - middle
         squares.append(np.mean(inputs**2, axis=1))
         for e, estimator in estimators.items():
-            outcomes[e].append(_outcome(plant, estimator, episodes))
-    rows = [_row(plant.description, name, e, _joined(parts)) for e, parts in outcomes.items()]
+            outcomes[e].append(outcome(plant, estimator, episodes))
+    own = _of_method(study, plant, excitation)
+    rows = [
+        {**table_row(study, plant.description, (name, e), joined(parts)), **own}
+        for e, parts in outcomes.items()
+    ]
     return rows, np.sqrt(np.concatenate(squares).mean(axis=0))
 
 
-def _outcome(plant: AbstractPlant, estimator: AbstractEstimator, episodes: Episodes) -> _Outcome:
+def _of_method(
+    study: Study, plant: AbstractPlant, excitation: AbstractExcitation
+) -> dict[str, Any]:
+    """Bounds of shorter experiments, where the study asks for them; signals are replanned."""
+    if not study.lengths:
+        return {}
+    keys = episode_keys(study)[:CHUNK]
+    bounds = [
+        np.asarray(evaluate(plant, excitation, length, study.spread, keys).bound).mean(axis=0)
+        for length in study.lengths
+    ]
+    names = names_of(plant.definition.parameters)
+    percent = {
+        n: (100 * values).tolist() for n, values in zip(names, np.transpose(bounds), strict=True)
+    }
+    return {"bound_by_length": {"num_steps": list(study.lengths), "cramer_rao_percent": percent}}
+
+
+def outcome(plant: AbstractPlant, estimator: AbstractEstimator, episodes: Episodes) -> Outcome:
+    """What an estimator makes of a batch of episodes."""
     estimated, std_error, status = estimate_all(plant, estimator, episodes.trajectory)
-    return _Outcome(
+    return Outcome(
         true=np.stack(episodes.params, axis=1),
         estimated=np.asarray(estimated),
         std_error=np.asarray(std_error),
@@ -178,18 +157,24 @@ def _outcome(plant: AbstractPlant, estimator: AbstractEstimator, episodes: Episo
         is_violation=np.asarray(episodes.is_violation),
         max_abs_output=np.asarray(episodes.max_abs_output),
         bound=np.asarray(episodes.bound),
+        log_det=np.asarray(jax.vmap(d_optimality)(episodes.information)),
     )
 
 
-def _joined(parts: list[_Outcome]) -> _Outcome:
-    names = [field.name for field in dataclasses.fields(_Outcome)]
-    return _Outcome(**{n: np.concatenate([getattr(p, n) for p in parts]) for n in names})
+def joined(parts: list[Outcome]) -> Outcome:
+    """Several batches as one."""
+    names = [field.name for field in dataclasses.fields(Outcome)]
+    return Outcome(**{n: np.concatenate([getattr(p, n) for p in parts]) for n in names})
 
 
-def _row(
-    description: PlantDescription, method: str, estimator: str, outcome: _Outcome
+def table_row(
+    study: Study, description: PlantDescription, names: tuple[str, str], outcome: Outcome
 ) -> dict[str, Any]:
-    """One row of the table; its keys are documented in docs/machine-readable.md."""
+    """One row of the table; its keys are documented in docs/machine-readable.md.
+
+    Args:
+        names: of method and estimator.
+    """
     good = outcome.status == Status.SUCCESSFUL
     error = (outcome.estimated / outcome.true - 1)[good]
     std_error = (outcome.std_error / np.abs(outcome.true))[good]
@@ -202,8 +187,8 @@ def _row(
         return dict(zip(names_of(description.parameters), values, strict=True))
 
     return {
-        "method": method,
-        "estimator": estimator,
+        "method": names[0],
+        "estimator": names[1],
         "evaluations": count,
         "failed": int(count - good.sum()),
         "failures": {reason: reasons.count(reason) for reason in sorted(set(reasons))},
@@ -214,11 +199,23 @@ def _row(
             **mean_sd(factor * outcome.max_abs_output[:, watched]),
             "unit": unit,
         },
+        "log_det_information": float(outcome.log_det.mean()),
+        "log_det_information_sd": mean_sd(outcome.log_det)["sd"],
+        **_paired_log_det(study, outcome),
         "relative_error_percent": by_name(_error(100 * np.abs(e)) for e in error.T),
         "cramer_rao_percent": by_name(100 * outcome.bound.mean(axis=0)),
         "rms_over_cramer_rao": by_name(_rms(error) / _rms(outcome.bound[good])),
         "coverage95_percent": by_name(100 * _fraction(np.abs(error) < 1.959964 * std_error)),
         "beyond_6_std_errors": int(np.any(np.abs(error) > 6 * std_error, axis=1).sum()),
+    }
+
+
+def _paired_log_det(study: Study, outcome: Outcome) -> dict[str, float]:
+    """Mean over the plants that the clairvoyant signals are designed for."""
+    if study.clairvoyant is None:
+        return {}
+    return {
+        "log_det_of_clairvoyant_plants": float(outcome.log_det[: study.clairvoyant.plants].mean())
     }
 
 
@@ -334,18 +331,23 @@ def unpacked(
         yield study, plant
 
 
-def methods_task(study: Mapping[str, Any], plant: Mapping[str, Any]) -> list[dict[str, Any]]:
+def methods_task(study: Mapping[str, Any], plant: Mapping[str, Any]) -> dict[str, Any]:
     """Rows of a study's own methods; what a worker is called for."""
     with unpacked(study, plant) as (chosen, _):
-        return run_benchmark(chosen)
+        return {"rows": run_benchmark(chosen)}
 
 
 def study_of(folder: Path) -> Study:
-    """The study of a run folder."""
-    if not (folder / "study.json").is_file():
+    """The study of a run folder; ValueError where there is none."""
+    path = folder / "study.json"
+    if not folder.is_dir():
+        raise ValueError(f"{folder}: no such folder")
+    if not path.is_file():
         raise ValueError(f"{folder} holds no study")
-    settings = read_json(folder / "study.json")
-    return study_from(settings, str(folder / "study.json"))
+    try:
+        return study_from(read_json(path), "settings")
+    except ValueError:
+        raise damaged(path) from None
 
 
 def numbers_of(value: Any) -> Any:
@@ -365,8 +367,25 @@ def read_json(path: Path, *keys: str) -> dict[str, Any]:
     """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise ValueError(f"{path}: cannot be read ({error})") from None
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read ({error.strerror})") from None
+    except (ValueError, RecursionError):
+        raise damaged(path) from None
     if not isinstance(content, dict) or not set(keys) <= content.keys():
-        raise ValueError(f"{path} is damaged; delete it and run the study again")
+        raise damaged(path)
     return content
+
+
+_REMEDIES = {
+    "study.json": "if the folder is of this study, delete the file: 'excite study run' writes it",
+    "run.json": "if the folder is of this study, delete the file: 'excite study run' writes it",
+    "clairvoyant.json": "delete it: 'excite study run' designs them again",
+    "methods.json": "delete it: 'excite study run' computes it again",
+    "table.json": "delete it: 'excite study run' writes it again",
+}
+
+
+def damaged(path: Path) -> ValueError:
+    """The error for a file of a run folder that is not as it was written, and what helps."""
+    of_seed = f"delete {path.parent}: 'excite study run' trains that seed from the beginning"
+    return ValueError(f"{path} is damaged; {_REMEDIES.get(path.name, of_seed)}")

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
-import os
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -27,9 +26,6 @@ from ..study import Agent, Study
 from ..training.base import Checkpoint, Trained
 from .base import agent_settings, evaluate_method, fingerprint, unpacked
 
-CHECKPOINT_SECONDS = float(os.environ.get("EXCITE_CHECKPOINT_SECONDS", "20"))
-"""Least time between two checkpoints of a seed."""
-
 COLLAPSED = 0.01
 """An agent whose RMS input over the evaluation is below this fraction of its limit."""
 
@@ -40,6 +36,7 @@ def seed_task(
     agent: str,
     seed: int,
     folder: str | None,
+    checkpoint_seconds: float,
 ) -> dict[str, Any]:
     """A trained policy, its learning curve, and how it does in the evaluation.
 
@@ -48,12 +45,14 @@ def seed_task(
         plant: `text`, the source of a user's own plant or None, and the plant's `hash`.
         agent, seed: what to train.
         folder: for checkpoints and logs, where this machine sees it.
+        checkpoint_seconds: least time between two checkpoints.
     """
     with unpacked(study, plant) as (chosen, built):
-        mark = fingerprint(chosen, built, agent)
-        keeper = _Keeper(Path(folder) if folder and Path(folder).is_dir() else None, mark)
-        env = chosen.agent(agent).env(built, chosen.spread, chosen.num_steps)
-        trained = _trained(env, chosen.agent(agent), seed, keeper)
+        mark, own = fingerprint(chosen, built, agent), chosen.agent(agent)
+        place = Path(folder) if folder and Path(folder).is_dir() else None
+        keeper = _Keeper(place, mark, checkpoint_seconds)
+        env = own.env(built, chosen.spread, chosen.num_steps)
+        trained = _trained(env, own, seed, keeper)
         seconds = keeper.seconds()
         provenance = {
             "excite": __version__,
@@ -67,7 +66,7 @@ def seed_task(
             "agent": agent,
             "seed": seed,
             **_evaluated(chosen, built, agent, policy),
-            "validation": trained.curve[-1],
+            "validation": trained.validation,
             "train_seconds": seconds,
             "resumed_at_steps": keeper.resumed_at_steps,
             "fingerprint": mark,
@@ -95,8 +94,8 @@ def _evaluated(study: Study, plant: AbstractPlant, agent: str, policy: Policy) -
 class _Keeper:
     """Writes checkpoints and progress of one seed into its folder, if there is one."""
 
-    def __init__(self, folder: Path | None, fingerprint: str) -> None:
-        self.folder, self.fingerprint = folder, fingerprint
+    def __init__(self, folder: Path | None, fingerprint: str, every: float) -> None:
+        self.folder, self.fingerprint, self.every = folder, fingerprint, every
         self.resumed_at_steps: int | None = None
         self.path = None if folder is None else folder / "checkpoint.safetensors"
         self.log_folder = None if folder is None else str(folder / "tensorboard")
@@ -117,8 +116,8 @@ class _Keeper:
             self.before = float(checkpoint.state["seconds"])
             self.resumed_at_steps = int(checkpoint.state["num_steps"])
         except (ValueError, KeyError, TypeError) as error:
-            hint = "; delete it to train this seed from the beginning"
-            raise ValueError(f"{error}{hint}") from None
+            what = error if type(error) is ValueError else f"{self.path} is damaged"
+            raise ValueError(f"{what}; delete it to train this seed from the beginning") from None
         return checkpoint
 
     def keep(self, checkpoint: Callable[[], Checkpoint], row: dict[str, float] | None) -> None:
@@ -127,7 +126,7 @@ class _Keeper:
             return
         if row is not None:
             write_json(self.folder / "progress.json", row)
-        if time.monotonic() - self.last >= CHECKPOINT_SECONDS:
+        if time.monotonic() - self.last >= self.every:
             made = checkpoint()
             own = {"seconds": self.seconds(), "fingerprint": self.fingerprint}
             state = {**made.state, **own}

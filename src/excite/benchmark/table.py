@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence, Set
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +11,19 @@ import jax
 import numpy as np
 import scipy.stats
 
-from ..description import names_of
+from ..description import PlantDescription, names_of
 from ..estimation import ARX
 from ..estimation.arx import running_params
+from ..evaluation import evaluate
 from ..excitation import PolicyExcitation
+from ..objective import InformationGain
 from ..plant import AbstractARXPlant, AbstractPlant
 from ..policy import read_policy
 from ..records import Record
 from ..study import Study
 from .base import (
+    damaged,
     episode_keys,
-    evaluate,
     mean_sd,
     numbers_of,
     read_json,
@@ -42,18 +44,115 @@ def study_table(folder: Path) -> dict[str, Any]:
     study = study_of(folder)
     seeds = {
         agent: [
-            numbers_of(read_json(path, "rows", "viable"))
+            _metrics(study, folder, agent, seed)
             for seed in range(study.seeds)
-            if (path := seed_folder(folder, agent, seed) / "metrics.json").is_file()
+            if (seed_folder(folder, agent, seed) / "metrics.json").is_file()
         ]
         for agent in study.agents
     }
     _require_finished(study, folder, seeds)
-    rows = numbers_of(read_json(folder / "methods.json", "rows")["rows"]) if study.methods else []
-    rows = [{**row, **_UNTRAINED} for row in rows]
+    rows = []
+    if study.methods:
+        params = _params(folder)
+        shapes = [_row_shape(params, m, e) for m in study.methods for e in study.estimators]
+        rows = _read(folder / "methods.json", {"rows": shapes})["rows"]
+        rows = [{**row, **_UNTRAINED} for row in rows]
     for metrics in seeds.values():
         rows += [across_seeds(metrics, e) for e in range(len(study.estimators))]
+    if study.clairvoyant is not None:
+        rows = _with_efficiency(study, folder, rows)
     return {"rows": rows, "differences": _differences(study, rows, seeds)}
+
+
+def _with_efficiency(
+    study: Study, folder: Path, rows: list[dict[str, Any]]
+) -> list[dict[str, Any]]:
+    """The rows and the clairvoyant signals' own, each with its D-efficiency.
+
+    exp((log det - log det of the clairvoyant) / number of parameters), both of the same
+    plants: how much of the information a parameter that can be had (A. Atkinson, A. Donev,
+    R. Tobias, Optimum Experimental Designs, 2007).
+    """
+    params = _params(folder)
+    shapes = [_row_shape(params, str, e) for e in study.estimators]
+    best = _read(folder / "clairvoyant.json", {"rows": shapes})["rows"]
+    reference = best[0]["log_det_of_clairvoyant_plants"]
+
+    def efficiency(row: Mapping[str, Any]) -> float:
+        own = row.get("log_det_of_clairvoyant_plants", math.nan)  # none where no seed is viable
+        return math.exp((own - reference) / len(params))
+
+    rows = [*rows, *({**row, **_UNTRAINED} for row in best)]
+    return [{**row, "d_efficiency": efficiency(row)} for row in rows]
+
+
+_NUMBER = int | float
+_NUMBERS: dict[str, Any] = {"mean": _NUMBER, "sd": _NUMBER}
+
+
+def _params(folder: Path) -> tuple[str, ...]:
+    """Names of the parameters of the run folder's plant."""
+    plant = read_json(folder / "run.json", "plant")["plant"]
+    try:
+        return names_of(PlantDescription.from_dict(plant).parameters)
+    except (ValueError, TypeError, AttributeError):
+        raise damaged(folder / "run.json") from None
+
+
+def _row_shape(
+    params: Sequence[str], method: Any = str, estimator: Any = str, is_agents: bool = False
+) -> dict[str, Any]:
+    """What a row has; one of a whole agent has more than those of its seeds."""
+    error = {**_NUMBERS, "median": _NUMBER, "rms": _NUMBER}
+    trained: dict[str, Any] = {}
+    if is_agents:
+        error["all_seeds"] = _NUMBERS
+        trained = {"seeds": int, "viable_seeds": int, "train_seconds": _NUMBER}
+    counts = ("evaluations", "failed", "violations", "beyond_6_std_errors")
+    numbers = ("cramer_rao_percent", "rms_over_cramer_rao", "coverage95_percent")
+    return {
+        "method": method,
+        "estimator": estimator,
+        **dict.fromkeys(counts, int),
+        "failures": dict,
+        "violation_rate": {"ci95": [_NUMBER, _NUMBER]},
+        "max_abs_output": {"output": str, "unit": str, **_NUMBERS},
+        "relative_error_percent": dict.fromkeys(params, error),
+        **dict.fromkeys(numbers, dict.fromkeys(params, _NUMBER)),
+        **trained,
+    }
+
+
+def _fits(value: Any, shape: Any) -> bool:
+    """Whether a value has the keys, lengths and types of `shape`, and the words in it."""
+    if isinstance(shape, dict):
+        return isinstance(value, dict) and all(
+            key in value and _fits(value[key], part) for key, part in shape.items()
+        )
+    if isinstance(shape, list):
+        return (
+            isinstance(value, list) and len(value) == len(shape) and all(map(_fits, value, shape))
+        )
+    return value == shape if isinstance(shape, str) else isinstance(value, shape)
+
+
+def _read(path: Path, shape: Mapping[str, Any]) -> dict[str, Any]:
+    """Content of a file of a run folder, numbers that do not exist included."""
+    content = numbers_of(read_json(path))
+    if not _fits(content, shape):
+        raise damaged(path)
+    return content
+
+
+def _metrics(study: Study, folder: Path, agent: str, seed: int) -> dict[str, Any]:
+    params = _params(folder)
+    shape = {
+        "rows": [_row_shape(params, agent, estimator) for estimator in study.estimators],
+        "viable": bool,
+        "train_seconds": _NUMBER,
+        "validation": {"return": _NUMBER},
+    }
+    return _read(seed_folder(folder, agent, seed) / "metrics.json", shape)
 
 
 def _require_finished(
@@ -63,6 +162,8 @@ def _require_finished(
     what = f"{missing} of {study.seeds * len(study.agents)} trainings are missing"
     if not missing and study.methods and not (folder / "methods.json").is_file():
         what = "its methods are not evaluated yet"
+    elif not missing and study.clairvoyant and not (folder / "clairvoyant.json").is_file():
+        what = "its clairvoyant signals are not designed yet"
     elif not missing:
         return
     raise ValueError(
@@ -107,6 +208,8 @@ def across_seeds(metrics: list[dict[str, Any]], estimator: int) -> dict[str, Any
             **rows[0]["max_abs_output"],
             **_mean_sd([r["max_abs_output"]["mean"] for r in viable]),
         },
+        **_means(rows, viable, "log_det"),
+        **_mean_lengths(viable),
         "relative_error_percent": {name: error(name) for name in names},
         "cramer_rao_percent": of_viable("cramer_rao_percent"),
         "rms_over_cramer_rao": of_viable("rms_over_cramer_rao"),
@@ -116,6 +219,25 @@ def across_seeds(metrics: list[dict[str, Any]], estimator: int) -> dict[str, Any
         "seeds": len(rows),
         "train_seconds": sum(m["train_seconds"] for m in metrics),
     }
+
+
+def _means(
+    rows: list[dict[str, Any]], viable: list[dict[str, Any]], prefix: str
+) -> dict[str, float]:
+    """Means of numbers that rows of an older version do not have; none where one lacks them."""
+    keys = [key for key in rows[0] if key.startswith(prefix) and all(key in r for r in rows)]
+    return {key: _mean_sd([r[key] for r in viable])["mean"] for key in keys}
+
+
+def _mean_lengths(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    own = [row["bound_by_length"] for row in rows if "bound_by_length" in row]
+    if not own:
+        return {}
+    percent = {
+        name: np.mean([o["cramer_rao_percent"][name] for o in own], axis=0).tolist()
+        for name in own[0]["cramer_rao_percent"]
+    }
+    return {"bound_by_length": {"num_steps": own[0]["num_steps"], "cramer_rao_percent": percent}}
 
 
 def _total(rows: list[dict[str, Any]], key: str) -> int:
@@ -183,16 +305,27 @@ def finished_table(folder: Path) -> dict[str, Any]:
         study_table(folder)  # says what is missing
         raise ValueError(f"{folder}: the table was not written; 'excite study run' writes it")
     content = read_json(path, "rows")
+    try:
+        params = list(content["rows"][0]["relative_error_percent"])
+        is_agents = [row.get("seeds") is not None for row in content["rows"]]
+    except (AttributeError, LookupError, TypeError):
+        raise damaged(path) from None
+    shapes = [_row_shape(params, is_agents=is_agent) for is_agent in is_agents]
+    if not _fits(numbers_of(content["rows"]), shapes):
+        raise damaged(path)
     return {**content, "rows": [{**_UNTRAINED, **row} for row in content["rows"]]}
 
 
 def best_seeds(study: Study, folder: Path) -> dict[str, int]:
-    """By agent, the seed with the highest return in the validation episodes."""
+    """By agent, the seed that was worth most in the validation episodes.
+
+    By the objective where training tells it, else by the return.
+    """
 
     def value(agent: str, seed: int) -> float:
-        metrics = read_json(seed_folder(folder, agent, seed) / "metrics.json", "validation")
-        reward = metrics["validation"]["return"]
-        return -math.inf if reward is None else reward
+        look = _metrics(study, folder, agent, seed)["validation"]
+        reward = look.get("worth", look["return"])
+        return -math.inf if math.isnan(reward) else reward
 
     seeds = range(study.seeds)
     return {a: max(seeds, key=lambda seed, a=a: value(a, seed)) for a in study.agents}
@@ -200,13 +333,27 @@ def best_seeds(study: Study, folder: Path) -> dict[str, int]:
 
 def learning_curves(study: Study, folder: Path) -> dict[str, list[dict[str, np.ndarray]]]:
     """Learning curves of all seeds by agent."""
+    names = {"steps", "violation_rate", *(f"relative_error_{p}" for p in _params(folder))}
+    seeds, curves = range(study.seeds), {}
+    for agent in study.agents:
+        paths = [seed_folder(folder, agent, seed) / "curve.csv" for seed in seeds]
+        curves[agent] = [_curve(path, names) for path in paths]
+        lengths = [len(curve["steps"]) for curve in curves[agent]]
+        if min(lengths) < max(lengths):  # every seed is looked at as often
+            raise damaged(paths[lengths.index(min(lengths))])
+    return curves
 
-    def curve(agent: str, seed: int) -> dict[str, np.ndarray]:
-        text = (seed_folder(folder, agent, seed) / "curve.csv").read_text(encoding="utf-8")
-        names, *rows = (line.split(",") for line in text.splitlines())
-        return dict(zip(names, np.array(rows, float).T, strict=True))
 
-    return {a: [curve(a, seed) for seed in range(study.seeds)] for a in study.agents}
+def _curve(path: Path, names: Set[str]) -> dict[str, np.ndarray]:
+    """Columns of a learning curve, these among them."""
+    try:
+        header, *rows = (line.split(",") for line in path.read_text("utf-8").splitlines())
+        curve = dict(zip(header, np.array(rows, float).T, strict=True))
+    except (OSError, ValueError):
+        raise damaged(path) from None
+    if not names <= curve.keys():
+        raise damaged(path)
+    return curve
 
 
 def example_episodes(study: Study, folder: Path) -> dict[str, tuple[Record, np.ndarray]]:
@@ -218,18 +365,36 @@ def example_episodes(study: Study, folder: Path) -> dict[str, tuple[Record, np.n
     plant, episodes = study.build_plant(), {}
     first = episode_keys(study)[:1]
     for agent, seed in best_seeds(study, folder).items():
-        policy = read_policy(seed_folder(folder, agent, seed) / "policy.safetensors")
-        excitation = PolicyExcitation.of(policy)
+        path = seed_folder(folder, agent, seed) / "policy.safetensors"
+        try:
+            excitation = PolicyExcitation.of(read_policy(path))
+        except ValueError:
+            raise damaged(path) from None
         batch = evaluate(plant, excitation, study.num_steps, study.spread, first)
         run, params = jax.tree.map(lambda leaf: leaf[0], (batch.trajectory, batch.params))
-        record = Record.of_episode(run.time, run.inputs, run.outputs)
-        estimates = _running(study, plant, run.inputs, run.measured)
+        estimator, estimates = _running(study, plant, run.inputs, run.measured)
+        about = {"seed": seed, "estimator": estimator}
+        record = Record.of_episode(run.time, run.inputs, run.outputs, about)
         episodes[agent] = record, estimates / np.stack(params)
     return episodes
 
 
-def _running(study: Study, plant: AbstractPlant, inputs: Any, measured: Any) -> np.ndarray:
-    estimators = [e for e in study.build_estimators(plant).values() if isinstance(e, ARX)]
-    if not (estimators and isinstance(plant, AbstractARXPlant)):
-        return np.full((len(measured), len(names_of(plant.definition.parameters))), np.nan)
-    return np.asarray(running_params(estimators[0], plant, inputs, measured))
+def _running(
+    study: Study, plant: AbstractPlant, inputs: Any, measured: Any
+) -> tuple[str, np.ndarray]:
+    for name, estimator in study.build_estimators(plant).items():
+        if isinstance(estimator, ARX) and isinstance(plant, AbstractARXPlant):
+            return name, np.asarray(running_params(estimator, plant, inputs, measured))
+    return "", np.full((len(measured), len(names_of(plant.definition.parameters))), np.nan)
+
+
+def bound_curves(study: Study) -> list[str]:
+    """Agents whose learning curves hold the Cramér-Rao bound in the place of errors."""
+    plant = study.build_plant()
+    return [
+        name
+        for name in study.agents
+        if isinstance(
+            study.agent(name).env(plant, study.spread, study.num_steps).objective, InformationGain
+        )
+    ]

@@ -14,11 +14,15 @@ import click
 
 from .. import __version__
 from .benchmark import benchmark
+from .design import design
 from .doctor import doctor
 from .door import RunFailedError
+from .export import export
 from .identify import identify
 from .information import information
 from .plants import plants
+from .policies import evaluate, policies
+from .run import run
 from .simulate import simulate
 from .study import study
 from .train import train
@@ -34,7 +38,10 @@ def cli(debug: bool) -> None:
     del debug  # read from the arguments in `main`, where errors arrive
 
 
-for command in (plants, simulate, information, identify, train, benchmark, study, doctor):
+for command in (
+    plants, policies, simulate, information, identify, design, train, evaluate, run, export,
+    benchmark, study, doctor,
+):  # fmt: skip
     cli.add_command(command)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -35,14 +37,14 @@ def benchmark(
     from ..benchmark import run_benchmark, write_benchmark
     from ..files import require_free_run_folder
     from ..report import benchmark_figure, save
-    from ..study import read_study
 
     overwrite = options.pop("overwrite")
     if out is not None:
         require_free_run_folder(out, overwrite)
-    chosen = read_study(study).changed(**options)
-    if chosen.agents:
-        raise ValueError(f"{study} has agents to train: excite study run {study} --out FOLDER")
+    chosen = study_in(study).changed(**options)
+    if chosen.agents or chosen.clairvoyant:
+        what = "agents to train" if chosen.agents else "signals to design"
+        raise ValueError(f"{study} has {what}: excite study run {study} --out FOLDER")
     with progress_bar(chosen.name) as progress:
         rows = run_benchmark(chosen, progress)
     settings = chosen.model_dump()
@@ -54,6 +56,20 @@ def benchmark(
         show_json({"rows": rows})
     else:
         show_comparison(rows, settings, out)
+
+
+def study_in(path: Path) -> Any:
+    """The study in a file, its warnings on stderr; shared with `study`."""
+    from ..study import read_study
+
+    return warned(read_study(path))
+
+
+def warned(study: Any) -> Any:
+    """The study, after its warnings on stderr; shared with `evaluate`."""
+    for warning in study.warnings():
+        click.echo(f"warning: {warning}", err=True)
+    return study
 
 
 def comparison_files(rows: Any, settings: Any) -> dict[str, bytes]:
@@ -70,10 +86,14 @@ def comparison_files(rows: Any, settings: Any) -> dict[str, bytes]:
 
 def show_comparison(rows: Any, settings: Any, out: Path | None) -> None:
     """A study's table and footnotes on stdout; shared with `study`."""
-    from ..report import all_cells, footnotes, table_header
+    from ..report import all_cells, fitting_tables, footnotes, table_header
 
     title = settings["title"] or settings["name"]
-    show_table(title, table_header(rows), all_cells(rows, settings["reference"]))
+    width = shutil.get_terminal_size().columns if sys.stdout.isatty() else 200
+    cells = all_cells(rows, settings["reference"])
+    for header, part in fitting_tables(table_header(rows), cells, width):
+        show_table(title, header, part)
+        title = ""
     for note in footnotes(settings):
         click.echo(note)
     if out is not None:

@@ -8,29 +8,26 @@ from typing import Any
 
 import click
 
-from .door import cache_folder, computing, json_option, show_json, show_table
+from .door import cache_folder, json_option, prepare_jax, show_json, show_table
 
 
 @click.command()
 @json_option
-@computing
 def doctor(as_json: bool) -> None:
     """Print versions, devices and extras, and what to type for what is missing."""
     import platform
-
-    import jax
 
     core, extras = _requirements()
     result = {
         "excite": metadata.version("excite"),
         "python": platform.python_version(),
-        "devices": [str(device) for device in jax.devices()],
+        "devices": _devices(),
         "packages": {name: _version(name) for name in core},
         "extras": {
             extra: {
                 "installed": not (missing := [n for n in names if _version(n) is None]),
                 "missing": missing,
-                "install": f"pip install --constraint constraints.txt --editable '.[{extra}]'",
+                "install": f"python -m pip install -e '.[{extra}]'",
             }
             for extra, names in extras.items()
         },
@@ -40,6 +37,17 @@ def doctor(as_json: bool) -> None:
         show_json(result)
         return
     _show(result)
+
+
+def _devices() -> list[str]:
+    """Where JAX computes; nowhere without it."""
+    try:
+        prepare_jax()
+    except ImportError:
+        return []
+    import jax
+
+    return [str(device) for device in jax.devices()]
 
 
 def _requirements() -> tuple[list[str], dict[str, list[str]]]:
@@ -62,7 +70,7 @@ def _version(package: str) -> str | None:
 
 def _show(result: dict[str, Any]) -> None:
     click.echo(f"excite {result['excite']}, Python {result['python']}")
-    click.echo(f"devices: {', '.join(result['devices'])}")
+    click.echo(f"devices: {', '.join(result['devices']) or 'none, JAX is not installed'}")
     click.echo(f"compiled programs: {result['cache']}")
     show_table(
         "core", ["package", "version"], [[n, v or "MISSING"] for n, v in result["packages"].items()]

@@ -44,6 +44,12 @@ class Assignments(click.ParamType):
         return result
 
 
+class WholeNumber(click.IntRange):
+    """A whole number of a range, called so when it is none."""
+
+    name = "whole number"
+
+
 def _option_value(text: str) -> Any:
     """A number, true, false or a list of numbers, as TOML and JSON write them."""
     value = json.loads(text)
@@ -82,12 +88,12 @@ def computing(command: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(command)
     def wrapped(*args: Any, **kwargs: Any) -> Any:
-        # The compiler's remarks on its own cache are no concern of the user's.
-        os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-        import jax
-
-        jax.config.update("jax_enable_x64", True)
-        _keep_compiled_programs(jax)
+        try:
+            prepare_jax()
+        except ImportError:
+            raise ValueError(
+                "this command needs JAX, which is not installed: python -m pip install -e ."
+            ) from None
         plot = kwargs.get("plot")
         if plot is not None:
             from ..report import require_plot_path
@@ -96,6 +102,16 @@ def computing(command: Callable[..., Any]) -> Callable[..., Any]:
         return command(*args, **kwargs)
 
     return wrapped
+
+
+def prepare_jax() -> None:
+    """Double precision, and a cache of compiled programs."""
+    # The compiler's remarks on its own cache are no concern of the user's.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    _keep_compiled_programs(jax)
 
 
 def _keep_compiled_programs(jax: Any) -> None:

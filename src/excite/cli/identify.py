@@ -29,7 +29,7 @@ from .door import (
     default="nls",
     show_default=True,
     metavar="NAME",
-    help="nls, arx-rls (the paper's) or arx-rls-wide (wide start covariance).",
+    help="nls, arx-rls (the paper's), arx-rls-wide (wide start covariance) or decrement.",
 )
 @click.option(
     "--initial-state",

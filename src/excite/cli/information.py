@@ -56,7 +56,8 @@ def information(
         percent = {n: p["cramer_rao_percent"] for n, p in result["params"].items()}
         save(information_figure(chosen.description, drawn, percent), plot)
     if as_json:
-        show_json({**result, "excitation": job["excitation_name"], "num_steps": job["steps"]})
+        kept = {"num_steps": job["steps"], "warnings": job["warnings"]}
+        show_json({**result, "excitation": job["excitation_name"], **kept})
     else:
         _show(chosen.description, result, job)
 

@@ -28,13 +28,16 @@ def excitation_options(command: Any) -> Any:
     for option in reversed(
         [
             click.option("--excitation", metavar="NAME",
-                         help="random, prbs, chirp, multisine, square, or the file of a policy "
-                         "(.safetensors); default chirp."),
+                         help="random, prbs, chirp, multisine, square, decay, loop-NAME around one "
+                         "of them, a shipped policy, or a file: policy (.safetensors) or signal "
+                         "(.csv, .mat); default chirp."),
             click.option("--set", "settings", type=VALUES, multiple=True,
                          help="Options of the excitation: amplitude, hold, clock, register, "
-                         "start_frequency, stop_frequency, frequency, logarithmic."),
+                         "start_frequency, stop_frequency, frequency, logarithmic, pump; of a "
+                         "loop also gain, damping."),
             click.option("--steps", type=click.IntRange(2, 10_000_000), metavar="T",
-                         help="Length in samples; default 500, or all of a file."),
+                         help="Length in samples; default 500, that of a policy, or all of a "
+                         "file."),
             click.option("--params", type=NUMBERS, multiple=True,
                          help="True parameters where they are not the nominal ones."),
             click.option("--noise", type=NUMBERS, multiple=True,
@@ -53,54 +56,68 @@ def excitation_options(command: Any) -> Any:
 
 
 def prepared(options: dict[str, Any], plant_name: str, file: Path | None) -> dict[str, Any]:
-    """Plant, true parameters, excitation, length and key from the options above."""
+    """Plant, true parameters, excitation, length and key from the options above.
+
+    A policy of another plant is warned of.
+    """
     import jax
     import jax.numpy as jnp
 
     from ..excitation import Replay
-    from ..names import excitation_named, plant_named, policy_origin, with_sensor
+    from ..names import plant_named, with_sensor
     from ..plant import params_from
-    from ..records import read_record
+    from ..records import read_record, require_playable
 
     plant = with_sensor(
         plant_named(plant_name), merged(options["noise"]), merged(options["resolution"])
     )
-    record, name, settings = None, options["excitation"], merged(options["settings"])
-    if file is not None and (settings or name):
+    record, origin, name = None, {}, options["excitation"]
+    if file is not None and (options["settings"] or name):
         raise ValueError("an input file takes the place of --excitation and --set")
     if file is None:
         name = name or "chirp"
-        excitation = excitation_named(name, settings, plant)
-        steps = options["steps"] or 500
+        excitation, origin, steps = _named(name, options, plant)
     else:
         columns, scales = merged(options["column"]), merged(options["scale"])
         record = read_record(file, plant.definition, columns, scales, inputs_only=True)
-        _require_playable(record, plant)
+        require_playable(record, plant.definition)
         plant = plant.changed(dt=record.dt)
         excitation, name = Replay(jnp.asarray(record.inputs)), "replay"
         steps = options["steps"] or len(record.inputs) - 1
         if steps > len(record.inputs):
             raise ValueError(f"{file} has {len(record.inputs)} inputs, --steps asks for {steps}")
-    return {
+    job = {
         "plant": plant,
         "params": params_from(plant, merged(options["params"])),
         "excitation": excitation,
         "excitation_name": name,
-        "origin": policy_origin(name, plant),
+        "origin": origin,
+        "warnings": [origin["warning"]] if "warning" in origin else [],
         "steps": steps,
         "key": jax.random.key(options["seed"]),
         "record": record,
     }
+    for warning in job["warnings"]:
+        click.echo(f"warning: {warning}", err=True)
+    return job
 
 
-def _require_playable(record: Any, plant: Any) -> None:
-    """A record with inputs beyond the limits would be clipped into another experiment."""
-    for part, values in zip(plant.definition.inputs, record.inputs.T, strict=True):
-        if values.min() < part.lower - 1e-9 or values.max() > part.upper + 1e-9:
-            raise ValueError(
-                f"{record.source}: {part.name!r} runs from {values.min():g} to {values.max():g} "
-                f"{part.unit}; the plant's limits are {part.lower:g} to {part.upper:g} {part.unit}"
-            )
+def _named(name: str, options: dict[str, Any], plant: Any) -> tuple[Any, dict[str, str], int]:
+    """An excitation by name, the origin of a policy, and how many steps."""
+    from ..excitation import PolicyExcitation, Replay
+    from ..names import excitation_and_origin
+
+    excitation, origin = excitation_and_origin(name, merged(options["settings"]), plant)
+    if isinstance(excitation, PolicyExcitation):
+        longest = excitation.layout.num_steps
+    elif isinstance(excitation, Replay):
+        longest = len(excitation.inputs)
+    else:
+        return excitation, origin, options["steps"] or 500
+    steps = options["steps"] or longest
+    if steps > longest:
+        raise ValueError(f"{name} was made for {longest} steps; --steps asks for {steps}")
+    return excitation, origin, steps
 
 
 @click.command()
@@ -138,8 +155,6 @@ def simulate(
             "the simulation left the finite numbers: these parameters make the plant too fast "
             "for its integration step, or unstable"
         )
-    if "warning" in job["origin"]:
-        click.echo(f"warning: {job['origin']['warning']}", err=True)
     description = job["plant"].description
     record = _record(run, job, options["seed"])
     summary = {
@@ -152,6 +167,7 @@ def simulate(
         "max_abs_output": _by_name(description.outputs, max_abs_output(run.outputs)),
         "is_violation": bool(is_violation(run.outputs, critical_levels(description))),
         "file": None if out is None else str(out),
+        "warnings": job["warnings"],
     }
     if plot is not None:
         save(episode_figure(description, record), plot)

@@ -9,10 +9,11 @@ from typing import Any
 
 import click
 
-from .benchmark import comparison_files, show_comparison
+from .benchmark import comparison_files, show_comparison, study_in
 from .door import (
     OUT_FILE,
     RunFailedError,
+    WholeNumber,
     computing,
     json_option,
     progress_bar,
@@ -37,27 +38,19 @@ def study() -> None:
 )
 @click.option("--address", metavar="tcp://HOST:PORT", help="Scheduler of the Dask cluster.")
 @click.option(
-    "--workers",
-    type=click.IntRange(min=1),
-    help="Processes of the local engine; default one a core.",
+    "--workers", type=WholeNumber(1), help="Processes of the local engine; default one a core."
 )
 @json_option
 @computing
 def run(
-    study_file: Path,
-    out: Path,
-    engine: str,
-    address: str | None,
-    workers: int | None,
+    study_file: Path, out: Path, engine: str, address: str | None, workers: int | None,
     as_json: bool,
-) -> None:
+) -> None:  # fmt: skip
     """Train what STUDY.toml lacks in its run folder, then write its table and figures.
 
     Interrupted at any moment, the same command goes on where it was.
     """
-    from ..study import read_study
-
-    chosen = read_study(study_file)
+    chosen = study_in(study_file)
     run_study_here(chosen, out, as_json, engine, address, workers)
 
 
@@ -72,8 +65,8 @@ def run_study_here(
     """Runs a study, writes and shows its table; shared with `train`."""
     from ..benchmark.run import run_study
 
-    if engine == "local" and any(agent.method == "ppo" for agent in chosen.agents.values()):
-        _require_trainer()
+    if engine == "local":
+        _require_trainer(chosen, out)
     machine = _engine(engine, address, workers)
 
     def finished(name: str) -> None:
@@ -83,17 +76,26 @@ def run_study_here(
         with progress_bar(chosen.name) as progress:
             failures = run_study(chosen, out, machine, progress, finished)
         if failures:
-            reasons = "; ".join(f"{name}: {reason}" for name, reason in failures.items())
-            raise RunFailedError(
-                f"{len(failures)} tasks failed ({reasons}); what is finished is kept in {out}, "
-                "the same command tries the rest again"
-            )
+            raise _failed(failures, out)
         _finish(chosen, out)
         _show(out, as_json)
     except KeyboardInterrupt:
         kept = f"what is finished is kept in {out}, the same command goes on"
         click.echo(f"excite: interrupted; {kept}", err=True)
         sys.exit(130)
+
+
+def _failed(failures: dict[str, Exception], out: Path) -> Exception:
+    """One error for all tasks that failed; the user's mistake where every one of them is."""
+    names: dict[str, list[str]] = {}
+    for name, error in failures.items():
+        names.setdefault(str(error), []).append(name)
+    reasons = "; ".join(f"{', '.join(some)}: {reason}" for reason, some in names.items())
+    is_mistake = all(isinstance(error, ValueError) for error in failures.values())
+    return (ValueError if is_mistake else RunFailedError)(
+        f"{len(failures)} task{'s' * (len(failures) > 1)} failed ({reasons}); what is finished "
+        f"is kept in {out}, the same command tries the rest again"
+    )
 
 
 @study.command()
@@ -105,15 +107,19 @@ def table(folder: Path, as_json: bool) -> None:
     _show(folder, as_json)
 
 
-def _require_trainer() -> None:
+def _require_trainer(chosen: Any, out: Path) -> None:
+    """Raises ValueError where seeds are left to train and a library is missing."""
     from importlib.util import find_spec
 
+    from ..benchmark.base import seed_folder
+
+    agents = [name for name, agent in chosen.agents.items() if agent.method == "ppo"]
+    folders = [seed_folder(out, a, seed) for a in agents for seed in range(chosen.seeds)]
+    if all((folder / "metrics.json").is_file() for folder in folders):
+        return
     missing = [n for n in ("stable_baselines3", "torch", "tensorboard") if find_spec(n) is None]
     if missing:
-        raise ValueError(
-            f"training needs {', '.join(missing)}: "
-            "pip install --constraint constraints.txt '.[ppo]'"
-        )
+        raise ValueError(f"training needs {', '.join(missing)}: python -m pip install -e '.[ppo]'")
 
 
 def _engine(engine: str, address: str | None, workers: int | None) -> Any:
@@ -124,7 +130,8 @@ def _engine(engine: str, address: str | None, workers: int | None) -> Any:
             raise ValueError("--engine dask needs --address tcp://HOST:PORT of its scheduler")
         if workers is not None:
             raise ValueError("--workers is for the local engine; a Dask cluster has its own")
-        return dask_engine(address)
+        waiting = f"waiting for workers of the scheduler at {address}"
+        return dask_engine(address, lambda: click.echo(waiting, err=True))
     if address is not None:
         raise ValueError("--address is for --engine dask")
     return local_engine(workers or len(os.sched_getaffinity(0)))
@@ -132,7 +139,13 @@ def _engine(engine: str, address: str | None, workers: int | None) -> Any:
 
 def _finish(chosen: Any, folder: Path) -> None:
     """Writes the table and the figures into the run folder."""
-    from ..benchmark.table import best_seeds, example_episodes, learning_curves, study_table
+    from ..benchmark.table import (
+        best_seeds,
+        bound_curves,
+        example_episodes,
+        learning_curves,
+        study_table,
+    )
     from ..files import write_bytes, write_json
     from ..report import (
         agents_figure,
@@ -140,7 +153,9 @@ def _finish(chosen: Any, folder: Path) -> None:
         curves_figure,
         differences_csv,
         differences_markdown,
+        frontier_figure,
         image,
+        lengths_figure,
     )
 
     content, settings = study_table(folder), chosen.model_dump()
@@ -151,9 +166,14 @@ def _finish(chosen: Any, folder: Path) -> None:
         "differences.csv": differences_csv(content["differences"]).encode(),
     }
     shown["table.md"] += differences_markdown(content["differences"]).encode()
+    if chosen.clairvoyant is not None:
+        shown["frontier.png"] = image(frontier_figure(rows, title), "png")
+    if chosen.lengths:
+        shown["lengths.png"] = image(lengths_figure(rows, title), "png")
     if chosen.agents:
         plant = chosen.build_plant().description
-        curves = curves_figure(plant, learning_curves(chosen, folder), title)
+        learnt = learning_curves(chosen, folder)
+        curves = curves_figure(plant, learnt, title, bound_curves(chosen))
         episodes = agents_figure(plant, example_episodes(chosen, folder), title)
         shown |= {"curves.png": image(curves, "png"), "episodes.png": image(episodes, "png")}
         content["best_seeds"] = best_seeds(chosen, folder)

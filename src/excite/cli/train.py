@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from .door import NUMBERS, OUT_FILE, VALUES, computing, json_option, merged
+from .door import NUMBERS, OUT_FILE, VALUES, WholeNumber, computing, json_option, merged
 from .study import run_study_here
 
 _OBJECTIVES = {
@@ -17,97 +17,54 @@ _OBJECTIVES = {
     "E": {"reward": "information", "criterion": "E"},
     "relative": {"reward": "relative"},
     "log": {"reward": "log"},
+    "goals": {"reward": "goals"},
+    "nls": {"reward": "relative", "estimator": "nls"},
 }
+
+
+def _options(command: Any) -> Any:
+    """What is trained, on what, and for what."""
+    for option in reversed(
+        [
+            click.option("--method", type=click.Choice(["gradient", "ppo"]), default="gradient",
+                         show_default=True, help="Gradient of the simulated experiment, or PPO."),
+            click.option("--objective", type=click.Choice(list(_OBJECTIVES)), default="D",
+                         show_default=True,
+                         help="Criterion of the Fisher information, or errors of the ARX "
+                         "estimator."),
+            click.option("--target", "targets", multiple=True, metavar="NAME",
+                         help="Parameter that counts; default the plant's targets."),
+            click.option("--goal", "goals", type=NUMBERS, multiple=True,
+                         help="Relative error of a parameter that counts as one."),
+            click.option("--output-scale", type=NUMBERS, multiple=True,
+                         help="What an output is divided by before it is observed, in its unit."),
+            click.option("--window", type=WholeNumber(1, 10_000),
+                         help="Samples observed; default 80."),
+            click.option("--clock", "clocks", type=float, multiple=True, metavar="HZ",
+                         help="Observe sine and cosine of this frequency too."),
+            click.option("--set", "training", type=VALUES, multiple=True,
+                         help="Hyper-parameters of the method, for instance num_updates=300."),
+            click.option("--seeds", type=WholeNumber(1, 1000), default=1, show_default=True,
+                         help="Independent trainings."),
+            click.option("--spread", type=click.FloatRange(0, 1, max_open=True), default=0.3,
+                         show_default=True,
+                         help="Plants are drawn from nominal values ± this fraction."),
+            click.option("--steps", type=WholeNumber(2, 1_000_000), default=500,
+                         show_default=True, metavar="T", help="Length of an experiment."),
+            click.option("--noise", type=NUMBERS, multiple=True,
+                         help="Standard deviation of an output's noise, in its unit."),
+            click.option("--episodes", type=WholeNumber(1), default=100, show_default=True,
+                         help="Evaluation episodes."),
+        ]
+    ):  # fmt: skip
+        command = option(command)
+    return command
 
 
 @click.command()
 @click.argument("plant")
 @click.option("--out", type=OUT_FILE, required=True, metavar="FOLDER", help="Its run folder.")
-@click.option(
-    "--method",
-    type=click.Choice(["gradient", "ppo"]),
-    default="gradient",
-    show_default=True,
-    help="Gradient of the simulated experiment, or PPO.",
-)
-@click.option(
-    "--objective",
-    type=click.Choice(list(_OBJECTIVES)),
-    default="D",
-    show_default=True,
-    help="Criterion of the Fisher information, or errors of the ARX estimator.",
-)
-@click.option(
-    "--target",
-    "targets",
-    multiple=True,
-    metavar="NAME",
-    help="Parameter that counts; default the plant's targets.",
-)
-@click.option(
-    "--goal",
-    "goals",
-    type=NUMBERS,
-    multiple=True,
-    help="Relative error of a parameter that counts as one.",
-)
-@click.option(
-    "--output-scale",
-    type=NUMBERS,
-    multiple=True,
-    help="What an output is divided by before it is observed, in its unit.",
-)
-@click.option("--window", type=click.IntRange(1, 10_000), help="Samples observed; default 80.")
-@click.option(
-    "--clock",
-    "clocks",
-    type=float,
-    multiple=True,
-    metavar="HZ",
-    help="Observe sine and cosine of this frequency too.",
-)
-@click.option(
-    "--set",
-    "training",
-    type=VALUES,
-    multiple=True,
-    help="Hyper-parameters of the method, for instance num_updates=300.",
-)
-@click.option(
-    "--seeds",
-    type=click.IntRange(1, 1000),
-    default=1,
-    show_default=True,
-    help="Independent trainings.",
-)
-@click.option(
-    "--spread",
-    type=click.FloatRange(0, 1, max_open=True),
-    default=0.3,
-    show_default=True,
-    help="Plants are drawn from nominal values ± this fraction.",
-)
-@click.option(
-    "--steps",
-    type=click.IntRange(2, 1_000_000),
-    default=500,
-    show_default=True,
-    metavar="T",
-    help="Length of an experiment.",
-)
-@click.option(
-    "--noise",
-    type=NUMBERS,
-    multiple=True,
-    help="Standard deviation of an output's noise, in its unit.",
-)
-@click.option(
-    "--episodes",
-    type=click.IntRange(min=1),
-    default=100,
-    show_default=True,
-    help="Evaluation episodes.",
-)
+@_options
 @json_option
 @computing
 def train(plant: str, out: Path, as_json: bool, **options: Any) -> None:  # fmt: skip

@@ -13,18 +13,19 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..information import relative_size, require_double_precision
+from ..information import require_double_precision
 from ..plant import AbstractARXPlant, AbstractPlant, Params
 from .base import (
     AbstractEstimator,
     Estimate,
     Experiments,
     Status,
+    relative_information,
     residual_of,
     simulate_experiments,
+    status_of,
 )
 
 Coefficients = Float[Array, "4"]
@@ -127,12 +128,11 @@ class ARX(AbstractEstimator):
         status = jnp.where(_is_ill_conditioned(regressors, valid), Status.ILL_CONDITIONED, status)
         slope = jax.jacfwd(lambda c: jnp.stack(physical_params(plant, c)[0]))(memory.coefficients)
         covariance = variance * slope @ memory.covariance @ slope.T
-        size = relative_size(plant, params)
         simulated = simulate_experiments(plant, params, experiments, experiments.initial_state)
         return Estimate(
             params=params,
             covariance=covariance,
-            information=jnp.linalg.inv(covariance / jnp.outer(size, size)),
+            information=relative_information(plant, params, covariance),
             status=status,
             initial_state=experiments.initial_state,
             residual=residual_of(experiments, simulated),
@@ -186,11 +186,7 @@ def physical_params(
     """The plant's parameters for ARX coefficients, and a status."""
     c_0, c_1, d_0, status = transfer_function(coefficients, plant.dt)
     params = plant.from_transfer_function(c_0, c_1, d_0)
-    values = jnp.stack(params)
-    positive = np.array([p.positive for p in plant.definition.parameters])
-    status = jnp.where(jnp.any(positive & (values <= 0)), Status.UNPHYSICAL, status)
-    finite = jnp.all(jnp.isfinite(values))
-    return params, jnp.where(finite, status, Status.NOT_FINITE)
+    return params, status_of(plant, params, status)
 
 
 @eqx.filter_jit

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..description import PlantDescription
+from ..information import relative_size
 from ..plant import AbstractPlant, Params
 from ..simulation import simulate
 
@@ -144,6 +145,23 @@ def residual_of(
 ) -> Float[Array, "experiment sample output"]:
     """Measured minus simulated outputs, zero where padded."""
     return jnp.where(experiments.valid[..., None], experiments.measured - simulated, 0.0)
+
+
+def status_of(plant: AbstractPlant, params: Params, status: Int[Array, ""]) -> Int[Array, ""]:
+    """The status of an estimate, of its parameters' signs and finiteness too."""
+    values = jnp.stack(params)
+    positive = np.array([p.positive for p in plant.definition.parameters])
+    status = jnp.where(jnp.any(positive & (values <= 0)), Status.UNPHYSICAL, status)
+    finite = jnp.all(jnp.isfinite(values))
+    return jnp.where(finite, status, Status.NOT_FINITE)
+
+
+def relative_information(
+    plant: AbstractPlant, params: Params, covariance: Float[Array, "param param"]
+) -> Float[Array, "param param"]:
+    """Information of relative changes, as an estimate has it, from a covariance of `params`."""
+    size = relative_size(plant, params)
+    return jnp.linalg.inv(covariance / jnp.outer(size, size))
 
 
 class _Bounds:

@@ -1,6 +1,8 @@
 """Plants: the contract (`base`) and one file per shipped plant."""
 
 from .aero2 import Aero2 as Aero2
+from .aero2 import Aero2Detailed as Aero2Detailed
+from .aero2 import Aero2Lag as Aero2Lag
 from .base import AbstractARXPlant as AbstractARXPlant
 from .base import AbstractPlant as AbstractPlant
 from .base import Params as Params

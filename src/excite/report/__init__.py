@@ -15,6 +15,8 @@ from .figures import episode_figure as episode_figure
 from .figures import episodes_figure as episodes_figure
 from .figures import identification_figure as identification_figure
 from .figures import information_figure as information_figure
+from .frontier import frontier_figure as frontier_figure
+from .frontier import lengths_figure as lengths_figure
 from .study import agents_figure as agents_figure
 from .study import curves_figure as curves_figure
 from .tables import all_cells as all_cells
@@ -23,6 +25,7 @@ from .tables import benchmark_latex as benchmark_latex
 from .tables import benchmark_markdown as benchmark_markdown
 from .tables import differences_csv as differences_csv
 from .tables import differences_markdown as differences_markdown
+from .tables import fitting_tables as fitting_tables
 from .tables import footnotes as footnotes
 from .tables import reference_cells as reference_cells
 from .tables import table_cells as table_cells

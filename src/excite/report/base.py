@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import io
 import math
+import textwrap
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import matplotlib.figure
 import matplotlib.pyplot as plt
 import numpy as np
-from jaxtyping import Float
 
 from ..description import Input, Output, PlantDescription, display_unit
 from ..files import write_bytes
@@ -21,7 +22,9 @@ from ..records import Record
 
 # Distinguishable with any colour vision (M. Okabe and K. Ito, 2008).
 BLUE, ORANGE, GREEN, RED, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#767676"
+_COLOURS = (BLUE, ORANGE, GREEN, RED, "#CC79A7", "#56B4E9")
 PLOT_ENDINGS = (".png", ".svg", ".pdf")
+_MIN_WIDTH = 6.4  # inches; a narrower figure cuts its title and its legend
 _MAX_POINTS = 4000  # more cannot be told apart on paper and make files slow to open
 
 
@@ -68,16 +71,33 @@ def image(figure: matplotlib.figure.Figure, kind: str) -> bytes:
     return buffer.getvalue()
 
 
-def new_figure(rows: int, columns: int = 1, height: float = 2.2, width: float = 8.0) -> tuple:
+def colour_of(i: int) -> str:
+    """Colour of the i-th thing in a picture."""
+    return _COLOURS[i % len(_COLOURS)]
+
+
+def new_figure(
+    rows: int, columns: int = 1, height: float = 2.2, width: float = 8.0, sharey: Any = False
+) -> tuple:
     """A figure and its grid of axes; height of one row and width of all, in inches."""
     plt.switch_backend("agg")
     figure, axes = plt.subplots(
-        rows, columns, figsize=(width, height * rows + 0.6), squeeze=False, layout="constrained"
+        rows,
+        columns,
+        figsize=(max(width, _MIN_WIDTH), height * rows + 0.6),
+        sharey=sharey,
+        squeeze=False,
+        layout="constrained",
     )
     for axis in axes.ravel():
         axis.spines[["top", "right"]].set_visible(False)
         axis.grid(alpha=0.25)
     return figure, axes
+
+
+def add_title(figure: matplotlib.figure.Figure, title: str) -> None:
+    """A title above all axes, broken where the figure ends."""
+    figure.suptitle(textwrap.fill(title, int(9 * figure.get_figwidth())))
 
 
 def add_legend(figure: matplotlib.figure.Figure, *axes: Any) -> None:
@@ -87,7 +107,9 @@ def add_legend(figure: matplotlib.figure.Figure, *axes: Any) -> None:
         handles, labels = axis.get_legend_handles_labels()
         entries |= dict(zip(labels, handles, strict=True))
     if entries:
-        figure.legend(entries.values(), entries, loc="outside lower center", ncols=4, fontsize=8)
+        columns = int(figure.get_figwidth() / 2)
+        place = "outside lower center"
+        figure.legend(entries.values(), entries, loc=place, ncols=columns, fontsize=8)
 
 
 def axis_label(part: Input | Output) -> str:
@@ -101,28 +123,32 @@ def thin(*arrays: np.ndarray) -> list[np.ndarray]:
     return [a[::every] for a in arrays]
 
 
-def draw_levels(axis: Any, part: Output, drawn: Float[np.ndarray, "..."]) -> None:
+def draw_levels(axis: Any, part: Output, largest: float) -> None:
     """Both safety levels, where the output comes near enough for them to fit the picture."""
     factor = display_unit(part.unit)[1]
     for level, colour, word in (
         (part.warning_level, ORANGE, "warning"),
         (part.critical_level, RED, "critical"),
     ):
-        if level is None or np.max(np.abs(drawn)) < 0.25 * level:
+        if level is None or largest < 0.25 * level:
             continue
         for sign in (1, -1):
             label = f"{word} level" if sign == 1 else None
             axis.axhline(sign * level * factor, color=colour, ls="--", lw=1, label=label)
 
 
-def draw_episode(axes: Any, description: PlantDescription, record: Record) -> None:
-    """One axis an input, then one axis an output."""
+def draw_episodes(axes: Any, description: PlantDescription, records: Sequence[Record]) -> None:
+    """One column an experiment; one row an input, then one row an output."""
     for i, part in enumerate(description.inputs):
-        time, values = thin(record.time, record.inputs[:, i])
-        axes[i].step(time, values, where="post", color=GREEN, lw=1)
-        axes[i].set(ylabel=axis_label(part))
-    for i, part in enumerate(description.outputs, len(description.inputs)):
-        time, values = thin(record.time, record.outputs[:, i - len(description.inputs)])
-        axes[i].plot(time, display_unit(part.unit)[1] * values, color=BLUE, lw=1)
-        draw_levels(axes[i], part, values)
-        axes[i].set(ylabel=axis_label(part))
+        axes[i, 0].set(ylabel=axis_label(part))
+        for axis, record in zip(axes[i], records, strict=True):
+            time, values = thin(record.time, record.inputs[:, i])
+            axis.step(time, values, where="post", color=GREEN, lw=1)
+    for i, part in enumerate(description.outputs):
+        row = axes[len(description.inputs) + i]
+        row[0].set(ylabel=axis_label(part))
+        largest = max(float(np.max(np.abs(record.outputs[:, i]))) for record in records)
+        for axis, record in zip(row, records, strict=True):
+            time, values = thin(record.time, record.outputs[:, i])
+            axis.plot(time, display_unit(part.unit)[1] * values, color=BLUE, lw=1)
+            draw_levels(axis, part, largest)

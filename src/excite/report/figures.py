@@ -17,11 +17,12 @@ from .base import (
     GREEN,
     GREY,
     ORANGE,
-    RED,
     add_legend,
+    add_title,
     axis_label,
+    colour_of,
     digits_for,
-    draw_episode,
+    draw_episodes,
     new_figure,
     number,
     thin,
@@ -50,7 +51,7 @@ def identification_figure(
     axes[-2, 0].set(xlabel="time [s]")
     _draw_intervals(axes[-1, 0], result["params"])
     add_legend(figure, axes[0, 0])
-    figure.suptitle(f"{description.name}: {result['estimator']}, {result['status']}")
+    add_title(figure, f"{description.name}: {result['estimator']}, {result['status']}")
     return figure
 
 
@@ -72,10 +73,10 @@ def _draw_intervals(axis: Any, params: Mapping[str, Mapping[str, Any]]) -> None:
 def episode_figure(description: PlantDescription, record: Record) -> matplotlib.figure.Figure:
     """Inputs and outputs of one experiment, with the safety levels."""
     figure, axes = new_figure(len(description.inputs) + len(description.outputs))
-    draw_episode(axes[:, 0], description, record)
+    draw_episodes(axes, description, [record])
     axes[-1, 0].set(xlabel="time [s]")
     add_legend(figure, *axes[:, 0])
-    figure.suptitle(description.name)
+    add_title(figure, description.name)
     return figure
 
 
@@ -84,13 +85,13 @@ def episodes_figure(
 ) -> matplotlib.figure.Figure:
     """Several experiments of one plant side by side, by title."""
     rows = len(description.inputs) + len(description.outputs)
-    figure, axes = new_figure(rows, len(records), width=3.2 * len(records))
-    for column, (title, record) in enumerate(records.items()):
-        draw_episode(axes[:, column], description, record)
+    figure, axes = new_figure(rows, len(records), width=3.2 * len(records), sharey="row")
+    draw_episodes(axes, description, list(records.values()))
+    for column, title in enumerate(records):
         axes[0, column].set(title=title)
         axes[-1, column].set(xlabel="time [s]")
     add_legend(figure, *axes[:, 0])
-    figure.suptitle(f"{description.name}: nominal response")
+    add_title(figure, f"{description.name}: nominal response")
     return figure
 
 
@@ -132,17 +133,30 @@ def benchmark_figure(rows: Sequence[Mapping[str, Any]], title: str) -> matplotli
                 methods.index(r["method"]) + 0.12 * (e - (len(estimators) - 1) / 2) for r in chosen
             ]
             means = [r["relative_error_percent"][name]["mean"] for r in chosen]
-            colour = (BLUE, ORANGE, GREEN, RED)[e % 4]
-            axis.plot(place, means, "o", color=colour, ms=6, label=estimator)
+            axis.plot(place, means, "o", color=colour_of(e), ms=6, label=estimator)
         for m, method in enumerate(methods):
             # What an efficient estimator's mean error would be: sqrt(2 / pi) of the bound.
             bound = next(r for r in rows if r["method"] == method)["cramer_rao_percent"][name]
             label = "attainable (0.80 of the bound)" if m == 0 else None
             axis.hlines(0.798 * bound, m - 0.35, m + 0.35, color=GREY, lw=2, label=label)
-        slant = {"rotation": 40, "ha": "right"} if len(methods) > 4 else {}  # or they overlap
-        axis.set_xticks(range(len(methods)), methods, **slant)
-        axis.set(yscale="log", title=name)
+        ticks = [method + _absent(rows, method, name) for method in methods]
+        is_tight = len("".join(ticks)) > 24  # or they overlap
+        slant = {"rotation": 40, "ha": "right", "rotation_mode": "anchor"} if is_tight else {}
+        axis.set_xticks(range(len(methods)), ticks, **slant)
+        axis.set(yscale="log", title=name, xlim=(-0.5, len(methods) - 0.5))
     axes[0, 0].set(ylabel="mean relative error [%]")
     add_legend(figure, axes[0, 0])
-    figure.suptitle(title)
+    add_title(figure, title)
     return figure
+
+
+def _absent(rows: Sequence[Mapping[str, Any]], method: str, name: str) -> str:
+    """Why a method, or one of its estimators, has no error to be drawn."""
+    absent = [
+        row
+        for row in rows
+        if row["method"] == method and math.isnan(row["relative_error_percent"][name]["mean"])
+    ]
+    if any(row.get("viable_seeds") == 0 for row in absent):
+        return " (collapsed)"
+    return f" ({', '.join(row['estimator'] for row in absent)} failed)" if absent else ""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import textwrap
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import matplotlib.figure
@@ -10,35 +11,48 @@ import numpy as np
 
 from ..description import PlantDescription
 from ..records import Record
-from .base import BLUE, GREEN, ORANGE, RED, add_legend, draw_episode, new_figure
+from .base import BLUE, RED, add_legend, add_title, colour_of, draw_episodes, new_figure
 
 Curve = Mapping[str, np.ndarray]
 """Columns of one learning curve by name; `steps` is one of them."""
 
 
 def curves_figure(
-    description: PlantDescription, curves: Mapping[str, Sequence[Curve]], title: str
+    description: PlantDescription,
+    curves: Mapping[str, Sequence[Curve]],
+    title: str,
+    bounds: Collection[str] = (),
 ) -> matplotlib.figure.Figure:
     """Learning curves of the deterministic policies: median and band over the seeds.
 
     Args:
         curves: by agent, one a seed.
+        bounds: agents rewarded with information, whose curves hold no errors but the least
+            standard deviations (Cramér-Rao).
     """
     names = [p.name for p in description.parameters]
-    figure, axes = new_figure(len(names) + 1, len(curves), height=1.9, width=3.2 * len(curves))
+    figure, axes = new_figure(
+        len(names) + 1, len(curves), height=1.9, width=3.2 * len(curves), sharey="row"
+    )
     for column, (agent, seeds) in enumerate(curves.items()):
-        axes[0, column].set(title=f"{agent}, {len(seeds)} seeds")
+        count = f"{len(seeds)} seed" + "s" * (len(seeds) > 1)
+        axes[0, column].set(title=_column_title(f"{agent}, {count}"))
+        word = "bound" if agent in bounds else "error"
         for axis, name in zip(axes[:, column], names, strict=False):
             _draw_band(axis, seeds, f"relative_error_{name}", BLUE)
             axis.set(yscale="log")
+            if column == 0 or (agent in bounds) != (next(iter(curves)) in bounds):
+                axis.set_ylabel(f"{name} {word} [%]", labelpad=8)
         _draw_band(axes[-1, column], seeds, "violation_rate", RED)
         axes[-1, column].set(xlabel="million steps", ylim=(-2, 102))
-    for axis, name in zip(axes[:, 0], names, strict=False):
-        axis.set(ylabel=f"{name} error [%]")
     axes[-1, 0].set(ylabel="violations [%]")
-    add_legend(figure, axes[0, 0], axes[-1, 0])
-    figure.suptitle(f"{title}: policy without exploration noise")
+    add_legend(figure, axes[0, 0])
+    add_title(figure, f"{title}: policy without exploration noise")
     return figure
+
+
+def _column_title(text: str) -> str:
+    return textwrap.fill(text, 28)
 
 
 def _draw_band(axis: Any, seeds: Sequence[Curve], column: str, colour: str) -> None:
@@ -59,22 +73,40 @@ def agents_figure(
     """One episode of each agent: inputs, outputs with their levels, running estimates.
 
     Args:
-        episodes: by agent, the record, and the estimates over the true parameters, one row a
-            sample (not numbers where there are none).
+        episodes: by agent, the record, its metadata with the `seed` and the `estimator`; and
+            the estimates over the true parameters, one row a sample (not numbers where there
+            are none).
     """
-    names = [p.name for p in description.parameters]
-    rows = len(description.inputs) + len(description.outputs)
-    figure, axes = new_figure(rows + 1, len(episodes), height=1.9, width=3.4 * len(episodes))
-    for column, (agent, (record, estimates)) in enumerate(episodes.items()):
-        draw_episode(axes[:rows, column], description, record)
-        axes[0, column].set(title=agent)
-        below = axes[rows, column]
-        for name, values, colour in zip(
-            names, estimates.T, (BLUE, ORANGE, GREEN, RED), strict=False
-        ):
-            below.plot(record.time, values, color=colour, lw=1, label=name)
-        below.axhline(1, color="black", lw=0.6)
-        below.set(xlabel="time [s]", yscale="log", ylim=(0.1, 30), ylabel="estimate / true")
+    records = [record for record, _ in episodes.values()]
+    running = [estimates for _, estimates in episodes.values()]
+    has_estimates = any(np.any(np.isfinite(e)) for e in running)
+    rows = len(description.inputs) + len(description.outputs) + has_estimates
+    figure, axes = new_figure(
+        rows, len(episodes), height=1.9, width=3.4 * len(episodes), sharey="row"
+    )
+    draw_episodes(axes, description, records)
+    for column, (agent, record) in enumerate(zip(episodes, records, strict=True)):
+        seed = record.metadata.get("seed")
+        text = agent if seed is None else f"{agent}, seed {seed}"
+        axes[0, column].set(title=_column_title(text))
+        axes[-1, column].set(xlabel="time [s]")
+    if has_estimates:
+        _draw_running(axes[-1], description, records, running)
     add_legend(figure, *axes[:, 0])
-    figure.suptitle(title)
+    add_title(figure, title)
     return figure
+
+
+def _draw_running(
+    axes: Any,
+    description: PlantDescription,
+    records: Sequence[Record],
+    running: Sequence[np.ndarray],
+) -> None:
+    """Estimates over true parameters, one axis an experiment."""
+    for axis, record, estimates in zip(axes, records, running, strict=True):
+        for i, part in enumerate(description.parameters):
+            axis.plot(record.time, estimates[:, i], color=colour_of(i), lw=1, label=part.name)
+        axis.axhline(1, color="black", lw=0.6)
+    estimator = records[0].metadata.get("estimator", "estimate")
+    axes[0].set(yscale="log", ylim=(0.1, 30), ylabel=f"{estimator} / true")

@@ -20,6 +20,7 @@ def table_header(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     for name in rows[0]["relative_error_percent"]:
         header += [f"{name} error %", "bound %"]
     header += [f"max {largest['output']} {largest['unit']}", "violations (95 %)", "failed"]
+    header += ["log det", "D-efficiency"] if "d_efficiency" in rows[0] else []
     return [*header, "viable seeds", "training"] if "seeds" in rows[0] else header
 
 
@@ -37,6 +38,8 @@ def table_cells(row: Mapping[str, Any]) -> list[str]:
     largest = row["max_abs_output"]
     failed = f"{row['failed']}/{row['evaluations']}"
     cells += [mean_sd(largest["mean"], largest["sd"]), count, failed]
+    if "d_efficiency" in row:
+        cells += [number(row.get("log_det_information"), 4), number(row["d_efficiency"], 2)]
     return [*cells, *_training_cells(row)] if "seeds" in row else cells
 
 
@@ -55,6 +58,7 @@ def reference_cells(row: Mapping[str, Any], reference: Mapping[str, Any]) -> lis
         published = reference["relative_error_percent"].get(name)
         cells += ["–" if published is None else mean_sd(*published), "–"]
     cells += [mean_sd(*reference["max_abs_output"]), reference["violations"], "–"]
+    cells += ["–", "–"] if "d_efficiency" in row else []
     return [*cells, reference.get("viable_seeds") or "–", "–"] if "seeds" in row else cells
 
 
@@ -71,6 +75,25 @@ def all_cells(
     return cells
 
 
+def fitting_tables(
+    header: Sequence[str], cells: Sequence[Sequence[str]], width: int
+) -> list[tuple[list[str], list[list[str]]]]:
+    """A table as several below each other, none wider than `width` where that can be.
+
+    Each begins with method and estimator; a bound stays beside its error.
+    """
+    wide = [3 + max(map(len, column)) for column in zip(header, *cells, strict=True)]
+    tables, labels = [[0, 1]], [0, 1]
+    for i in range(2, len(header)):
+        if header[i] == "bound %":
+            continue
+        group = [i, i + 1] if header[i + 1 : i + 2] == ["bound %"] else [i]
+        if tables[-1] != labels and sum(wide[c] for c in tables[-1] + group) > width:
+            tables.append(labels)
+        tables[-1] = tables[-1] + group
+    return [([header[c] for c in t], [[row[c] for c in t] for row in cells]) for t in tables]
+
+
 def footnotes(study: Mapping[str, Any]) -> list[str]:
     """What a reader of the table must know."""
     notes = [
@@ -85,6 +108,12 @@ def footnotes(study: Mapping[str, Any]) -> list[str]:
             "seed has collapsed where the RMS input is below 1 % of its limit); violations and "
             "failures over all evaluations of all seeds. The policy is evaluated without "
             "exploration noise."
+        )
+    if study.get("clairvoyant"):
+        notes.append(
+            "log det is that of the relative Fisher information. The D-efficiency compares it, on "
+            f"the first {study['clairvoyant']['plants']} plants, with signals designed for each "
+            "plant as if its parameters were known: 1 is what no experiment can beat."
         )
     if study.get("ours"):
         notes.append("Ours, other than the source: " + "; ".join(study["ours"]) + ".")
@@ -114,6 +143,9 @@ def benchmark_csv(rows: Sequence[Mapping[str, Any]]) -> str:
     for key in ("viable_seeds", "seeds", "train_seconds"):
         if key in rows[0]:
             columns[key] = [math.nan if row[key] is None else row[key] for row in rows]
+    for key in ("log_det_information", "log_det_information_sd", "d_efficiency"):
+        if key in rows[0]:
+            columns[key] = [row.get(key, math.nan) for row in rows]
     largest = rows[0]["max_abs_output"]
     for part in ("mean", "sd"):
         title = f"max_abs_{largest['output']}_{largest['unit']}_{part}"

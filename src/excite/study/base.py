@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Annotated, Any, Literal, TypeVar
@@ -15,12 +16,14 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from ..description import names_of
 from ..env import Env
-from ..estimation import ARX
+from ..estimation import ARX, NLS
 from ..names import estimator_named, unknown
 from ..objective import (
+    MAX_SENSITIVITY,
     AbstractObjective,
     EstimationError,
     InformationGain,
+    OutputError,
     prior_sd_of,
     target_mask,
 )
@@ -38,21 +41,26 @@ class Settings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-Count = Annotated[int, Field(gt=0, strict=True)]
-Magnitude = Annotated[float, Field(ge=0, strict=True, allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, strict=True, allow_inf_nan=False)]
-
-
-class EstimatorSettings(Settings):
-    """One estimator: a kind and its options."""
+class Choice(Settings):
+    """One of several kinds, and its options."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
-    kind: str
 
     @property
     def options(self) -> dict[str, Any]:
         """All but the kind."""
         return dict(self.model_extra or {})
+
+
+Count = Annotated[int, Field(gt=0, strict=True)]
+Magnitude = Annotated[float, Field(ge=0, strict=True, allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, strict=True, allow_inf_nan=False)]
+
+
+class EstimatorSettings(Choice):
+    """One estimator: a kind and its options."""
+
+    kind: str
 
 
 METHODS = {"ppo": PPOSettings, "gradient": GradientSettings}
@@ -66,23 +74,35 @@ class DecisionSettings(Settings):
         window: samples observed.
         clocks: frequencies [Hz] whose sine and cosine are observed too.
         output_scale: y_max by output, in its unit, where it differs from the output's scale.
-        reward: of the experiment: `relative` errors (Eq. 4), `log` of them, or
+        input_amplitude: by input, in its unit, how far from the middle of its limits the
+            policy may go, where that is less than the limits allow.
+        spread: of the plants it is trained on, where it differs from the study's.
+        constants: of these plants, drawn between two ends, [0.12, 0.21], for every one.
+        reward: of the experiment: `relative` errors (Eq. 4), `log` of them, the worst over
+            its goal (`goals`), or
             `information`; by default the plant's.
+        dense: whether information is rewarded at every step, by default for PPO alone.
         weight: factor of that reward.
-        criterion: of the information, see `InformationGain`.
+        criterion, max_sensitivity: of the information, see `InformationGain`.
         goals: by parameter, the relative error that counts as one, default one.
-        estimator: ARX estimator in the reward, by the study's name or any.
+        estimator: in the reward, by the study's name or any; an ARX estimator, or `nls` to
+            first order in the noise, for any plant.
         start_covariance: instead of that estimator's; a smaller one lets its bias, which is
             a smooth function of the inputs, outweigh the sensor's noise.
         normalise_penalty: whether the safety penalty is divided by the number of steps.
     """
 
-    window: Count = 80
+    window: Annotated[Count, Field(le=10_000)] = 80
     clocks: list[Positive] = []
     output_scale: dict[str, Positive] = {}
-    reward: Literal["relative", "log", "information"] | None = None
+    input_amplitude: dict[str, Positive] = {}
+    spread: Annotated[float, Field(ge=0, lt=1, strict=True, allow_inf_nan=False)] | None = None
+    constants: dict[str, tuple[float, float]] = {}
+    reward: Literal["relative", "log", "goals", "information"] | None = None
+    dense: Annotated[bool, Field(strict=True)] | None = None
     weight: Positive = 1.0
     criterion: Literal["D", "A", "E"] = "D"
+    max_sensitivity: Positive = MAX_SENSITIVITY
     goals: dict[str, Positive] = {}
     estimator: str = "arx-rls"
     start_covariance: Positive | None = None
@@ -136,9 +156,11 @@ class Agent:
             ValueError: for a setting that does not exist or is not allowed.
         """
         process = checked(DecisionSettings, {**decision, **own.decision}, "decision")
-        unused = {"estimator", "goals", "start_covariance"} & own.decision.keys()
-        if process.reward == "information" and unused:
-            raise ValueError(f"decision: the reward 'information' has no {sorted(unused)[0]!r}")
+        if process.reward == "information":  # another agent may use what all have in common
+            _require_used(own.decision if "reward" in own.decision else process.model_fields_set)
+        targets = own.targets or []
+        if len(set(targets)) < len(targets):
+            raise ValueError(f"targets must differ from each other, got {', '.join(targets)}")
         chosen = checked(METHODS[own.method], {**training, **own.training}, "training")
         return cls(own.targets, own.method, process, chosen, estimators)
 
@@ -146,51 +168,74 @@ class Agent:
         """The decision process of this agent.
 
         Raises:
-            ValueError: for a target or output that does not exist, or a reward from an
-                ARX estimator where the plant has no mapping from it.
+            ValueError: for a target, output or input that does not exist, an amplitude
+                beyond the input's limits, or a reward from an ARX estimator where the
+                plant has no mapping from it.
         """
+        decision = self.decision
+        own = spread if decision.spread is None else decision.spread
+        return Env.of(
+            plant,
+            objective=self._objective(plant, own),
+            layout=self._layout(plant, num_steps),
+            spread=own,
+            penalty_weight=1 / num_steps if decision.normalise_penalty else 1.0,
+            constants=_ends(plant, decision.constants),
+        )
+
+    def _layout(self, plant: AbstractPlant, num_steps: int) -> Layout:
         decision, outputs = self.decision, plant.definition.outputs
+        usual = Layout.of(plant.description, decision.window, num_steps)
+        halves = dict(zip(names_of(plant.definition.inputs), usual.input_half, strict=True))
         for name in decision.output_scale:
             if name not in names_of(outputs):
                 raise unknown("output in output_scale", name, names_of(outputs))
-        layout = dataclasses.replace(
-            Layout.of(plant.description, decision.window, num_steps),
+        for name, amplitude in decision.input_amplitude.items():
+            if name not in halves:
+                raise unknown("input in input_amplitude", name, halves)
+            if amplitude > halves[name]:
+                raise ValueError(
+                    f"input_amplitude of {name!r} is at most {halves[name]:g}: got {amplitude:g}"
+                )
+        return dataclasses.replace(
+            usual,
             output_scale=tuple(decision.output_scale.get(o.name, o.scale) for o in outputs),
+            input_half=tuple((halves | decision.input_amplitude).values()),
             clocks=_cycles(decision.clocks, float(plant.dt)),
-        )
-        return Env.of(
-            plant,
-            objective=self._objective(plant, spread),
-            layout=layout,
-            spread=spread,
-            penalty_weight=1 / num_steps if decision.normalise_penalty else 1.0,
         )
 
     def _objective(self, plant: AbstractPlant, spread: float) -> AbstractObjective:
         decision, has_mapping = self.decision, isinstance(plant, AbstractARXPlant)
         targets = target_mask(plant.definition, self.targets)
         if decision.reward == "information" or (decision.reward is None and not has_mapping):
+            if decision.reward is None:
+                _require_used(decision.model_fields_set)
             return InformationGain(
                 targets,
                 prior_sd_of(spread),
                 decision.weight,
                 criterion=decision.criterion,
-                dense=self.method == "ppo",  # a gradient needs no reward on the way
+                max_sensitivity=decision.max_sensitivity,
+                # A gradient needs no reward on the way.
+                dense=self.method == "ppo" if decision.dense is None else decision.dense,
             )
         own = self.estimators.get(decision.estimator, EstimatorSettings(kind=decision.estimator))
         estimator = estimator_named(own.kind, own.options)
+        target_mask(plant.definition, list(decision.goals) or None)  # checks the names
+        goals = [decision.goals.get(p.name, 1.0) for p in plant.definition.parameters]
+        common = targets, goals, decision.reward or "relative", decision.weight
+        if isinstance(estimator, NLS):
+            bound = {"max_sensitivity": decision.max_sensitivity}
+            return OutputError(*common, prior_sd=prior_sd_of(spread), **bound)
         if not (has_mapping and isinstance(estimator, ARX)):
             raise ValueError(
                 f"the reward {decision.reward!r} from the estimator {decision.estimator!r} needs "
-                "an ARX estimator, and a plant with a mapping from ARX coefficients; the reward "
-                "'information' needs neither"
+                "an ARX estimator, and a plant with a mapping from ARX coefficients; the "
+                "estimator 'nls' and the reward 'information' need neither"
             )
-        target_mask(plant.definition, list(decision.goals) or None)  # checks the names
-        goals = [decision.goals.get(p.name, 1.0) for p in plant.definition.parameters]
         if decision.start_covariance is not None:
             estimator = dataclasses.replace(estimator, start_covariance=decision.start_covariance)
-        is_log = decision.reward == "log"
-        return EstimationError(estimator, targets, goals, is_log, decision.weight)
+        return EstimationError(*common, estimator=estimator)
 
     def total_steps(self, num_steps: int) -> int:
         """Sampling times of the whole training, for experiments of so many."""
@@ -204,13 +249,35 @@ class Agent:
         mask = target_mask(plant.definition, self.targets)
         # What settings did not have from the first stands here only where it is used, so
         # that seeds trained before it are still known.
-        later = {"clocks", "criterion"} - self.decision.model_fields_set
+        later = {"clocks", "criterion", "max_sensitivity", "input_amplitude", "spread", "dense"}
+        later |= {"constants"}
         return {
             "method": self.method,
             "targets": [name for name, chosen in zip(names, mask, strict=True) if chosen],
-            "decision": self.decision.model_dump(exclude=later),
+            "decision": self.decision.model_dump(exclude=later - self.decision.model_fields_set),
             "training": dataclasses.asdict(self.training),
         }
+
+
+def _ends(plant: AbstractPlant, ranges: Mapping[str, tuple[float, float]]) -> Any:
+    """Lowest and highest constants of a plant; ValueError for a range that is not allowed."""
+    if not ranges:
+        return None
+    names = names_of(plant.definition.constants)
+    for name, (low, high) in ranges.items():
+        if name not in names:
+            raise unknown("constant in constants", name, names)
+        if not low <= high:
+            raise ValueError(f"the range of the constant {name!r} must grow: got {low:g}, {high:g}")
+    ends = ({name: ends[i] for name, ends in ranges.items()} for i in (0, 1))
+    return tuple(plant.changed(**own).constants for own in ends)
+
+
+def _require_used(names: Iterable[str]) -> None:
+    """Raises ValueError for settings of another reward than `information`."""
+    unused = sorted({"estimator", "goals", "start_covariance"} & set(names))
+    if unused:
+        raise ValueError(f"decision: the reward 'information' has no {unused[0]!r}")
 
 
 def _cycles(clocks: Sequence[float], dt: float) -> tuple[float, ...]:
@@ -233,9 +300,23 @@ def checked(kind: type[_T], values: Mapping[str, Any], where: str) -> _T:
             raise unknown(f"{where} setting", name, fields)
     try:
         # As JSON, because a strict check of Python's own types would want tuples for lists.
-        return pydantic.TypeAdapter(kind).validate_json(json.dumps(dict(values)), strict=True)
+        content = json.dumps(dict(values), default=str)
+        return pydantic.TypeAdapter(kind).validate_json(content, strict=True)
     except pydantic.ValidationError as error:
         raise ValueError(f"{where}: {sentence(error)}") from None
+
+
+_ALLOWED = {
+    "bool": "true or false",
+    "int": "a whole number",
+    "float": "a number",
+    "string": "a string",
+    "list": "a list",
+    "tuple": "a list",
+    "dict": "a table",
+    "model": "a table",
+}
+"""What is allowed where pydantic misses a type, by the first word of its complaint."""
 
 
 def sentence(
@@ -255,7 +336,13 @@ def sentence(
         return f"{where}: " * bool(where) + str(unknown("key", key, model.model_fields))
     if first["type"] == "missing":
         return f"the key {location!r} is missing"
+    if first["type"] == "value_error" and "ctx" in first:  # our own sentence
+        return f"{location}: " * bool(location) + str(first["ctx"]["error"])
     got = json.dumps(first["input"], default=str)
     if isinstance(first["input"], float) and not math.isfinite(first["input"]):
         got = str(first["input"])
-    return f"{location}: {first['msg']}, got {got}" if location else f"{first['msg']}, got {got}"
+    msg, _, rest = first["msg"].partition("Input should be ")
+    kind = re.match(r"([a-z]+)_(type|parsing|from|attributes)", first["type"])
+    allowed = _ALLOWED.get(kind[1], rest) if kind else rest
+    what = f" must be {allowed}" if allowed else f": {msg}"
+    return f"{location}{what}, got {got}"

@@ -3,26 +3,39 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
+import jax
 import pydantic
 import tomlkit
 import tomlkit.exceptions
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
 from ..description import names_of
-from ..estimation import ARX, AbstractEstimator
+from ..estimation import ARX, AbstractEstimator, Decrement
 from ..excitation import AbstractExcitation
 from ..files import folder_word
 from ..information import require_noise
-from ..names import ESTIMATORS, estimator_named, excitation_named, plant_named, unknown, with_sensor
+from ..names import (
+    ESTIMATORS,
+    SIGNAL_ENDINGS,
+    estimator_named,
+    excitation_and_origin,
+    excitation_named,
+    plant_named,
+    unknown,
+    with_sensor,
+)
 from ..plant import AbstractARXPlant, AbstractPlant
+from ..policy import POLICY_ENDING
 from ..training.base import PPOSettings
 from ..training.gradient import GradientSettings
 from .base import (
     Agent,
     AgentSettings,
+    Choice,
     Count,
     DecisionSettings,
     EstimatorSettings,
@@ -40,16 +53,22 @@ class SensorSettings(Settings):
     resolution: Magnitude | None = None
 
 
-class MethodSettings(Settings):
+class MethodSettings(Choice):
     """One way to excite: a kind of excitation and its options."""
 
-    model_config = ConfigDict(extra="allow", frozen=True)
     excitation: str
 
-    @property
-    def options(self) -> dict[str, Any]:
-        """All but the kind."""
-        return dict(self.model_extra or {})
+
+class ClairvoyantSettings(Settings):
+    """Signals designed for known parameters, by which methods are measured.
+
+    Attributes:
+        plants: for how many of the evaluation episodes' plants.
+        starts: of the search for each.
+    """
+
+    plants: Count = 32
+    starts: Count = 4
 
 
 class ReferenceRow(Settings):
@@ -78,6 +97,8 @@ class Study(Settings):
         seeds: trainings of each agent, with the seeds 0, 1, ...
         decision: settings of all agents.
         training, gradient: hyper-parameters of all agents trained by PPO, and by gradient.
+        clairvoyant: signals to measure the methods by.
+        lengths: numbers of steps at which every method's Cramér-Rao bound is computed.
         inferred: settings that the source of the study does not state, in words.
         ours: settings that differ from the source's, in words.
         reference: published rows by method, shown in tables for comparison.
@@ -99,6 +120,8 @@ class Study(Settings):
     decision: dict[str, Any] = {}
     training: dict[str, Any] = {}
     gradient: dict[str, Any] = {}
+    clairvoyant: ClairvoyantSettings | None = None
+    lengths: list[Count] = []
     inferred: list[str] = []
     ours: list[str] = []
     reference: dict[str, ReferenceRow] = {}
@@ -118,10 +141,35 @@ class Study(Settings):
         )
 
     def build_methods(self, plant: AbstractPlant) -> dict[str, AbstractExcitation]:
-        """The study's excitations, checked against the plant."""
-        return {
-            n: excitation_named(m.excitation, m.options, plant) for n, m in self.methods.items()
+        """The study's excitations, checked against the plant and the number of steps."""
+        methods = {}
+        for length in self.lengths:
+            if not 2 <= length <= self.num_steps:
+                raise ValueError(f"lengths must lie between 2 and num_steps: got {length}")
+        for name, method in self.methods.items():
+            made = excitation_named(method.excitation, method.options, plant)
+            try:
+                jax.eval_shape(partial(made.init, plant, self.num_steps), jax.random.key(0))
+            except ValueError as error:
+                raise ValueError(f"{method.excitation}: {error}") from None
+            methods[name] = made
+        return methods
+
+    def warnings(self) -> list[str]:
+        """A sentence for every policy among the methods that was trained on another plant."""
+        origins = self.origins(self.build_plant())
+        found = {
+            self.methods[n].excitation: o["warning"] for n, o in origins.items() if "warning" in o
         }
+        return [f"{path}: {warning}" for path, warning in found.items()]
+
+    def origins(self, plant: AbstractPlant) -> dict[str, dict[str, str]]:
+        """What a record must say of each method that is a policy, see `excitation_and_origin`."""
+        own = {
+            name: excitation_and_origin(m.excitation, m.options, plant)[1]
+            for name, m in self.methods.items()
+        }
+        return {name: origin for name, origin in own.items() if origin}
 
     def build_estimators(self, plant: AbstractPlant) -> dict[str, AbstractEstimator]:
         """The study's estimators.
@@ -131,7 +179,7 @@ class Study(Settings):
         """
         estimators = {n: estimator_named(e.kind, e.options) for n, e in self.estimators.items()}
         for name, estimator in estimators.items():
-            if isinstance(estimator, ARX) and not isinstance(plant, AbstractARXPlant):
+            if isinstance(estimator, ARX | Decrement) and not isinstance(plant, AbstractARXPlant):
                 raise ValueError(
                     f"estimator {name!r} needs a plant with a mapping from ARX coefficients; "
                     f"{self.plant!r} has none, 'nls' needs none"
@@ -177,6 +225,8 @@ class Study(Settings):
                 raise ValueError(f"agents.{name}: {error}") from None
         if self.agents:
             require_noise(plant)
+            if self.num_steps < 2:
+                raise ValueError("num_steps must be at least 2 where agents are trained, got 1")
 
     def check_reference(self, plant: AbstractPlant) -> None:
         """Raises ValueError for published rows of an unknown method or parameter."""
@@ -207,7 +257,13 @@ class Study(Settings):
         return study_from({**self.model_dump(), **settings}, "settings")
 
 
-_TABLES = {"": Study, "sensor": SensorSettings, "reference": ReferenceRow, "agents": AgentSettings}
+_TABLES = {
+    "": Study,
+    "clairvoyant": ClairvoyantSettings,
+    "sensor": SensorSettings,
+    "reference": ReferenceRow,
+    "agents": AgentSettings,
+}
 
 
 def read_study(path: Path) -> Study:
@@ -225,9 +281,19 @@ def read_study(path: Path) -> Study:
     except tomlkit.exceptions.ParseError as error:
         raise ValueError(f"{path}: not valid TOML: {error}") from None
     study = study_from(content, str(path))
-    if ":" in study.plant and (path.parent / study.plant.rpartition(":")[0]).is_file():
-        study = study.changed(plant=str(path.parent / study.plant))  # relative to the study
-    return study.checked(str(path))
+    return _beside(study, path.parent).checked(str(path))
+
+
+def _beside(study: Study, folder: Path) -> Study:
+    """The study with the files it names, where they lie in its own folder."""
+    plant, methods = study.plant, study.model_dump()["methods"]
+    if ":" in plant and (folder / plant.rpartition(":")[0]).is_file():
+        plant = str(folder / plant)
+    for method in methods.values():
+        file = folder / method["excitation"]
+        if file.suffix in (POLICY_ENDING, *SIGNAL_ENDINGS) and file.is_file():
+            method["excitation"] = str(file)
+    return study.changed(plant=plant, methods=methods)
 
 
 def study_from(content: Mapping[str, Any], where: str) -> Study:

@@ -22,6 +22,41 @@ WATCH_SEED = 0x7A11DA7E
 """Validation episodes, the same for all seeds, apart from training and every evaluation."""
 
 
+def check_counts(settings: Any, *names: str) -> None:
+    """Raises ValueError for a setting below one."""
+    for name in names:
+        if getattr(settings, name) < 1:
+            raise ValueError(f"{name} must be at least 1: got {getattr(settings, name)}")
+
+
+def check_positive(settings: Any, *names: str) -> None:
+    """Raises ValueError for a setting that is not positive and finite; None is allowed."""
+    for name in names:
+        value = getattr(settings, name)
+        if value is not None and not 0 < value < math.inf:
+            raise ValueError(f"{name} must be positive and finite: got {value:g}")
+
+
+def check_not_negative(settings: Any, *names: str) -> None:
+    """Raises ValueError for a setting that is negative or not finite."""
+    for name in names:
+        if not 0 <= getattr(settings, name) < math.inf:
+            raise ValueError(f"{name} must not be negative: got {getattr(settings, name):g}")
+
+
+def check_fractions(settings: Any, *names: str) -> None:
+    """Raises ValueError for a setting that is not in [0, 1)."""
+    for name in names:
+        if not 0 <= getattr(settings, name) < 1:
+            raise ValueError(f"{name} must lie in [0, 1): got {getattr(settings, name):g}")
+
+
+def check_widths(settings: Any) -> None:
+    """Raises ValueError where the hidden layers have no widths of at least one."""
+    if not settings.hidden or min(settings.hidden) < 1:
+        raise ValueError(f"hidden needs widths of at least 1: got {list(settings.hidden)}")
+
+
 @dataclass(frozen=True)
 class PPOSettings:
     """Hyper-parameters, named as in Stable-Baselines3 and with its defaults where it has one.
@@ -35,7 +70,8 @@ class PPOSettings:
         learning_rate, learning_rate_end: Adam's step, first and last, linear between;
             without an end it is constant.
         noise_sd, noise_sd_end: standard deviation of the exploration noise, in units of
-            the input limit, first and last, geometric between; without an end it is learnt.
+            the input limit, in the first rollout and in one that would follow the last,
+            geometric between; without an end it is learnt.
         average_last: fraction of the training, at its end, over which the weights of the policy
             are averaged (B. Polyak, A. Juditsky, Acceleration of stochastic approximation by
             averaging, 1992); 0 is the last policy, as in Stable-Baselines3.
@@ -66,27 +102,18 @@ class PPOSettings:
 
     def __post_init__(self) -> None:
         """Raises ValueError for a value that is not allowed."""
-        counts = ("total_steps", "num_envs", "n_steps", "batch_size", "n_epochs")
-        for name in (*counts, "watch_every", "watch_episodes"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1: got {getattr(self, name)}")
-        rates = ("learning_rate", "learning_rate_end", "noise_sd", "noise_sd_end")
-        for name in (*rates, "clip_range", "max_grad_norm"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < math.inf:
-                raise ValueError(f"{name} must be positive: got {value:g}")
-        for name in ("ent_coef", "vf_coef"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must not be negative: got {getattr(self, name):g}")
+        check_counts(self, "total_steps", "num_envs", "n_steps", "batch_size", "n_epochs")
+        check_counts(self, "watch_every", "watch_episodes")
+        check_positive(self, "learning_rate", "learning_rate_end", "noise_sd", "noise_sd_end")
+        check_positive(self, "clip_range", "max_grad_norm")
+        check_not_negative(self, "ent_coef", "vf_coef")
         for name in ("gamma", "gae_lambda"):
             if not 0 < getattr(self, name) <= 1:
                 raise ValueError(
                     f"{name} must be above 0 and at most 1: got {getattr(self, name):g}"
                 )
-        if not 0 <= self.average_last < 1:
-            raise ValueError(f"average_last must lie in [0, 1): got {self.average_last:g}")
-        if not self.hidden or min(self.hidden) < 1:
-            raise ValueError(f"hidden needs widths of at least 1: got {list(self.hidden)}")
+        check_fractions(self, "average_last")
+        check_widths(self)
         rollout = self.num_envs * self.n_steps
         if self.batch_size < 2 or rollout % self.batch_size:
             raise ValueError(
@@ -130,10 +157,17 @@ class Checkpoint:
 
 @dataclass(frozen=True)
 class Trained:
-    """Weights of the trained policy, and its learning curve: one row a look."""
+    """A trained policy.
+
+    Attributes:
+        weights: of its network.
+        curve: one row a look.
+        validation: the look at these weights.
+    """
 
     weights: Weights
     curve: list[dict[str, float]]
+    validation: dict[str, float]
 
 
 OnBoundary: TypeAlias = Callable[[Callable[[], Checkpoint], dict[str, float] | None], None]
@@ -180,9 +214,14 @@ def watch(env: Env, weights: Weights, keys: Key[Array, " episode"]) -> Watched:
     return jax.vmap(episode)(keys)
 
 
+def watch_keys(num_episodes: int) -> Key[Array, " episode"]:
+    """Keys of the validation episodes."""
+    return jax.random.split(jax.random.key(WATCH_SEED), num_episodes)
+
+
 def look(env: Env, weights: Weights, num_episodes: int) -> dict[str, float]:
     """What a learning curve shows of the deterministic policy, in the validation episodes."""
-    seen = watch(env, weights, jax.random.split(jax.random.key(WATCH_SEED), num_episodes))
+    seen = watch(env, weights, watch_keys(num_episodes))
     names = names_of(env.plant.definition.parameters)
     errors = np.asarray(seen.relative_errors).mean(axis=0)
     return {

@@ -3,14 +3,16 @@
 The decision process is one differentiable function of the policy's weights, so that the
 gradient of what an experiment is worth follows from one backward pass through it. Every
 update takes a fresh batch of plants. Safety is a quadratic penalty on the true outputs
-from a margin below the critical level, whose weight grows after a batch with a violation
-and slowly decays otherwise.
+from a margin below the critical level, whose weight grows after a batch in which a plant
+came too near to that level and slowly decays otherwise. Of all looks at the policy the
+best one whose violation rate on held-out plants is allowed is kept.
 """
 
 from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,12 +21,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray
+from jaxtyping import Array, Float, Key, PRNGKeyArray
 
-from ..env import Env
-from ..policy import Weights, forward, observe
+from ..env import Env, EnvState
+from ..policy import Layout, Weights, forward, observe
 from ..safety import watched_levels
-from .base import Checkpoint, OnBoundary, Trained, look
+from .base import (
+    Checkpoint,
+    OnBoundary,
+    Trained,
+    check_counts,
+    check_fractions,
+    check_not_negative,
+    check_positive,
+    check_widths,
+    look,
+    watch_keys,
+)
 
 
 @dataclass(frozen=True)
@@ -39,63 +52,76 @@ class GradientSettings:
         hidden: widths of the hidden layers, tanh.
         last_gain: scale of the last layer's first weights; a loud first policy runs away.
         margin: the penalty begins at this fraction of a critical level.
-        penalty_weight: of the penalty, at the beginning.
-        penalty_growth, penalty_decay: what is added to its logarithm after a batch with a
-            violation, and taken away after one without.
+        penalty_weight: of the penalty, at the beginning and at least.
+        near: fraction of a critical level that counts as too near to it.
+        penalty_growth, penalty_decay: what is added to the weight's logarithm after a batch
+            that came too near, and taken away after another.
+        violation_rate: allowed on held-out plants.
         watch_every: updates between two looks at the policy.
         watch_episodes: episodes of such a look.
     """
 
     num_updates: int = 1000
-    num_plants: int = 32
-    learning_rate: float = 2e-3
+    num_plants: int = 64
+    learning_rate: float = 3e-3
     max_grad_norm: float = 1.0
     hidden: tuple[int, ...] = (64, 64)
     last_gain: float = 0.02
-    margin: float = 0.9
-    penalty_weight: float = 1.0
-    penalty_growth: float = 0.05
-    penalty_decay: float = 0.005
+    margin: float = 0.95
+    penalty_weight: float = 30.0
+    near: float = 0.97
+    penalty_growth: float = 0.02
+    penalty_decay: float = 0.02
+    violation_rate: float = 0.0
     watch_every: int = 50
-    watch_episodes: int = 100
+    watch_episodes: int = 500
 
     def __post_init__(self) -> None:
         """Raises ValueError for a value that is not allowed."""
-        for name in ("num_updates", "num_plants", "watch_every", "watch_episodes"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1: got {getattr(self, name)}")
-        for name in ("learning_rate", "max_grad_norm", "last_gain", "penalty_weight"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must be positive: got {getattr(self, name):g}")
-        for name in ("penalty_growth", "penalty_decay"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must not be negative: got {getattr(self, name):g}")
-        if not 0 <= self.margin < 1:
-            raise ValueError(f"margin must lie in [0, 1): got {self.margin:g}")
-        if not self.hidden or min(self.hidden) < 1:
-            raise ValueError(f"hidden needs widths of at least 1: got {list(self.hidden)}")
+        check_counts(self, "num_updates", "num_plants", "watch_every", "watch_episodes")
+        check_positive(self, "learning_rate", "max_grad_norm", "last_gain", "penalty_weight")
+        check_not_negative(self, "penalty_growth", "penalty_decay", "violation_rate")
+        check_fractions(self, "margin", "near")
+        check_widths(self)
+
+
+class Network(eqx.Module):
+    """A policy being trained."""
+
+    weights: Weights
+    layout: Layout = eqx.field(static=True)
+
+    def __call__(self, state: EnvState) -> Float[Array, " input"]:
+        """The policy's action in this state."""
+        return forward(jnp, self.weights, observe(jnp, self.layout, state.window, state.k))
 
 
 class Batch(eqx.Module):
-    """Experiments of one policy on a batch of plants.
+    """Experiments of one policy or signal on a batch of plants.
 
     Attributes:
         worth: of each, by the objective.
+        errors: relative errors of the parameters at the end, as the objective knows them.
         excess: of each, the mean square of how far outputs lie beyond the margin; one is
             the critical level.
-        is_violation: of each.
+        nearness: of each, the largest output over its critical level; infinite for an
+            experiment that cannot be computed.
     """
 
     worth: Float[Array, "*plant"]
+    errors: Float[Array, "*plant param"]
     excess: Float[Array, "*plant"]
-    is_violation: Bool[Array, "*plant"]
+    nearness: Float[Array, "*plant"]
 
 
 @eqx.filter_jit
 def experiments(
-    env: Env, weights: Weights, keys: Key[Array, " plant"], margin: Float[Array, ""] | float
+    env: Env,
+    act: Callable[[EnvState], Float[Array, " input"]],
+    keys: Key[Array, " plant"],
+    margin: Float[Array, ""] | float,
 ) -> Batch:
-    """One experiment for every key, differentiable in the weights.
+    """One experiment for every key, differentiable in what `act` holds.
 
     Only the states at every step are kept for the backward pass; the rest of a step is
     computed again.
@@ -103,31 +129,69 @@ def experiments(
     watched, _, critical = watched_levels(env.plant.definition)
 
     @jax.checkpoint
-    def advance(carry: tuple, _: None) -> tuple[tuple, tuple]:
-        state, observation = carry
-        state, output, gain = env.advance(state, forward(jnp, weights, observation))
+    def advance(state: EnvState, _: None) -> tuple[EnvState, tuple]:
+        state, output, gain = env.advance(state, act(state))
         size = jnp.abs(output[np.array(watched, int)]) / critical
         over = jnp.maximum(size - margin, 0.0) / (1 - margin)
-        observation = observe(jnp, env.layout, state.window, state.k)
-        return (state, observation), (gain, jnp.sum(over**2), jnp.any(size >= 1))
+        return state, (gain, jnp.sum(over**2), jnp.max(size, initial=0.0))
 
     def experiment(key: PRNGKeyArray) -> Batch:
-        (state, _), (gains, excess, is_over) = jax.lax.scan(
-            advance, env.reset(key), None, length=env.layout.num_steps
+        start, _ = env.reset(key)
+        state, (gains, excess, sizes) = jax.lax.scan(
+            advance, start, None, length=env.layout.num_steps
         )
         final = env.objective.final(env.plant, state.memory, state.params)
-        is_violation = jnp.any(is_over) | ~state.is_finite
-        return Batch(jnp.sum(gains) + final, jnp.mean(excess), is_violation)
+        errors = env.objective.relative_errors(env.plant, state.memory, state.params)
+        nearness = jnp.where(state.is_finite, jnp.max(sizes), jnp.inf)
+        return Batch(jnp.sum(gains) + final, errors, jnp.mean(excess), nearness)
 
     return jax.vmap(experiment)(keys)
 
 
-class _Progress(eqx.Module):
-    """What changes from update to update."""
+class Progress(eqx.Module):
+    """What changes from update to update.
 
-    weights: Weights
+    Attributes:
+        player: the policy or signal being trained.
+        adam: state of the optimiser.
+        penalty_weight: of the safety penalty.
+    """
+
+    player: Any
     adam: Any
-    penalty_weight: Float[Array, ""]
+    penalty_weight: Float[Array, "*training"]
+
+    @classmethod
+    def start(cls, player: Any, settings: GradientSettings) -> Progress:
+        """Before the first update."""
+        adam = _optimiser(settings).init(eqx.filter(player, eqx.is_array))
+        return cls(player, adam, jnp.asarray(settings.penalty_weight, float))
+
+
+def update(
+    env: Env, settings: GradientSettings, now: Progress, keys: Key[Array, " plant"]
+) -> tuple[Progress, Batch]:
+    """One step of Adam on the plants of these keys, and their experiments before it."""
+
+    def loss(player: Any) -> tuple[Array, Batch]:
+        batch = experiments(env, player, keys, settings.margin)
+        worth = env.objective.of_batch(batch.worth, batch.errors)
+        return now.penalty_weight * jnp.mean(batch.excess) - worth, batch
+
+    (cost, batch), gradient = eqx.filter_value_and_grad(loss, has_aux=True)(now.player)
+    gradient = jax.tree.map(lambda leaf: jnp.where(jnp.isfinite(cost), leaf, jnp.nan), gradient)
+    step, adam = _optimiser(settings).update(gradient, now.adam)
+    is_near = jnp.any(batch.nearness >= settings.near)
+    change = jnp.where(is_near, settings.penalty_growth, -settings.penalty_decay)
+    player = eqx.apply_updates(now.player, step)
+    weight = jnp.maximum(now.penalty_weight * jnp.exp(change), settings.penalty_weight)
+    return Progress(player, adam, weight), batch
+
+
+update_all = eqx.filter_jit(
+    eqx.filter_vmap(update, in_axes=(None, None, eqx.if_array(0), eqx.if_array(0)))
+)
+"""`update` for several trainings side by side; their axis is the first of progress and keys."""
 
 
 def train(
@@ -147,24 +211,137 @@ def train(
     Raises:
         ValueError: where gradients are no longer finite.
     """
-    first, key = jax.random.split(jax.random.key(seed))
-    weights = _first_weights(env, settings, first)
-    penalty_weight = jnp.asarray(settings.penalty_weight, float)
-    now = _Progress(weights, _optimiser(settings).init(weights), penalty_weight)
-    start, curve = 0, []
+    return train_all(env, settings, [seed], resume=resume, on_boundary=on_boundary)[0]
+
+
+def train_all(
+    env: Env,
+    settings: GradientSettings,
+    seeds: Sequence[int],
+    *,
+    resume: Checkpoint | None = None,
+    on_boundary: OnBoundary = lambda *_: None,
+) -> list[Trained]:
+    """Trains one policy a seed, all in one batch; see `train`.
+
+    Their looks go to `on_boundary` as one, the mean.
+    """
+    course, keys = started(env, settings, seeds)
     if resume is not None:
-        now, start, curve = _restored(now, resume)
-    for i in range(start, settings.num_updates + 1):
-        row, steps = None, float(i * settings.num_plants * env.layout.num_steps)
+        course = _restored(course, resume)
+    for i in range(course.num_updates, settings.num_updates + 1):
+        row = None
         is_due = i % settings.watch_every == 0 or i == settings.num_updates
-        if is_due and (not curve or curve[-1]["steps"] < steps):  # not twice after a resume
-            _require_finite(now, settings, i)
-            row = {"steps": steps, **look(env, now.weights, settings.watch_episodes), **_state(now)}
-            curve.append(row)
-        on_boundary(functools.partial(_checkpoint, now, i, steps, curve), row)
+        steps = float(i * settings.num_plants * env.layout.num_steps)
+        if is_due and course.last_look() < steps:  # not twice after a resume
+            _require_finite(course.now, settings, i)
+            row = _looked(env, settings, course, steps)
+            _require_computable(row)
+        on_boundary(functools.partial(course.checkpoint, steps), row)
         if i < settings.num_updates:
-            now = _update(env, settings, now, jax.random.fold_in(key, i))
-    return Trained(jax.tree.map(np.asarray, now.weights), curve)
+            course.now, _ = update_all(env, settings, course.now, keys(i))
+            course.num_updates += 1
+    best = course.best.weights
+    weights = [jax.tree.map(lambda x, s=s: np.asarray(x[s]), best) for s in range(len(seeds))]
+    looks = [max(c, key=lambda row: _rank(settings, row)) for c in course.curves]
+    return [Trained(*parts) for parts in zip(weights, course.curves, looks, strict=True)]
+
+
+@dataclass
+class _Course:
+    """A training under way; the leading axis of arrays is the seed.
+
+    Attributes:
+        now: progress.
+        best: the best policy seen by a look.
+        rank: of that look: minus the violation rate beyond the one allowed, then worth.
+        curves: looks, by seed.
+        num_updates: done.
+    """
+
+    now: Progress
+    best: Any
+    rank: Float[np.ndarray, "seed 2"]
+    curves: list[list[dict[str, float]]]
+    num_updates: int = 0
+
+    def last_look(self) -> float:
+        """Steps of the last look; before any, below zero."""
+        return self.curves[0][-1]["steps"] if self.curves[0] else -1.0
+
+    def checkpoint(self, steps: float) -> Checkpoint:
+        """All of it, to be restored."""
+        leaves = jax.tree.leaves((self.now, self.best, self.rank))
+        tensors = {f"leaf.{i}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
+        state = {"num_updates": self.num_updates, "num_steps": steps}
+        return Checkpoint(tensors, {**state, "curves": [list(c) for c in self.curves]})
+
+
+def _restored(course: _Course, saved: Checkpoint) -> _Course:
+    old, structure = jax.tree.flatten((course.now, course.best, course.rank))
+    leaves = [  # a file has no scalars
+        jnp.asarray(saved.tensors[f"leaf.{i}"], x.dtype).reshape(x.shape) for i, x in enumerate(old)
+    ]
+    now, best, rank = jax.tree.unflatten(structure, leaves)
+    return _Course(
+        now, best, np.array(rank), list(saved.state["curves"]), saved.state["num_updates"]
+    )
+
+
+def started(
+    env: Env, settings: GradientSettings, seeds: Sequence[int]
+) -> tuple[_Course, Callable[[int], Key[Array, "seed plant"]]]:
+    """Trainings at their beginning, and the keys of the plants of an update."""
+    pairs = jax.vmap(jax.random.split)(jnp.stack([jax.random.key(seed) for seed in seeds]))
+
+    def start(key: PRNGKeyArray) -> Progress:
+        return Progress.start(Network(_first_weights(env, settings, key), env.layout), settings)
+
+    def keys(i: int) -> Key[Array, "seed plant"]:
+        own = jax.vmap(jax.random.fold_in, (0, None))(pairs[:, 1], i)
+        return jax.vmap(jax.random.split, (0, None))(own, settings.num_plants)
+
+    now = eqx.filter_vmap(start)(pairs[:, 0])
+    rank = np.full((len(seeds), 2), -np.inf)
+    return _Course(now, now.player, rank, [[] for _ in seeds]), keys
+
+
+def _looked(
+    env: Env, settings: GradientSettings, course: _Course, steps: float
+) -> dict[str, float]:
+    """Looks at every policy and keeps the best; returns the mean of what was seen."""
+    for s, curve in enumerate(course.curves):
+        own = jax.tree.map(lambda x, s=s: x[s], course.now)
+        seen = look(env, own.player.weights, settings.watch_episodes)
+        judged = _judged(env, own.player, watch_keys(settings.watch_episodes))
+        curve.append({"steps": steps, **judged, **seen, **_state(own)})
+        rank = _rank(settings, curve[-1])
+        if rank > tuple(course.rank[s]):
+            course.rank[s] = rank
+            course.best = jax.tree.map(
+                lambda best, x, s=s: best.at[s].set(x), course.best, own.player
+            )
+    last = [curve[-1] for curve in course.curves]
+    return {name: float(np.mean([row[name] for row in last])) for name in last[0]}
+
+
+def _judged(env: Env, player: Network, keys: Key[Array, " plant"]) -> dict[str, float]:
+    """The objective alone, without the stepwise penalty of the decision process."""
+    batch = experiments(env, player, keys, 0.9)
+    return {
+        "worth": float(env.objective.of_batch(batch.worth, batch.errors)),
+        "nearness": float(jnp.max(batch.nearness)),
+        "not_computable": float(jnp.mean(jnp.isinf(batch.nearness))),
+    }
+
+
+def _rank(settings: GradientSettings, row: Mapping[str, float]) -> tuple[float, float]:
+    """How good a look was: the violation rate beyond the one allowed, then the worth.
+
+    The first look, at a policy that learnt nothing yet, is the last choice.
+    """
+    too_many = max(0.0, row["violation_rate"] - settings.violation_rate)
+    return (-too_many if row["steps"] else -math.inf, row["worth"])
 
 
 def _optimiser(settings: GradientSettings) -> optax.GradientTransformation:
@@ -186,25 +363,8 @@ def _first_weights(env: Env, settings: GradientSettings, key: PRNGKeyArray) -> W
     )
 
 
-@eqx.filter_jit
-def _update(env: Env, settings: GradientSettings, now: _Progress, key: PRNGKeyArray) -> _Progress:
-    keys = jax.random.split(key, settings.num_plants)
-
-    def loss(weights: Weights) -> tuple[Array, Array]:
-        batch = experiments(env, weights, keys, settings.margin)
-        cost = now.penalty_weight * jnp.mean(batch.excess) - jnp.mean(batch.worth)
-        return cost, jnp.any(batch.is_violation)
-
-    (cost, is_unsafe), gradient = jax.value_and_grad(loss, has_aux=True)(now.weights)
-    gradient = jax.tree.map(lambda leaf: jnp.where(jnp.isfinite(cost), leaf, jnp.nan), gradient)
-    step, adam = _optimiser(settings).update(gradient, now.adam, now.weights)
-    change = jnp.where(is_unsafe, settings.penalty_growth, -settings.penalty_decay)
-    weights: Any = optax.apply_updates(now.weights, step)
-    return _Progress(weights, adam, now.penalty_weight * jnp.exp(change))
-
-
-def _require_finite(now: _Progress, settings: GradientSettings, num_updates: int) -> None:
-    in_a_row = int(now.adam.notfinite_count)
+def _require_finite(now: Progress, settings: GradientSettings, num_updates: int) -> None:
+    in_a_row = int(np.max(now.adam.notfinite_count))
     if in_a_row >= min(settings.watch_every, settings.num_updates) and num_updates:
         raise ValueError(
             f"the gradient was not finite in the last {in_a_row} updates: the plant or its "
@@ -213,26 +373,17 @@ def _require_finite(now: _Progress, settings: GradientSettings, num_updates: int
         )
 
 
-def _state(now: _Progress) -> dict[str, float]:
+def _require_computable(row: Mapping[str, float]) -> None:
+    if row["not_computable"] == 1:
+        raise ValueError(
+            "no experiment on this plant can be computed to its end: its state leaves the finite "
+            "numbers under this policy; give it a critical level, a shorter experiment or a "
+            "smaller spread"
+        )
+
+
+def _state(now: Progress) -> dict[str, float]:
     return {
         "penalty_weight": float(now.penalty_weight),
         "not_finite": float(now.adam.total_notfinite),
     }
-
-
-def _checkpoint(
-    now: _Progress, num_updates: int, num_steps: float, curve: list[dict[str, float]]
-) -> Checkpoint:
-    tensors = {f"leaf.{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(now))}
-    state = {"num_updates": num_updates, "num_steps": num_steps, "curve": list(curve)}
-    return Checkpoint(tensors, state)
-
-
-def _restored(first: _Progress, saved: Checkpoint) -> tuple[_Progress, int, list[dict[str, float]]]:
-    """Progress, the update that comes next, and the curve before it."""
-    old, structure = jax.tree.flatten(first)
-    leaves = [  # a file has no scalars
-        jnp.asarray(saved.tensors[f"leaf.{i}"], x.dtype).reshape(x.shape) for i, x in enumerate(old)
-    ]
-    now = jax.tree.unflatten(structure, leaves)
-    return now, saved.state["num_updates"], list(saved.state["curve"])

@@ -131,7 +131,7 @@ def train(
     remaining = settings.total_steps - model.num_timesteps
     if remaining > 0:
         model.learn(remaining, watcher, reset_num_timesteps=resume is None)
-    return Trained(watcher.weights, watcher.curve)
+    return Trained(watcher.weights, watcher.curve, watcher.curve[-1])
 
 
 def policy_weights(model: PPO) -> Weights:

@@ -1,18 +1,8 @@
-"""Excitations: what turns the measurements so far into the next input.
-
-An excitation is `init` (before the experiment) and `__call__` (at every sample). Signals
-ignore the measurement: they lay down their whole sequence in `init`. With several inputs
-every input gets a sequence of its own that is not a multiple of another's, because inputs
-that move together cannot be told apart.
-
-All values are bounded by the plant's input limits, and reproducible from a key.
-"""
+"""Signals laid down beforehand: random, PRBS, chirp, multisine, square, decay, and replay."""
 
 from __future__ import annotations
 
-import abc
 import functools
-from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -20,21 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from .plant import AbstractPlant
-from .policy import (
-    Layout,
-    Policy,
-    Window,
-    empty_window,
-    forward,
-    observe,
-    scaled_action,
-    with_input,
-    with_measurement,
-)
-
-Sequence: TypeAlias = Float[Array, "time input"]
-SignalState: TypeAlias = Any
+from ..plant import AbstractPlant
+from .base import AbstractShape, AbstractSignal, Sequence, optional_array
 
 # Feedback taps of maximum-length shift registers (period 2^bits - 1), counted from 1;
 # S. W. Golomb, Shift Register Sequences, 1967.
@@ -43,58 +20,6 @@ _TAPS = {
     9: (9, 5), 10: (10, 7), 11: (11, 9), 12: (12, 11, 10, 4), 13: (13, 12, 11, 8),
     14: (14, 13, 12, 2), 15: (15, 14), 16: (16, 15, 13, 4),
 }  # fmt: skip
-
-
-def optional_array(value: Any) -> Array | None:
-    """An array of numbers, or None as it is; converts fields."""
-    return None if value is None else jnp.asarray(value, float)
-
-
-class AbstractExcitation(eqx.Module):
-    """Base of all excitations."""
-
-    @abc.abstractmethod
-    def init(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> Any:
-        """State before the first sample of an experiment of `num_steps` steps."""
-
-    @abc.abstractmethod
-    def __call__(
-        self, state: Any, measurement: Float[Array, " output"]
-    ) -> tuple[Any, Float[Array, " input"]]:
-        """Next state, and the input held until the next sample."""
-
-
-class AbstractSignal(AbstractExcitation):
-    """An excitation that ignores the measurement: a sequence known beforehand."""
-
-    @abc.abstractmethod
-    def sequence(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> Sequence:
-        """All inputs of an experiment, in input units, within the input limits."""
-
-    def init(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> SignalState:
-        """The sequence and the index of its next row."""
-        return self.sequence(plant, num_steps, key), jnp.asarray(0)
-
-    def __call__(
-        self, state: SignalState, measurement: Float[Array, " output"]
-    ) -> tuple[SignalState, Float[Array, " input"]]:
-        """The next row of the sequence."""
-        del measurement
-        sequence, k = state
-        return (sequence, k + 1), sequence[k]
-
-
-def _scaled(unit: Sequence, plant: AbstractPlant, amplitude: Array | None) -> Sequence:
-    """A sequence in [-1, 1] around the middle of the limits, clipped to them.
-
-    Without an amplitude, that of the plant's description for classical signals.
-    """
-    lower, upper = plant.input_limits
-    if amplitude is None:
-        amplitude = jnp.asarray([i.amplitude for i in plant.definition.inputs])
-    amplitude = jnp.broadcast_to(amplitude, lower.shape)
-    middle = (lower + upper) / 2
-    return jnp.clip(middle[None] + amplitude[None] * unit, lower[None], upper[None])
 
 
 def _hold(values: Float[Array, "block input"], num_steps: int, samples: int) -> Sequence:
@@ -108,29 +33,26 @@ def _blocks(num_steps: int, samples: int, what: str) -> int:
     return -(-num_steps // samples)
 
 
-class Random(AbstractSignal):
+class Random(AbstractShape):
     """Uniform random input, each value held for `hold` samples.
 
     Attributes:
-        amplitude: largest distance from the middle of the input limits [input unit].
         hold: samples for which a value is held.
     """
 
-    amplitude: Float[Array, "..."] | None = eqx.field(converter=optional_array, default=None)
     hold: int = eqx.field(static=True, default=1)
 
-    def sequence(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> Sequence:
+    def shape(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> Sequence:
         """Independent values for every input."""
         shape = (_blocks(num_steps, self.hold, "hold"), len(plant.definition.inputs))
         unit = jax.random.uniform(key, shape, float, -1.0, 1.0)
-        return _scaled(_hold(unit, num_steps, self.hold), plant, self.amplitude)
+        return _hold(unit, num_steps, self.hold)
 
 
-class PRBS(AbstractSignal):
+class PRBS(AbstractShape):
     """Pseudo-random binary sequence: the input switches between two values.
 
     Attributes:
-        amplitude: distance of both values from the middle of the limits [input unit].
         clock: samples between two chances to switch.
         register: bits of a maximum-length shift register (2 to 16), started at random;
             0 draws every value independently. A second input gets the sequence delayed by
@@ -138,11 +60,10 @@ class PRBS(AbstractSignal):
             Identification, 1993).
     """
 
-    amplitude: Float[Array, "..."] | None = eqx.field(converter=optional_array, default=None)
     clock: int = eqx.field(static=True, default=1)
     register: int = eqx.field(static=True, default=0)
 
-    def sequence(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> Sequence:
+    def shape(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> Sequence:
         """Two values for every input; the key draws them, or where the register starts."""
         blocks = _blocks(num_steps, self.clock, "clock")
         num_inputs = len(plant.definition.inputs)
@@ -154,7 +75,7 @@ class PRBS(AbstractSignal):
             delays = jnp.arange(num_inputs) * (period.size // num_inputs)
             index = start + jnp.arange(blocks)[:, None] - delays[None]
             unit = period[index % period.size]
-        return _scaled(_hold(unit, num_steps, self.clock), plant, self.amplitude)
+        return _hold(unit, num_steps, self.clock)
 
 
 @functools.cache
@@ -183,23 +104,21 @@ def _band(plant: AbstractPlant, low: Array | None, high: Array | None) -> tuple[
     return low, jnp.minimum(default[1], nyquist) if high is None else high
 
 
-class Chirp(AbstractSignal):
+class Chirp(AbstractShape):
     """Sine whose frequency sweeps the band once, linearly or logarithmically in time.
 
     A second input gets the sweep shifted cyclically by a fraction of the experiment.
 
     Attributes:
-        amplitude: of the sine [input unit].
         start_frequency, stop_frequency: [Hz], default the plant's band.
         logarithmic: whether equal times are spent on equal frequency ratios.
     """
 
-    amplitude: Float[Array, "..."] | None = eqx.field(converter=optional_array, default=None)
     start_frequency: Float[Array, ""] | None = eqx.field(converter=optional_array, default=None)
     stop_frequency: Float[Array, ""] | None = eqx.field(converter=optional_array, default=None)
     logarithmic: bool = eqx.field(static=True, default=False)
 
-    def sequence(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> Sequence:
+    def shape(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> Sequence:
         """The same sweep for every key."""
         del key
         low, high = _band(plant, self.start_frequency, self.stop_frequency)
@@ -214,11 +133,10 @@ class Chirp(AbstractSignal):
         num_inputs = len(plant.definition.inputs)
         shifts = [i * num_steps // num_inputs for i in range(num_inputs)]
         sweep = jnp.sin(2 * jnp.pi * cycles)
-        unit = jnp.stack([jnp.roll(sweep, shift) for shift in shifts], axis=1)
-        return _scaled(unit, plant, self.amplitude)
+        return jnp.stack([jnp.roll(sweep, shift) for shift in shifts], axis=1)
 
 
-class Multisine(AbstractSignal):
+class Multisine(AbstractShape):
     """Sum of all harmonics of the experiment's length in a band, with Schroeder phases.
 
     Its phases, -pi j (j - 1) / J for the j-th of J harmonics, keep the crest factor low
@@ -226,15 +144,13 @@ class Multisine(AbstractSignal):
     peak. Several inputs take turns with the harmonics, so that they are orthogonal.
 
     Attributes:
-        amplitude: largest magnitude of the sum [input unit].
         start_frequency, stop_frequency: band [Hz], default the plant's.
     """
 
-    amplitude: Float[Array, "..."] | None = eqx.field(converter=optional_array, default=None)
     start_frequency: Float[Array, ""] | None = eqx.field(converter=optional_array, default=None)
     stop_frequency: Float[Array, ""] | None = eqx.field(converter=optional_array, default=None)
 
-    def sequence(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> Sequence:
+    def shape(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> Sequence:
         """The same sum for every key; zero where the band holds no harmonic."""
         del key
         low, high = _band(plant, self.start_frequency, self.stop_frequency)
@@ -248,21 +164,19 @@ class Multisine(AbstractSignal):
         phase = -jnp.pi * j * (j - 1) / jnp.maximum(j[-1:], 1)
         unit = jnp.fft.irfft(jnp.where(chosen, jnp.exp(1j * phase), 0.0), num_steps, axis=0)
         peak = jnp.max(jnp.abs(unit), axis=0, keepdims=True)
-        return _scaled(unit / jnp.where(peak > 0, peak, 1.0), plant, self.amplitude)
+        return unit / jnp.where(peak > 0, peak, 1.0)
 
 
-class Square(AbstractSignal):
+class Square(AbstractShape):
     """Square wave; the i-th input switches 2^i times as fast (i = 0, 1, ...).
 
     Attributes:
-        amplitude: distance of both values from the middle of the limits [input unit].
         frequency: of the first input [Hz], default the geometric mean of the plant's band.
     """
 
-    amplitude: Float[Array, "..."] | None = eqx.field(converter=optional_array, default=None)
     frequency: Float[Array, ""] | None = eqx.field(converter=optional_array, default=None)
 
-    def sequence(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> Sequence:
+    def shape(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> Sequence:
         """The same wave for every key, beginning with its upper value."""
         del key
         low, high = _band(plant, None, None)
@@ -271,7 +185,27 @@ class Square(AbstractSignal):
         half_periods = 2 * frequency * plant.dt * jnp.arange(num_steps)
         # The small number keeps a switch at its sample where rounding would delay it.
         count = jnp.floor(half_periods[:, None] * octaves[None] + 1e-9)
-        return _scaled(1 - 2 * (count % 2), plant, self.amplitude)
+        return 1 - 2 * (count % 2)
+
+
+class Decay(AbstractShape):
+    """Pump and free decay: a square wave near resonance, then the input rests.
+
+    The classical way to the damping of an oscillator, to be evaluated by the logarithmic
+    decrement.
+
+    Attributes:
+        frequency: of the square wave [Hz], default the geometric mean of the plant's band.
+        pump: fraction of the experiment for which the plant is driven.
+    """
+
+    frequency: Float[Array, ""] | None = eqx.field(converter=optional_array, default=None)
+    pump: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=0.3)
+
+    def shape(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> Sequence:
+        """The wave, then zero."""
+        wave = Square(frequency=self.frequency).shape(plant, num_steps, key)
+        return jnp.where(jnp.arange(num_steps)[:, None] < self.pump * num_steps, wave, 0.0)
 
 
 class Replay(AbstractSignal):
@@ -298,52 +232,3 @@ class Replay(AbstractSignal):
             )
         lower, upper = plant.input_limits
         return jnp.clip(self.inputs[:num_steps], lower[None], upper[None])
-
-
-class PolicyExcitation(AbstractExcitation):
-    """A learned policy: the only excitation here that looks at the measurements.
-
-    Attributes:
-        weights: of the network, single precision.
-        layout: what it observes.
-    """
-
-    weights: tuple[tuple[Float[Array, "_to _from"], Float[Array, " _to"]], ...]
-    layout: Layout = eqx.field(static=True)
-
-    @classmethod
-    def of(cls, policy: Policy) -> PolicyExcitation:
-        """The excitation of a policy read from a file."""
-        layers = tuple((jnp.asarray(m), jnp.asarray(b)) for m, b in policy.weights)
-        return cls(layers, policy.layout)
-
-    def init(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> tuple[Window, Array]:
-        """An empty window and k = 0.
-
-        Raises:
-            ValueError: for an experiment longer than the policy was made for.
-        """
-        del plant, key
-        if num_steps > self.layout.num_steps:
-            raise ValueError(
-                f"the policy was made for {self.layout.num_steps} steps; "
-                f"the experiment has {num_steps}"
-            )
-        return empty_window(jnp, self.layout), jnp.asarray(0)
-
-    def __call__(
-        self, state: tuple[Window, Array], measurement: Float[Array, " output"]
-    ) -> tuple[tuple[Window, Array], Float[Array, " input"]]:
-        """The network's input for the window that ends with this measurement."""
-        window, k = state
-        window = with_measurement(jnp, self.layout, window, measurement)
-        action = forward(jnp, self.weights, observe(jnp, self.layout, window, k))
-        input = scaled_action(jnp, self.layout, action.astype(float))
-        return (with_input(jnp, self.layout, window, input), k + 1), input
-
-
-def crest_factor(sequence: Sequence) -> Float[Array, " input"]:
-    """Peak over root mean square of each input; infinite for an input that is zero."""
-    peak = jnp.max(jnp.abs(sequence), axis=0)
-    rms = jnp.sqrt(jnp.mean(sequence**2, axis=0))
-    return jnp.where(rms > 0, peak / jnp.where(rms > 0, rms, 1.0), jnp.inf)

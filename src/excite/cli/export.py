@@ -1,0 +1,45 @@
+"""`excite export`: a policy in the format of other tools."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from .door import OUT_FILE, json_option, show_json
+
+
+@click.command()
+@click.argument("policy")
+@click.option("--onnx", type=OUT_FILE, required=True, metavar="FILE", help="ONNX model (.onnx).")
+@click.option("--overwrite", is_flag=True, help="Replace the file if it exists.")
+@json_option
+def export(policy: str, onnx: Path, overwrite: bool, as_json: bool) -> None:
+    """Write POLICY, a file or a shipped name, as an ONNX model."""
+    from ..export import require_onnx_path, write_onnx
+    from ..policy import policy_path, read_policy, shipped_policies
+
+    path = policy_path(policy)
+    if path is None:
+        from ..names import unknown
+
+        raise unknown("policy", policy, [*shipped_policies(), "path/to/policy.safetensors"])
+    require_onnx_path(onnx, overwrite)
+    read = read_policy(path)
+    write_onnx(read, onnx, overwrite)
+    result = {
+        "policy": policy,
+        "plant": read.plant.name,
+        "observation": read.layout.size,
+        "action": len(read.layout.input_half),
+        "bytes": onnx.stat().st_size,
+        "hash": read.hash,
+        "file": str(onnx),
+    }
+    if as_json:
+        show_json(result)
+    else:
+        click.echo(
+            f"{onnx}: observation [batch, {result['observation']}] to action "
+            f"[batch, {result['action']}], {result['bytes']} bytes"
+        )

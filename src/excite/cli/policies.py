@@ -1,0 +1,111 @@
+"""`excite policies` and `excite evaluate`: what is shipped, and what a policy is worth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from .benchmark import show_comparison, warned
+from .door import (
+    NUMBERS,
+    WholeNumber,
+    computing,
+    json_option,
+    merged,
+    progress_bar,
+    show_json,
+    show_table,
+)
+
+
+@click.command()
+@json_option
+def policies(as_json: bool) -> None:
+    """List the policies that come with the package; one with its plant's name is its default."""
+    from ..policy import read_policy, shipped_policies
+
+    found = []
+    for name, path in shipped_policies().items():
+        policy = read_policy(path)
+        found.append(
+            {
+                "name": name,
+                "plant": policy.plant.name,
+                "default": name == policy.plant.name,
+                "num_steps": policy.layout.num_steps,
+                "method": policy.provenance.get("method"),
+                "agent": policy.provenance.get("agent"),
+                "study": policy.provenance.get("study"),
+                "bytes": path.stat().st_size,
+                "hash": policy.hash,
+                "file": str(path),
+            }
+        )
+    if as_json:
+        show_json({"policies": found})
+        return
+    header = ["name", "plant", "default", "steps", "trained by", "agent", "of study"]
+    rows = [
+        [p["name"], p["plant"], "yes" if p["default"] else "", str(p["num_steps"]),
+         str(p["method"]), str(p["agent"]), str(p["study"])]
+        for p in found
+    ]  # fmt: skip
+    show_table("shipped policies; use a name as --excitation", header, rows)
+
+
+@click.command()
+@click.argument("policy")
+@click.option("--plant", help="Name or path/to/file.py:ClassName; default the policy's plant.")
+@click.option(
+    "--episodes", type=WholeNumber(1), default=1000, show_default=True, help="Fresh plants."
+)
+@click.option("--seed", type=WholeNumber(0), default=0, show_default=True, help="Of the plants.")
+@click.option("--spread", type=float, default=0.3, show_default=True, help="Of the parameters.")
+@click.option("--noise", type=NUMBERS, multiple=True, help="An output's noise, in its unit.")
+@click.option("--estimators", metavar="NAME,...", help="Default nls, and arx-rls where it can.")
+@json_option
+@computing
+def evaluate(policy: str, as_json: bool, **options: Any) -> None:
+    """Score POLICY, a file or a shipped name, on plants drawn at random."""
+    from ..benchmark import run_benchmark
+
+    chosen = warned(_study(policy, options))
+    with progress_bar(f"evaluating {policy}") as progress:
+        rows = run_benchmark(chosen, progress)
+    if as_json:
+        show_json({"rows": rows})
+    else:
+        show_comparison(rows, chosen.model_dump(), None)
+        click.echo(f"log det of the Fisher information: {rows[0]['log_det_information']:.2f}")
+
+
+def _study(policy: str, options: dict[str, Any]) -> Any:
+    """The study of one method that these options mean."""
+    from ..names import plant_named, unknown
+    from ..plant import AbstractARXPlant
+    from ..policy import policy_path, read_policy, shipped_policies
+    from ..study import study_from
+
+    path = policy_path(policy)
+    if path is None:
+        raise unknown("policy", policy, [*shipped_policies(), "path/to/policy.safetensors"])
+    own = read_policy(path)
+    plant = options["plant"] or own.plant.name
+    kinds = ["arx-rls"] * isinstance(plant_named(plant), AbstractARXPlant) + ["nls"]
+    study = study_from(
+        {
+            "name": Path(policy).stem,
+            "plant": plant,
+            "episodes": options["episodes"],
+            "num_steps": own.layout.num_steps,
+            "seed": options["seed"],
+            "spread": options["spread"],
+            "sensor": {n: {"noise_sd": sd} for n, sd in merged(options["noise"]).items()},
+            "methods": {Path(policy).stem: {"excitation": policy}},
+            "estimators": {kind: {"kind": kind} for kind in kinds},
+        },
+        "evaluate",
+    )
+    return study.changed(estimators=options["estimators"]).checked("evaluate")

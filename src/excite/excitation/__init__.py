@@ -1,0 +1,17 @@
+"""Excitations: the contract (`base`), signals, and those that look at the measurements."""
+
+from .base import AbstractExcitation as AbstractExcitation
+from .base import AbstractShape as AbstractShape
+from .base import AbstractSignal as AbstractSignal
+from .base import crest_factor as crest_factor
+from .base import optional_array as optional_array
+from .feedback import PolicyExcitation as PolicyExcitation
+from .feedback import PositionLoop as PositionLoop
+from .signals import PRBS as PRBS
+from .signals import Chirp as Chirp
+from .signals import Decay as Decay
+from .signals import Multisine as Multisine
+from .signals import Random as Random
+from .signals import Replay as Replay
+from .signals import Square as Square
+from .signals import maximum_length_sequence as maximum_length_sequence

@@ -1,0 +1,99 @@
+"""Excitations: what turns the measurements so far into the next input.
+
+An excitation is `init` (before the experiment) and `__call__` (at every sample). Signals
+ignore the measurement: they lay down their whole sequence in `init`. With several inputs
+every input gets a sequence of its own that is not a multiple of another's, because inputs
+that move together cannot be told apart.
+
+All values are bounded by the plant's input limits, and reproducible from a key.
+"""
+
+from __future__ import annotations
+
+import abc
+from typing import Any, TypeAlias
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from ..plant import AbstractPlant
+
+Sequence: TypeAlias = Float[Array, "time input"]
+SignalState: TypeAlias = Any
+
+
+def optional_array(value: Any) -> Array | None:
+    """An array of numbers, or None as it is; converts fields."""
+    return None if value is None else jnp.asarray(value, float)
+
+
+class AbstractExcitation(eqx.Module):
+    """Base of all excitations."""
+
+    @abc.abstractmethod
+    def init(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> Any:
+        """State before the first sample of an experiment of `num_steps` steps."""
+
+    @abc.abstractmethod
+    def __call__(
+        self, state: Any, measurement: Float[Array, " output"]
+    ) -> tuple[Any, Float[Array, " input"]]:
+        """Next state, and the input held until the next sample."""
+
+    def applied(self, state: Any, input: Float[Array, " input"]) -> Any:
+        """The state after another input than the one asked for was applied."""
+        del input
+        return state
+
+
+class AbstractSignal(AbstractExcitation):
+    """An excitation that ignores the measurement: a sequence known beforehand."""
+
+    @abc.abstractmethod
+    def sequence(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> Sequence:
+        """All inputs of an experiment, in input units, within the input limits."""
+
+    def init(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> SignalState:
+        """The sequence and the index of its next row."""
+        return self.sequence(plant, num_steps, key), jnp.asarray(0)
+
+    def __call__(
+        self, state: SignalState, measurement: Float[Array, " output"]
+    ) -> tuple[SignalState, Float[Array, " input"]]:
+        """The next row of the sequence."""
+        del measurement
+        sequence, k = state
+        return (sequence, k + 1), sequence[k]
+
+
+class AbstractShape(AbstractSignal):
+    """A signal with a shape in [-1, 1], scaled by its amplitude around the middle of the limits.
+
+    Attributes:
+        amplitude: largest distance from that middle [input unit], one for all inputs or one
+            each; by default that of the plant's description for classical signals.
+    """
+
+    amplitude: Float[Array, "..."] | None = eqx.field(converter=optional_array, default=None)
+
+    @abc.abstractmethod
+    def shape(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> Sequence:
+        """The whole sequence in [-1, 1]."""
+
+    def sequence(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> Sequence:
+        """The shape, scaled and clipped to the input limits."""
+        lower, upper = plant.input_limits
+        amplitude = self.amplitude
+        if amplitude is None:
+            amplitude = jnp.asarray([i.amplitude for i in plant.definition.inputs])
+        amplitude = jnp.broadcast_to(amplitude, lower.shape)
+        unit, middle = self.shape(plant, num_steps, key), (lower + upper) / 2
+        return jnp.clip(middle[None] + amplitude[None] * unit, lower[None], upper[None])
+
+
+def crest_factor(sequence: Sequence) -> Float[Array, " input"]:
+    """Peak over root mean square of each input; infinite for an input that is zero."""
+    peak = jnp.max(jnp.abs(sequence), axis=0)
+    rms = jnp.sqrt(jnp.mean(sequence**2, axis=0))
+    return jnp.where(rms > 0, peak / jnp.where(rms > 0, rms, 1.0), jnp.inf)

@@ -1,0 +1,124 @@
+"""Excitations that look at the measurements: a position loop, and learned policies."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from ..plant import AbstractPlant
+from ..policy import (
+    Layout,
+    Policy,
+    Window,
+    empty_window,
+    forward,
+    observe,
+    scaled_action,
+    with_input,
+    with_measurement,
+)
+from ..safety import watched_output
+from .base import AbstractExcitation, AbstractShape, optional_array
+
+
+class PositionLoop(AbstractExcitation):
+    """A signal as the reference of a proportional-derivative loop around one output.
+
+    The honest classical excitation of a plant with an integrator, which drifts away under
+    an open-loop signal. The loop closes around the first output with a critical level:
+    u = gain (r - y) - damping dy/dt, the derivative a difference of two measurements.
+
+    Attributes:
+        signal: whose shape the reference has.
+        amplitude: of the reference [output unit], by default half the output's scale.
+        gain: [input unit / output unit], by default the input's amplitude over the output's
+            scale.
+        damping: [input unit / (output unit / s)].
+    """
+
+    signal: AbstractShape
+    amplitude: Float[Array, ""] | None = eqx.field(converter=optional_array, default=None)
+    gain: Float[Array, ""] | None = eqx.field(converter=optional_array, default=None)
+    damping: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=0.0)
+
+    def init(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> Any:
+        """The reference, and what a step needs of the plant.
+
+        Raises:
+            ValueError: for a plant with more than one input.
+        """
+        d = plant.definition
+        if len(d.inputs) != 1:
+            raise ValueError(f"a position loop drives one input; {d.name!r} has {len(d.inputs)}")
+        watched = watched_output(d)
+        scale = d.outputs[watched].scale
+        amplitude = 0.5 * scale if self.amplitude is None else self.amplitude
+        gain = d.inputs[0].amplitude / scale if self.gain is None else self.gain
+        reference = amplitude * self.signal.shape(plant, num_steps, key)[:, 0]
+        lower, upper = plant.input_limits
+        output = plant.output(plant.initial_state, plant.nominal)[watched]
+        which = jnp.asarray(watched)
+        return reference, which, gain, plant.dt, (lower + upper) / 2, output, jnp.asarray(0)
+
+    def __call__(
+        self, state: Any, measurement: Float[Array, " output"]
+    ) -> tuple[Any, Float[Array, " input"]]:
+        """The loop's input, before it is clipped to the limits."""
+        reference, which, gain, dt, middle, before, k = state
+        y = measurement[which]
+        rate = jnp.where(k > 0, (y - before) / dt, 0.0)
+        input = middle + gain * (reference[k] - y) - self.damping * rate
+        return (reference, which, gain, dt, middle, y, k + 1), input
+
+
+class PolicyExcitation(AbstractExcitation):
+    """A learned policy.
+
+    Attributes:
+        weights: of the network, single precision.
+        layout: what it observes.
+    """
+
+    weights: tuple[tuple[Float[Array, "_to _from"], Float[Array, " _to"]], ...]
+    layout: Layout = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, policy: Policy) -> PolicyExcitation:
+        """The excitation of a policy read from a file."""
+        layers = tuple((jnp.asarray(m), jnp.asarray(b)) for m, b in policy.weights)
+        return cls(layers, policy.layout)
+
+    def init(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> tuple[Window, Array]:
+        """An empty window and k = 0.
+
+        Raises:
+            ValueError: for an experiment longer than the policy was made for.
+        """
+        del plant, key
+        if num_steps > self.layout.num_steps:
+            raise ValueError(
+                f"the policy was made for {self.layout.num_steps} steps; "
+                f"the experiment has {num_steps}"
+            )
+        return empty_window(jnp, self.layout), jnp.asarray(0)
+
+    def __call__(
+        self, state: tuple[Window, Array], measurement: Float[Array, " output"]
+    ) -> tuple[tuple[Window, Array], Float[Array, " input"]]:
+        """The network's input for the window that ends with this measurement."""
+        window, k = state
+        window = with_measurement(jnp, self.layout, window, measurement)
+        action = forward(jnp, self.weights, observe(jnp, self.layout, window, k))
+        input = scaled_action(jnp, self.layout, action.astype(float))
+        return (with_input(jnp, self.layout, window, input), k + 1), input
+
+    def applied(
+        self, state: tuple[Window, Array], input: Float[Array, " input"]
+    ) -> tuple[Window, Array]:
+        """The window remembers what was applied."""
+        window, k = state
+        newest = with_input(jnp, self.layout, window, input).inputs[-1]
+        return window._replace(inputs=window.inputs.at[-1].set(newest)), k

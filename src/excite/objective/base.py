@@ -1,0 +1,229 @@
+"""What an experiment is worth: the contract, and what objectives share."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from ..description import PlantDescription, names_of
+from ..excitation import optional_array
+from ..information import relative_size
+from ..plant import AbstractPlant, Params
+from ..safety import critical_levels
+from ..simulation import step
+
+MAX_ERROR = 100.0
+"""Relative error at which an estimate counts as nothing (10,000 %); also for one not finite."""
+
+MAX_SENSITIVITY = 30.0
+"""Of an output to a relative parameter, over the output's critical level or scale.
+
+Where a plant turns chaotic sensitivities grow without bound, and what they promise no
+estimator can find.
+"""
+
+
+def number(value: Any) -> Array:
+    """An array of floating-point numbers, also from whole ones; converts fields."""
+    return jnp.asarray(value, float)
+
+
+class Sample(eqx.Module):
+    """What one step shows an objective; only the last two are known on a rig.
+
+    Attributes:
+        params, state: true parameters, and the true state when the input began to act.
+        input: held during the step.
+        measured: outputs at its end.
+    """
+
+    params: Params
+    state: Float[Array, " state"]
+    input: Float[Array, " input"]
+    measured: Float[Array, " output"]
+
+
+class AbstractObjective(eqx.Module):
+    """What an experiment is worth."""
+
+    @abc.abstractmethod
+    def init(self, plant: AbstractPlant, measured: Float[Array, " output"]) -> Any:
+        """Memory at the first measurement."""
+
+    @abc.abstractmethod
+    def update(
+        self, plant: AbstractPlant, memory: Any, sample: Sample, k: Int[Array, ""]
+    ) -> tuple[Any, Float[Array, ""]]:
+        """Memory after step k (0, 1, ...), and the reward if every step were rewarded."""
+
+    @abc.abstractmethod
+    def final(self, plant: AbstractPlant, memory: Any, params: Params) -> Float[Array, ""]:
+        """Reward added at the last step."""
+
+    @abc.abstractmethod
+    def relative_errors(
+        self, plant: AbstractPlant, memory: Any, params: Params
+    ) -> Float[Array, " param"]:
+        """Relative error of each parameter as far as the objective knows it, to watch."""
+
+    def of_batch(
+        self, worths: Float[Array, " plant"], errors: Float[Array, "plant param"]
+    ) -> Float[Array, ""]:
+        """What experiments on many plants are worth together: the mean.
+
+        Args:
+            worths: of each, rewards summed.
+            errors: relative errors at the end of each.
+        """
+        del errors
+        return jnp.mean(worths)
+
+
+def toward_goals(
+    errors: Float[Array, "plant param"],
+    goals: Float[Array, " param"],
+    targets: tuple[bool, ...],
+) -> Float[Array, ""]:
+    """How far mean errors lie above their goals: the worst of them, smoothly.
+
+    A soft maximum of mean error over goal; a tenth of the mean logarithm keeps a gradient
+    on the errors that are not the worst.
+    """
+    chosen = np.flatnonzero(targets)
+    ratio = (errors / goals[None])[:, chosen]
+    worst = jax.nn.logsumexp(4 * jnp.mean(ratio, axis=0)) / 4
+    return worst + 0.1 * jnp.mean(jnp.log(ratio + 1e-3))
+
+
+class AbstractError(AbstractObjective):
+    """Terminal reward: minus the errors of an estimate, summed (Eq. 4) or otherwise.
+
+    Attributes:
+        targets: which parameters count.
+        goals: relative error of each parameter that counts as one; the paper's are ones.
+        form: `relative`, the sum of error over goal; `log`, that of log(1 + error / goal):
+            a factor counts the same however large the error is, until the goal is reached;
+            `goals`, the worst mean error over its goal, see `toward_goals`.
+        weight: factor of the reward.
+    """
+
+    targets: tuple[bool, ...] = eqx.field(static=True)
+    goals: Float[Array, " param"] | None = eqx.field(converter=optional_array, default=None)
+    form: str = eqx.field(static=True, default="relative")
+    weight: Float[Array, ""] = eqx.field(converter=number, default=1.0)
+
+    def final(self, plant: AbstractPlant, memory: Any, params: Params) -> Float[Array, ""]:
+        """What the estimate at the end is worth."""
+        return self.of_errors(self.relative_errors(plant, memory, params)[None])
+
+    def of_errors(self, errors: Float[Array, "plant param"]) -> Float[Array, ""]:
+        """What errors on some plants are worth together."""
+        goals = jnp.ones(errors.shape[1]) if self.goals is None else self.goals
+        if self.form == "goals":
+            return -self.weight * toward_goals(errors, goals, self.targets)
+        ratios = errors / goals[None]
+        terms = jnp.log1p(ratios) if self.form == "log" else ratios
+        of_plants = terms @ np.array(self.targets, float)
+        return -self.weight * jnp.mean(of_plants)
+
+    def of_batch(
+        self, worths: Float[Array, " plant"], errors: Float[Array, "plant param"]
+    ) -> Float[Array, ""]:
+        """Of the errors alone, which are all that is rewarded."""
+        del worths
+        return self.of_errors(errors)
+
+
+def bounded(errors: Float[Array, " param"]) -> Float[Array, " param"]:
+    """Relative errors, at most MAX_ERROR, which also stands for one that is not finite."""
+    return jnp.where(jnp.isfinite(errors), jnp.minimum(errors, MAX_ERROR), MAX_ERROR)
+
+
+class Knowledge(eqx.Module):
+    """Relative sensitivity of the state, and Fisher information, so far."""
+
+    sensitivity: Float[Array, "state param"]
+    information: Float[Array, "param param"]
+
+
+def prior_knowledge(
+    plant: AbstractPlant, num_params: int, prior_sd: Float[Array, ""]
+) -> tuple[Float[Array, "state param"], Float[Array, "param param"]]:
+    """Sensitivity and information before the experiment; the initial state is known."""
+    sensitivity = jnp.zeros((len(plant.definition.states), num_params))
+    return sensitivity, jnp.eye(num_params) / prior_sd**2
+
+
+def next_knowledge(
+    plant: AbstractPlant, memory: Knowledge, sample: Sample, limit: Float[Array, ""]
+) -> tuple[
+    Float[Array, "state param"], Float[Array, "param param"], Float[Array, "output param"], Array
+]:
+    """Sensitivity and information one step on.
+
+    Returns:
+        Both; sensitivities of the outputs over their standard deviation; the true outputs.
+    """
+    sensitivity, of_outputs, output = sensitivities(plant, memory.sensitivity, sample, limit)
+    weighted = of_outputs / plant.sensor.sd[:, None]
+    return sensitivity, memory.information + weighted.T @ weighted, weighted, output
+
+
+def sensitivities(
+    plant: AbstractPlant,
+    sensitivity: Float[Array, "state param"],
+    sample: Sample,
+    limit: Float[Array, ""],
+) -> tuple[Float[Array, "state param"], Float[Array, "output param"], Float[Array, " output"]]:
+    """Relative sensitivities of state and outputs one step on, and the true outputs."""
+    theta, size = jnp.stack(sample.params), relative_size(plant, sample.params)
+
+    def response(state: Array, change: Array) -> tuple[Array, Array]:
+        params = plant.Params(*(theta + size * change))
+        state = step(plant, state, sample.input, params)
+        return state, plant.output(state, params)
+
+    def derivative(direction: Array, change: Array) -> tuple[Array, Array]:
+        start = sample.state, jnp.zeros_like(theta)
+        return jax.jvp(response, start, (direction, change))[1]
+
+    of_states, of_outputs = jax.vmap(derivative, (1, 0), 1)(sensitivity, jnp.eye(len(theta)))
+    levels = critical_levels(plant.definition)
+    scales = np.array([o.scale for o in plant.definition.outputs])
+    ranges = np.where(np.isfinite(levels), levels, scales)
+    largest = jnp.max(jnp.abs(of_outputs) / ranges[:, None], axis=0)
+    factor = jnp.minimum(1.0, limit / jnp.maximum(largest, 1e-3))
+    output = response(sample.state, jnp.zeros_like(theta))[1]
+    return of_states * factor[None], of_outputs * factor[None], output
+
+
+def target_mask(description: PlantDescription, targets: Sequence[str] | None) -> tuple[bool, ...]:
+    """Which parameters count: those named, or the plant's own targets.
+
+    Raises:
+        ValueError: for an unknown name, or none at all.
+    """
+    names = names_of(description.parameters)
+    if targets is None:
+        return tuple(p.target for p in description.parameters)
+    for name in targets:
+        if name not in names:
+            raise ValueError(
+                f"plant {description.name!r} has no parameter {name!r}; it has {', '.join(names)}"
+            )
+    if not targets:
+        raise ValueError("an objective needs at least one parameter")
+    return tuple(name in targets for name in names)
+
+
+def prior_sd_of(spread: float) -> float:
+    """Standard deviation of a relative parameter that is uniform within ± `spread`."""
+    # A plant that is not drawn at random is still not known better than to one percent.
+    return max(spread, 0.01) / 3**0.5

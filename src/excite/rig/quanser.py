@@ -1,0 +1,203 @@
+"""The Quanser Aero 2, yaw locked: its pitch, driven over Quanser's HIL interface; NumPy alone.
+
+The interface comes with Quanser's SDK; the rest of the package does without it. The card's
+clock paces: a task on it reads the encoder at 500 Hz, and `read` waits for its next sample.
+The card's watchdog outlives this process: whatever kills it, the motors stop.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+
+from ..description import PlantDescription
+from .base import AbstractRig, Reading, RigError
+
+try:
+    from quanser import hardware  # pyright: ignore[reportMissingImports]
+    from quanser.hardware.enumerations import (  # pyright: ignore[reportMissingImports]
+        BufferOverflowMode,
+    )
+except ImportError:
+    hardware: Any = None
+    BufferOverflowMode: Any = None
+
+CARD = "quanser_aero2_usb"
+"""HIL's word for the Aero 2."""
+
+MAX_VOLTAGE = 24.0
+"""Of a motor [V]."""
+
+READING_RATE = 500.0
+"""Readings in one second."""
+
+COUNTS = 2880
+"""Counts of the pitch encoder in one revolution."""
+
+WATCHDOG_TIMEOUT = 0.5
+"""Without a reading for so long, the card stops the motors [s].
+
+The loop gives up by itself when it is late by one sampling time, 0.1 s: the watchdog is for
+a process that is gone or hangs. Until then full voltage moves a body at rest by 0.075 rad.
+"""
+
+_MOTORS = np.array([0, 1], np.uint32)  # analog outputs, and digital ones of their amplifiers
+_ENCODERS = np.array([0, 1, 2, 3], np.uint32)  # rotors, pitch, yaw
+_PITCH = np.array([2], np.uint32)
+_WITHOUT_END = 2**32 - 1  # HIL's number of samples for a task that runs until it is stopped
+
+
+class QuanserAero2(AbstractRig):
+    """An Aero 2, or its virtual twin: u on the first motor, -u on the second.
+
+    The body must be level and at rest when it is opened: this pitch is its zero. The sensor
+    in its description is the encoder, whatever sensor the plant was given with.
+    """
+
+    def __init__(self, description: PlantDescription, address: str = "0") -> None:
+        """A rig that is not open yet.
+
+        Args:
+            description: of one of the plants `aero2`, `aero2_lag`, `aero2_detailed`, or like it.
+            address: HIL's board identifier: "0", or "0@tcpip://localhost:18950" (virtual).
+
+        Raises:
+            ValueError: for a plant that is no Aero 2, or a dt that is no multiple of 2 ms.
+        """
+        largest = max(max(-i.lower, i.upper) for i in description.inputs)
+        if (len(description.inputs), len(description.outputs)) != (1, 1) or largest > MAX_VOLTAGE:
+            raise ValueError(
+                f"{description.name}: the Aero 2 has one input of at most {MAX_VOLTAGE:g} V "
+                "and one output, its pitch"
+            )
+        readings = description.dt * READING_RATE
+        self.num_readings = round(readings)
+        if self.num_readings < 1 or not math.isclose(readings, self.num_readings):
+            raise ValueError(
+                f"dt must be a multiple of {1 / READING_RATE:g} s, the time between two readings "
+                f"of the Aero 2: got {description.dt:g} s"
+            )
+        self.description, self._address = _with_encoder(description), address
+        self._is_virtual = "@" in address
+        self._card: Any = None
+        self._task: Any = None
+        self._num_read = 0
+        self._held: set[str] = set()  # calls that have not failed, so that `close` knows its part
+        self._counts = np.zeros(1, np.int32)
+
+    def open(self) -> None:
+        """Takes the card, zeroes encoders and motors, and enables the amplifiers."""
+        if hardware is None:
+            raise RigError(
+                "Quanser's Python package `quanser` is missing: it comes with Quanser's SDK, "
+                "not from a package index"
+            )
+        self._num_read = 0
+        self._card = hardware.HIL()
+        self._call("open", CARD, self._address)
+        # A card whose watchdog expired accepts nothing until this. One that has nothing to
+        # clear may say so by an error; one that still accepts nothing fails at the next call.
+        with contextlib.suppress(RigError):
+            self._call("watchdog_clear")
+        self._apply(0.0)
+        self._call("set_encoder_counts", _ENCODERS, len(_ENCODERS), np.zeros(4, np.int32))
+        room = int(READING_RATE)
+        self._task = self._call("task_create_encoder_reader", room, _PITCH, len(_PITCH))
+        # Hardware does not wait. Where samples were lost the loop sees that it is late.
+        modes = BufferOverflowMode
+        mode = modes.WAIT_ON_OVERFLOW if self._is_virtual else modes.OVERWRITE_ON_OVERFLOW
+        self._call("task_set_buffer_overflow_mode", self._task, mode)
+        self._enable(True)
+
+    def read(self) -> Reading:
+        """The pitch, when the card has sampled it; its clock starts with the first reading."""
+        if "task_start" not in self._held:
+            self._start()
+        if self._call("task_read_encoder", self._task, 1, self._counts) != 1:
+            raise RigError("task_read_encoder of the Aero 2 gave no sample: its task has ended")
+        if not self._call("watchdog_reload"):
+            raise RigError(
+                f"the watchdog of the Aero 2 stopped the motors: no reading for "
+                f"{WATCHDOG_TIMEOUT:g} s"
+            )
+        time = self._num_read / READING_RATE
+        self._num_read += 1
+        return Reading(time, self._counts * (2 * math.pi / COUNTS))
+
+    def write(self, input: np.ndarray) -> None:
+        """Applies one voltage to both motors, with opposite signs."""
+        (voltage,) = np.asarray(input, float).tolist()
+        limits = self.description.inputs[0]
+        if not limits.lower <= voltage <= limits.upper:  # nor is NaN
+            raise RigError(
+                f"an input of the Aero 2 must be from {limits.lower:g} to {limits.upper:g} V: "
+                f"got {voltage:g}"
+            )
+        if voltage != 0 and "task_start" not in self._held:
+            raise RigError("the Aero 2 must be read before it is driven: that starts its watchdog")
+        self._apply(voltage)
+
+    def close(self) -> None:
+        """Stops the motors and releases what was taken, each step even after one that failed."""
+        steps = (
+            ("open", lambda: self._apply(0.0)),
+            ("open", lambda: self._enable(False)),
+            ("watchdog_start", lambda: self._call("watchdog_stop")),
+            ("task_start", lambda: self._call("task_stop", self._task)),
+            ("task_create_encoder_reader", lambda: self._call("task_delete", self._task)),
+            ("open", lambda: self._call("close")),
+        )
+        errors = []
+        for needed, step in steps:
+            try:
+                if needed in self._held:
+                    step()
+            except BaseException as error:  # nor may Ctrl-C leave the motors running
+                errors.append(error)
+        self._held.clear()
+        if errors:
+            raise errors[0]
+
+    def facts(self) -> dict[str, Any]:
+        """Card and address, and how it is read."""
+        return {
+            "kind": "quanser",
+            "card": CARD,
+            "address": self._address,
+            "reading_rate": READING_RATE,
+            "watchdog_timeout": WATCHDOG_TIMEOUT,
+        }
+
+    def _start(self) -> None:
+        # Not when it is opened: what the task sampled before the first reading would be read in
+        # a burst that is no real time, and the watchdog would expire while the user prepares.
+        self._call("watchdog_set_analog_expiration_state", _MOTORS, len(_MOTORS), np.zeros(2))
+        self._call("watchdog_start", WATCHDOG_TIMEOUT)
+        clock = hardware.Clock.HARDWARE_CLOCK_0
+        self._call("task_start", self._task, clock, READING_RATE, _WITHOUT_END)
+
+    def _apply(self, voltage: float) -> None:
+        self._call("write_analog", _MOTORS, len(_MOTORS), np.array([voltage, -voltage]))
+
+    def _enable(self, on: bool) -> None:
+        self._call("write_digital", _MOTORS, len(_MOTORS), np.full(2, on, np.int8))
+
+    def _call(self, name: str, *arguments: Any) -> Any:
+        self._held.add(name)  # before: an interrupt may come after the card has done it
+        try:
+            return getattr(self._card, name)(*arguments)
+        except hardware.HILError as error:
+            self._held.discard(name)
+            why = error.get_error_message()
+            raise RigError(f"{name} of the Aero 2 failed: {why}") from error
+
+
+def _with_encoder(description: PlantDescription) -> PlantDescription:
+    """The description with the encoder's resolution; a supervisor must know it."""
+    (pitch,) = description.outputs
+    pitch = dataclasses.replace(pitch, resolution=max(pitch.resolution, 2 * math.pi / COUNTS))
+    return dataclasses.replace(description, outputs=(pitch,))

@@ -1,0 +1,311 @@
+"""A simulated rig that behaves like a real one: detailed plant, latency, jitter, dropouts.
+
+`Body` is the physics between two readings, a pure function. `SimulatedRig` steps it in
+real time, or as fast as it can, behind the contract of a rig; `run_batch` steps thousands
+side by side, with the same supervisor's rules, and goes on after a trip to see whether the
+safe input was enough. The true parameters are told only at the end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray
+
+from ..description import names_of
+from ..excitation import AbstractExcitation
+from ..plant import AbstractPlant, Params, draw_params
+from ..safety import (
+    Supervision,
+    Trip,
+    Watch,
+    allowed,
+    check_reading,
+    check_sample,
+    is_violation,
+    safe_input,
+)
+from ..simulation import measure, step
+from .base import AbstractRig, Pacer, Reading
+
+
+class BodyState(eqx.Module):
+    """State of a simulated rig.
+
+    Attributes:
+        plant_state: true state.
+        acting: input that acts.
+        written: input that was written last.
+        delay: time until it acts [s].
+        shown: last reading.
+        n: readings so far.
+        largest: largest magnitude of each true output.
+    """
+
+    plant_state: Float[Array, " state"]
+    acting: Float[Array, " input"]
+    written: Float[Array, " input"]
+    delay: Float[Array, ""]
+    shown: Float[Array, " output"]
+    n: Int[Array, ""]
+    largest: Float[Array, " output"]
+
+
+class Body(eqx.Module):
+    """What a simulated rig is made of.
+
+    Attributes:
+        plant: with the interval between two readings as its dt.
+        params: its true parameters.
+        latency: mean time from writing an input to its action [s].
+        jitter: half the range in which that time is drawn for every input [s].
+        dropout: probability that a reading repeats the one before it.
+        key: of noise, jitter and dropouts.
+    """
+
+    plant: AbstractPlant
+    params: Params
+    latency: Float[Array, ""]
+    jitter: Float[Array, ""]
+    dropout: Float[Array, ""]
+    key: PRNGKeyArray
+
+    @classmethod
+    def draw(
+        cls,
+        plant: AbstractPlant,
+        num_readings: int,
+        spread: float,
+        key: PRNGKeyArray,
+        **numbers: float,
+    ) -> Body:
+        """A body with parameters drawn around the nominal ones.
+
+        Args:
+            plant: sampled as experiments are.
+            num_readings: in one sampling time.
+            numbers: `latency`, `jitter`, `dropout`, where they are not the usual ones.
+        """
+        params_key, own = jax.random.split(key)
+        dt = float(plant.dt)
+        usual = {"latency": dt / 10, "jitter": dt / 1000, "dropout": 0.0} | numbers
+        return cls(
+            plant=at_interval(plant, num_readings),
+            params=draw_params(plant, params_key, spread),
+            key=own,
+            **{name: jnp.asarray(value, float) for name, value in usual.items()},
+        )
+
+    def start(self) -> BodyState:
+        """At rest, input zero, at the first reading."""
+        plant = self.plant
+        output = plant.output(plant.initial_state, self.params)
+        rest = jnp.asarray(safe_input(plant.definition))
+        shown = measure(plant, output, jax.random.fold_in(self.key, 0))
+        now, first = jnp.asarray(0.0), jnp.asarray(0)
+        return BodyState(plant.initial_state, rest, rest, now, shown, first, jnp.abs(output))
+
+    def write(self, state: BodyState, input: Float[Array, " input"]) -> BodyState:
+        """An input on its way: it acts after latency and jitter."""
+        late = jax.random.uniform(jax.random.fold_in(self.key, -1 - state.n), (), float, -1, 1)
+        delay = jnp.maximum(self.latency + self.jitter * late, 0.0)
+        return eqx.tree_at(lambda s: (s.written, s.delay), state, (input, delay))
+
+    def advance(self, state: BodyState) -> BodyState:
+        """One interval on, to the next reading."""
+        interval = self.plant.dt
+        before = jnp.clip(state.delay, 0.0, interval)  # how long the earlier input still acts
+        middle = self._moved(state.plant_state, state.acting, before)
+        after = self._moved(middle, state.written, interval - before)
+        output = self.plant.output(after, self.params)
+        noise_key, dropout_key = jax.random.split(jax.random.fold_in(self.key, state.n + 1))
+        measured = measure(self.plant, output, noise_key)
+        is_lost = jax.random.uniform(dropout_key) < self.dropout
+        return BodyState(
+            plant_state=after,
+            acting=jnp.where(state.delay < interval, state.written, state.acting),
+            written=state.written,
+            delay=state.delay - interval,
+            shown=jnp.where(is_lost, state.shown, measured),
+            n=state.n + 1,
+            largest=jnp.maximum(state.largest, jnp.abs(output)),
+        )
+
+    def _moved(self, state: Array, input: Array, duration: Array) -> Array:
+        """The plant's state after part of an interval."""
+        plant = eqx.tree_at(lambda p: p.dt, self.plant, duration)
+        return step(plant, state, input, self.params)
+
+
+def at_interval(plant: AbstractPlant, num_readings: int) -> AbstractPlant:
+    """The plant sampled at every reading, integrated no more coarsely than before."""
+    return plant.changed(dt=float(plant.dt) / num_readings)
+
+
+_advance = eqx.filter_jit(Body.advance)
+_write = eqx.filter_jit(Body.write)
+
+
+class SimulatedRig(AbstractRig):
+    """A body behind the contract of a rig."""
+
+    def __init__(
+        self, plant: AbstractPlant, body: Body, num_readings: int, is_real_time: bool
+    ) -> None:
+        """A rig of a plant; `body` is its physics between readings.
+
+        Raises:
+            ValueError: for an input that would not act before the next one.
+        """
+        self.description = plant.description
+        self.num_readings, self.is_real_time = num_readings, is_real_time
+        self.num_latency = round(float(body.latency) * num_readings / float(plant.dt))
+        if body.latency + body.jitter >= plant.dt or self.num_latency >= num_readings:
+            raise ValueError(
+                f"latency and jitter must be less than the sampling time of {plant.dt:g} s: "
+                f"got {body.latency:g} and {body.jitter:g} s"
+            )
+        self._body, self._interval = body, float(plant.dt) / num_readings
+
+    def open(self) -> None:
+        """At rest; compiles what a reading needs, so that the first is not late."""
+        self._state = self._body.start()
+        state, safe = self._state, jnp.asarray(self.safe_input)
+        for _ in range(2):  # a state that has moved is of another type to the compiler
+            state = _advance(self._body, _advance(self._body, _write(self._body, state, safe)))
+        self._pacer, self._count = Pacer(self._interval), -1
+
+    def read(self) -> Reading:
+        """The next reading; in real time when it is due."""
+        self._count += 1
+        if self._count:
+            self._state = _advance(self._body, self._state)
+        if self.is_real_time:
+            self._pacer.wait()
+        return Reading(self._count * self._interval, np.array(self._state.shown))
+
+    def write(self, input: np.ndarray) -> None:
+        """Applies an input, after the latency."""
+        self._state = _write(self._body, self._state, jnp.asarray(input, float))
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+    def facts(self) -> dict[str, Any]:
+        """What was hidden: true parameters, largest true outputs."""
+        names = names_of(self.description.parameters)
+        return {
+            "simulated": True,
+            "true_params": dict(zip(names, map(float, self._body.params), strict=True)),
+            "true_max_abs_output": np.asarray(self._state.largest).tolist(),
+        }
+
+
+class Runs(eqx.Module):
+    """A batch of experiments on simulated rigs; the leading axis is the run.
+
+    Attributes:
+        max_abs_output: largest magnitude of each true output at a reading.
+        is_violation: whether a critical level was reached, also after a trip.
+        trip: a `Trip`.
+        num_interventions: samples at which a filter changed the input.
+        inputs, measured: at sampling instants.
+    """
+
+    max_abs_output: Float[Array, "*run output"]
+    is_violation: Bool[Array, "*run"]
+    trip: Int[Array, "*run"]
+    num_interventions: Int[Array, "*run"]
+    inputs: Float[Array, "*run time input"]
+    measured: Float[Array, "*run time output"]
+
+
+Filter = Callable[[Any, Array, Array], tuple[Any, Array, Array]]
+"""From memory, measurement and proposed input to memory, input, and whether it changed it."""
+
+
+def no_filter(memory: Any, measured: Array, proposed: Array) -> tuple[Any, Array, Array]:
+    """Lets every input pass."""
+    del measured
+    return memory, proposed, jnp.asarray(False)
+
+
+@eqx.filter_jit
+def run_batch(
+    bodies: Body,
+    excitation: AbstractExcitation,
+    rules: Supervision,
+    shape: tuple[int, int],
+    filter: Filter = no_filter,
+    memory: Any = None,
+) -> Runs:
+    """One experiment on every body, as the real-time loop would run it.
+
+    Args:
+        bodies: their leading axis is the run.
+        excitation: the player.
+        shape: number of sampling instants, and of readings between two.
+        filter, memory: of a safety filter, at its beginning.
+    """
+    return jax.vmap(lambda body: _one_run(body, excitation, rules, shape, (filter, memory)))(bodies)
+
+
+def _one_run(
+    body: Body,
+    excitation: AbstractExcitation,
+    rules: Supervision,
+    shape: tuple[int, int],
+    filtering: tuple[Filter, Any],
+) -> Runs:
+    num_steps, num_readings = shape
+    filter, memory = filtering
+    interval = rules.dt / num_readings
+
+    def reading(carry: tuple, _: None) -> tuple[tuple, None]:
+        state, watch = carry
+        state = body.advance(state)
+        was_running = watch.trip == int(Trip.NONE)
+        watch = check_reading(jnp, rules, watch, state.shown, interval)
+        is_new = was_running & (watch.trip != int(Trip.NONE))
+        safe = body.write(state, jnp.asarray(rules.safe_input, float))
+        state = jax.tree.map(lambda a, b: jnp.where(is_new, a, b), safe, state)
+        return (state, watch), None
+
+    def sample(carry: tuple, _: None) -> tuple[tuple, tuple]:
+        state, watch, player, memory, count = carry
+        measured = watch.reading
+        watch = check_sample(jnp, rules, watch)
+        player, proposed = excitation(player, measured)
+        memory, proposed, is_changed = filter(memory, measured, proposed)
+        watch, input = allowed(jnp, rules, watch, proposed)
+        player, state = excitation.applied(player, input), body.write(state, input)
+        (state, watch), _ = jax.lax.scan(reading, (state, watch), None, length=num_readings)
+        return (state, watch, player, memory, count + is_changed), (input, measured)
+
+    state = body.start()
+    # A signal is made for the sampling time, not for the interval between two readings.
+    plant = eqx.tree_at(lambda p: p.dt, body.plant, jnp.asarray(rules.dt))
+    player = excitation.init(plant, num_steps, body.key)
+    watch = Watch.start(jnp, rules, state.shown)
+    carry = state, watch, player, memory, jnp.asarray(0)
+    (state, watch, *_, count), (inputs, measured) = jax.lax.scan(
+        sample, carry, None, length=num_steps
+    )
+    is_over = is_violation(state.largest[None], jnp.asarray(rules.critical))
+    return Runs(state.largest, is_over, watch.trip, count, inputs, measured)
+
+
+def bodies(
+    plant: AbstractPlant,
+    num_readings: int,
+    spread: float,
+    keys: Key[Array, " run"],
+    **numbers: float,
+) -> Body:
+    """One body a key; see `Body.draw`."""
+    return eqx.filter_vmap(lambda key: Body.draw(plant, num_readings, spread, key, **numbers))(keys)

@@ -1,0 +1,667 @@
+"""Rigs and the real-time loop: the order of an experiment, and every way in which it ends."""
+
+import dataclasses
+import errno
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import excite
+from excite.estimation import NLS, Experiments
+from excite.excitation import Chirp, PolicyExcitation
+from excite.files import csv_text
+from excite.identification import identify
+from excite.plant import Aero2, Aero2Detailed
+from excite.policy import read_policy, shipped_policies
+from excite.records import read_record
+from excite.rig import (
+    AbstractPlayer,
+    AbstractRig,
+    Outcome,
+    Pacer,
+    PolicyPlayer,
+    Reading,
+    Recorder,
+    RigError,
+    SignalPlayer,
+    interruptible,
+    run,
+)
+from excite.rig.prediction import FilteredPlayer, SafetyFilter
+from excite.rig.simulated import Body, SimulatedRig, at_interval, bodies, run_batch
+from excite.rig.tracking import Tracker
+from excite.safety import Supervision, Trip
+from excite.simulation import simulate
+
+PLANT = Aero2Detailed()
+AERO = PLANT.description
+RULES = Supervision.of(AERO)
+CRITICAL = float(RULES.critical[0])
+LEVEL_AT = 11  # of the reading of sample 5 in scripts, with two readings a sample
+
+
+class ScriptedRig(AbstractRig):
+    """Moves a little at every reading, but for what a script says.
+
+    `script` has by reading an output, or what is called in its place; `failing` has by method
+    the error that it raises; `from_write` is the first write that fails.
+    """
+
+    num_readings, is_real_time = 2, False
+
+    def __init__(self, script=None, failing=None, from_write=0, clock=1.0):
+        self.description = AERO
+        self.script, self.failing, self.from_write = script or {}, failing or {}, from_write
+        self.clock, self.log, self.num_read, self.num_written = clock, [], 0, 0
+
+    def open(self):
+        self.said("open")
+        self.pacer = Pacer(self.description.dt / self.num_readings)
+
+    def read(self):
+        self.said("read")
+        n, self.num_read = self.num_read, self.num_read + 1
+        if self.is_real_time:
+            self.pacer.wait()
+        output = self.script.get(n, 0.001 * n)
+        output = output() if callable(output) else output
+        interval = self.description.dt / self.num_readings
+        return Reading(self.clock * n * interval, np.array([output], float))
+
+    def write(self, input):
+        self.num_written += 1
+        if self.num_written > self.from_write:
+            self.said(f"write {float(input[0]):g}")
+        else:
+            self.log.append(f"write {float(input[0]):g}")
+
+    def close(self):
+        self.said("close")
+
+    def said(self, word):
+        self.log.append(word)
+        if word.split()[0] in self.failing:
+            error = self.failing[word.split()[0]]
+            raise error if isinstance(error, BaseException) else error.pop(0)
+
+
+class ScriptedPlayer(AbstractPlayer):
+    """Five volts, but for what is called at sampling instant `at`."""
+
+    def __init__(self, then=lambda: 5.0, at=4, num_steps=8):
+        self.num_steps, self.then, self.at = num_steps, then, at
+
+    def __call__(self, k, measured):
+        return np.array([float(self.then() if k == self.at else 5.0)])
+
+
+def raising(error):
+    def fail():
+        raise error
+
+    return fail
+
+
+def kill(number):
+    """Asks this process to end, and goes on."""
+
+    def ask():
+        os.kill(os.getpid(), number)
+        return 5.0
+
+    return ask
+
+
+def experiment(path, rig, player=None, recorder=None, **choices) -> tuple[Any, RigError | None]:
+    """As a user runs it: the outcome, or None, and the error that left the rig."""
+    outcome = None
+    try:
+        with interruptible() as stop, rig, recorder or Recorder(path, rig.description, {}) as r:
+            rules = Supervision.of(rig.description)
+            outcome = run(rig, player or ScriptedPlayer(), rules, r, stop=stop, **choices)
+    except RigError as error:
+        return outcome, error
+    return outcome, None
+
+
+def ended(path):
+    return json.loads(path.with_suffix(".json").read_text())["ended"]
+
+
+# ----------------------------------------------------------------------------- the loop
+
+
+def test_the_order_of_an_experiment(tmp_path):
+    rig = ScriptedRig()
+
+    class Player(ScriptedPlayer):
+        def __call__(self, k, measured):
+            rig.log.append(f"ask {k} {measured[0]:g}")
+            return super().__call__(k, measured)
+
+        def applied(self, input):
+            rig.log.append(f"told {input[0]:g}")
+
+    def show(sample):
+        recorded = len((tmp_path / "a.csv").read_text().splitlines()) - 1
+        rig.log.append(f"shown {sample.k}, {recorded} on disk")
+
+    outcome, _ = experiment(tmp_path / "a.csv", rig, Player(num_steps=2), on_sample=show)
+    assert outcome.is_complete
+    assert rig.log == [
+        "open", "read",
+        "ask 0 0", "write 5", "told 5", "shown 0, 1 on disk", "read", "read",
+        "ask 1 0.002", "write 5", "told 5", "shown 1, 2 on disk", "read", "read",
+        "write 0", "write 0", "write 0", "close",
+    ]  # fmt: skip
+    record = read_record(tmp_path / "a.csv", AERO)
+    np.testing.assert_array_equal(record.outputs[:, 0], [0.0, 0.002, 0.004])
+    np.testing.assert_array_equal(record.inputs[:, 0], [5.0, 5.0, 0.0])
+    assert ended(tmp_path / "a.csv") == {**outcome.to_dict(), "reason": "complete"}
+
+
+@pytest.mark.parametrize("latency", [0, 1, 3])
+def test_the_record_holds_the_reading_at_which_an_input_begins_to_act(tmp_path, latency):
+    rig = ScriptedRig()
+    rig.num_readings, rig.num_latency = 4, latency
+    outcome, _ = experiment(tmp_path / "a.csv", rig, SignalPlayer(np.array([[1.0], [2.0], [3.0]])))
+    assert outcome.is_complete
+    record = read_record(tmp_path / "a.csv", AERO)
+    np.testing.assert_array_equal(record.inputs[:, 0], [1.0, 2.0, 3.0, 0.0])
+    expected = 0.001 * (4 * np.arange(4) + latency)
+    np.testing.assert_allclose(record.outputs[:, 0], expected, rtol=1e-12)
+    np.testing.assert_allclose(record.time, AERO.dt * np.arange(4))
+    clock = np.genfromtxt(tmp_path / "a.csv", delimiter=",", names=True)["clock"]
+    np.testing.assert_allclose(clock, AERO.dt * (np.arange(4) + latency / 4))
+
+
+def test_a_latency_of_a_whole_sample_is_refused(tmp_path):
+    rig = ScriptedRig()
+    rig.num_latency = 2
+    outcome, _ = experiment(tmp_path / "a.csv", rig)
+    assert "must be less than the 2 of one sampling time" in outcome.reason
+    assert outcome.num_samples == 0
+
+
+def test_a_recorder_refuses_what_it_would_destroy(tmp_path):
+    (tmp_path / "a.csv").write_text("mine")
+    with pytest.raises(ValueError, match="exists"):
+        Recorder(tmp_path / "a.csv", AERO, {})
+    with pytest.raises(ValueError, match="line by line"):
+        Recorder(tmp_path / "a.mat", AERO, {})
+    assert (tmp_path / "a.csv").read_text() == "mine"
+
+
+# ------------------------------------------------------------------------ how it ends
+
+STUCK = {n: 0.012 * min(n, 5) for n in range(30)}
+RISING = {8: 0.25, 9: 0.45, 10: 0.60, LEVEL_AT: 0.70}
+SHAKEN = {LEVEL_AT: raising(RigError("the cable is out"))}
+ENDINGS = {
+    "player fails": ({}, raising(ZeroDivisionError("oh")), "ZeroDivisionError: oh", None, 4),
+    "player is interrupted": ({}, raising(KeyboardInterrupt()), "interrupted", None, 4),
+    "player without a number": ({}, lambda: math.nan, "asked for an input", "input_not_finite", 5),
+    "SIGINT": ({}, kill(signal.SIGINT), "interrupted by SIGINT", None, 5),
+    "SIGTERM": ({}, kill(signal.SIGTERM), "interrupted by SIGTERM", None, 5),
+    "a reading is no number": ({"script": {LEVEL_AT: math.nan}}, None, "finite", "not_finite", 6),
+    "a reading is infinite": ({"script": {LEVEL_AT: -math.inf}}, None, "finite", "not_finite", 6),
+    "a reading jumps": ({"script": {LEVEL_AT: 0.6}}, None, "measurement jumped", "jump", 6),
+    "a reading sticks": ({"script": STUCK}, None, "stood still", "stale", 8),
+    "the level": ({"script": RISING}, None, "reached", "level", 6),
+    "the rig fails to read": ({"script": SHAKEN}, None, "the cable is out", None, 6),
+    "its clock stands": ({"clock": 0.0}, None, "stood still", "stale", 1),
+    "its clock is none": ({"clock": math.nan}, None, "stood still", "stale", 1),
+    "its clock runs": ({"clock": 1.5}, None, "lasted longer", "duration", 8),
+}
+
+
+@pytest.mark.parametrize("name", ENDINGS)
+def test_an_ending_is_safe_released_recorded_and_explained(tmp_path, name):
+    choices, then, reason, trip, num_rows = ENDINGS[name]
+    rig, path = ScriptedRig(**choices), tmp_path / "a.csv"
+    outcome, error = experiment(path, rig, ScriptedPlayer(then) if then else None)
+    assert error is None
+    assert reason in outcome.reason
+    assert outcome.trip.name.lower() == (trip or "none")
+    assert rig.log[-3:] == ["write 0", "write 0", "close"]
+    assert ended(path)["reason"] == outcome.reason
+    assert not outcome.is_complete
+    rows = path.read_text().splitlines()[1:]
+    assert len(rows) == num_rows
+    if num_rows > 1:
+        record = read_record(path, AERO)
+        assert np.abs(record.outputs).max() <= outcome.max_abs_output[0]
+    if trip is not None:
+        assert " at " in outcome.reason  # which reading it was
+
+
+def test_after_a_trip_the_player_is_not_asked_again(tmp_path):
+    asked = []
+
+    class Player(ScriptedPlayer):
+        def __call__(self, k, measured):
+            asked.append(k)
+            return super().__call__(k, measured)
+
+    rig = ScriptedRig(RISING)
+    outcome, _ = experiment(tmp_path / "a.csv", rig, Player())
+    assert asked == [0, 1, 2, 3, 4, 5]
+    assert outcome.num_samples == 6
+    assert set(rig.log[rig.log.index("write 5") :]) == {"write 5", "read", "write 0", "close"}
+
+
+@pytest.mark.parametrize("failing", ["open", "read", "write"])
+def test_a_rig_that_fails_is_closed(tmp_path, failing):
+    rig = ScriptedRig(failing={failing: RigError("the cable is out")})
+    outcome, error = experiment(tmp_path / "a.csv", rig)
+    assert rig.log[-1] == "close"
+    if failing == "open":
+        assert outcome is None
+        assert rig.log == ["open", "close"]
+        assert not list(tmp_path.iterdir())
+    else:
+        assert outcome.reason.startswith("the cable is out")
+        assert ended(tmp_path / "a.csv")["reason"] == outcome.reason
+    assert (error is None) == (failing == "read")
+
+
+def test_a_rig_that_fails_to_open_and_to_close_tells_the_first(tmp_path):
+    rig = ScriptedRig(failing={"open": RigError("no card"), "close": RigError("nothing")})
+    assert str(experiment(tmp_path / "a.csv", rig)[1]) == "no card"
+
+
+def test_a_safe_input_that_cannot_be_written_is_told_and_the_rig_closed(tmp_path):
+    rig = ScriptedRig(failing={"write": RigError("the cable is out")}, from_write=8)
+    outcome, error = experiment(tmp_path / "a.csv", rig)
+    assert str(error) == "the cable is out"
+    assert rig.log[-1] == "close"
+    # The loop's last sample writes the safe input as well.
+    assert outcome.reason == (
+        "the cable is out; the safe input could not be applied: the cable is out"
+    )
+    assert ended(tmp_path / "a.csv")["reason"] == outcome.reason
+    assert len(read_record(tmp_path / "a.csv", AERO).time) == 8
+
+
+def test_an_interrupt_while_the_safe_input_is_written_loses_nothing(tmp_path):
+    rig = ScriptedRig(failing={"write": [KeyboardInterrupt()]}, from_write=4)
+    rig.said = interrupted_once(rig)
+    player = ScriptedPlayer(raising(ValueError("oh")))
+    outcome, _ = experiment(tmp_path / "a.csv", rig, player)
+    expected = "ValueError: oh; the safe input could not be applied: interrupted"
+    assert outcome.reason == ended(tmp_path / "a.csv")["reason"] == expected
+    assert rig.log[-2:] == ["write 0", "close"]
+
+
+def interrupted_once(rig):
+    """The rig's `said`, which raises only while there is something left to raise."""
+    told = rig.said
+
+    def said(word):
+        if not any(rig.failing.values()):
+            rig.failing = {}
+        told(word)
+
+    return said
+
+
+def test_a_second_interrupt_ends_a_rig_that_hangs(tmp_path):
+    def hang():
+        kill(signal.SIGINT)()
+        kill(signal.SIGINT)()
+        raise AssertionError("a second Ctrl-C must not wait for the next reading")
+
+    rig = ScriptedRig({9: hang})
+    outcome, _ = experiment(tmp_path / "a.csv", rig)
+    assert outcome.reason == "interrupted"
+    assert rig.log[-3:] == ["write 0", "write 0", "close"]
+    assert len(read_record(tmp_path / "a.csv", AERO).time) == 5
+
+
+def test_signals_are_given_back():
+    before = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
+    with interruptible() as stop:
+        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert stop.reason == "interrupted by SIGTERM"
+    assert [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)] == before
+
+
+class FullDisk:
+    """A file of a disk that is full after a number of lines; `part` of the next still fits."""
+
+    def __init__(self, file, num_lines, part):
+        self.file, self.left, self.part = file, num_lines, part
+
+    def write(self, line):
+        self.left -= 1
+        if self.left >= 0:
+            return self.file.write(line)
+        if self.part:
+            return self.file.write(line[: self.part])
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def __getattr__(self, name):
+        return getattr(self.file, name)
+
+
+class FullRecorder(Recorder):
+    part = 0
+
+    def __enter__(self):
+        super().__enter__()
+        self._file = FullDisk(self._file, 5, self.part)
+        return self
+
+
+@pytest.mark.parametrize("part", [0, 7])
+def test_a_full_disk_ends_it_with_a_record_that_can_be_read(tmp_path, part):
+    path, rig = tmp_path / "a.csv", ScriptedRig()
+    recorder = FullRecorder(path, AERO, {})
+    recorder.part = part
+    outcome, _ = experiment(path, rig, recorder=recorder)
+    assert ("the disk is full" if part else "No space left") in outcome.reason
+    assert ended(path)["reason"] == outcome.reason
+    assert rig.log[-3:] == ["write 0", "write 0", "close"]
+    assert len(read_record(path, AERO).time) == 5
+
+
+def test_a_sidecar_that_cannot_be_written_at_the_end_is_told(tmp_path, monkeypatch):
+    def full(self, ended):
+        raise ValueError("a.json: cannot be written")
+
+    monkeypatch.setattr(Recorder, "end", full)
+    rig = ScriptedRig()
+    outcome, _ = experiment(tmp_path / "a.csv", rig)
+    assert outcome.reason == (
+        "complete; the record was not told: ValueError: a.json: cannot be written"
+    )
+    assert rig.log[-1] == "close"
+
+
+@pytest.mark.parametrize("facts", [raising(ZeroDivisionError("oh")), lambda: {"x": {1, 2}}])
+def test_a_part_that_cannot_tell_of_itself_loses_nothing(tmp_path, facts):
+    rig, player = ScriptedRig(), ScriptedPlayer()
+    rig.facts = player.facts = facts
+    outcome, error = experiment(tmp_path / "a.csv", rig, player)
+    assert error is None
+    assert outcome.is_complete
+    told = ended(tmp_path / "a.csv")
+    assert told["reason"] == "complete"
+    assert "Error: " in told["rig"]["error"]
+    assert "Error: " in told["player"]["error"]
+
+
+# ---------------------------------------------------------------------------- real time
+
+
+def real_time_rig(dt, num_readings, sleeps):
+    """Reading number -> how long it takes."""
+    rig = ScriptedRig({n: lambda s=s, n=n: time.sleep(s) or 0.001 * n for n, s in sleeps.items()})
+    rig.description = dataclasses.replace(AERO, dt=dt, band=(0.05, 1.0))
+    rig.num_readings, rig.is_real_time = num_readings, True
+    return rig
+
+
+def test_a_sample_that_is_late_by_another_ends_it(tmp_path):
+    rig = real_time_rig(0.1, 2, {7: 0.2})
+    outcome, _ = experiment(tmp_path / "a.csv", rig)
+    assert outcome.trip == Trip.DEADLINES
+    assert outcome.num_samples == 4
+    assert rig.log[-3:] == ["write 0", "write 0", "close"]
+    assert ended(tmp_path / "a.csv")["missed_deadlines"] >= 1
+    assert len(read_record(tmp_path / "a.csv", AERO).time) == 4
+
+
+def test_readings_that_are_late_in_a_row_end_it(tmp_path):
+    rig = real_time_rig(0.2, 4, dict.fromkeys(range(3, 30), 0.06) | {3: 0.12})
+    outcome, _ = experiment(tmp_path / "a.csv", rig)
+    assert outcome.trip == Trip.DEADLINES
+    assert max(outcome.late) < 0.2  # none of them by a whole sample
+    assert outcome.num_missed >= 5
+
+
+def test_one_late_reading_is_counted_and_forgiven(tmp_path):
+    rig = real_time_rig(0.4, 4, {3: 0.15})
+    outcome, _ = experiment(tmp_path / "a.csv", rig, ScriptedPlayer(num_steps=2))
+    assert outcome.is_complete, outcome.reason
+    assert outcome.num_missed == 1
+    assert outcome.to_dict()["late_ms_percentiles"]["100"] == pytest.approx(150, abs=40)
+
+
+def test_where_time_is_not_the_walls_nothing_is_late():
+    assert Outcome().to_dict()["late_ms_percentiles"] is None
+
+
+# ------------------------------------------------------------------------ simulated rig
+
+NUM_READINGS, NUM_SAMPLES = 10, 120
+IDEAL = Aero2()
+
+
+@pytest.fixture(scope="module")
+def many():
+    keys = jax.random.split(jax.random.key(5), 20)
+    return bodies(PLANT, NUM_READINGS, 0.3, keys)
+
+
+def body_of(num_readings=NUM_READINGS, seed=0, spread=0.1, **numbers):
+    return Body.draw(PLANT, num_readings, spread, jax.random.key(seed), **numbers)
+
+
+def simulated(path, body, player, num_steps, on_sample=lambda _: None):
+    rig = SimulatedRig(PLANT, body, NUM_READINGS, is_real_time=False)
+    player.num_steps = num_steps
+    outcome, error = experiment(path, rig, player, on_sample=on_sample)
+    assert error is None
+    return outcome, rig
+
+
+def chirp(num_steps, amplitude=None):
+    excitation = Chirp(amplitude=amplitude)
+    return excitation, np.asarray(excitation.sequence(PLANT, num_steps, jax.random.key(0)))
+
+
+def test_the_loop_and_the_batch_are_one_experiment(many, tmp_path):
+    policy = read_policy(shipped_policies()["aero2-ppo-all"])
+    gentle, sequence = chirp(80, 3.0)
+    trips = set()
+    for name, excitation, make, num_steps in (
+        ("policy", PolicyExcitation.of(policy), lambda: PolicyPlayer(policy), 120),
+        ("chirp", gentle, lambda: SignalPlayer(sequence), 80),
+    ):
+        runs = run_batch(many, excitation, RULES, (num_steps, NUM_READINGS))
+        for i in range(20):
+            path = tmp_path / f"{name}{i}.csv"
+            body = jax.tree.map(lambda leaf, i=i: leaf[i], many)
+            outcome, _ = simulated(path, body, make(), num_steps)
+            trip = Trip(int(runs.trip[i]))
+            assert outcome.trip == trip
+            inputs = np.asarray(runs.inputs[i])
+            # At a sampling instant the safe input takes the place of the player's.
+            is_sampled = trip in (Trip.PREDICTED_LEVEL, Trip.STALE)
+            if trip != Trip.NONE:
+                assert outcome.num_samples == np.count_nonzero(inputs) + is_sampled
+            else:
+                assert outcome.num_samples == num_steps
+            recorded = np.genfromtxt(path, delimiter=",", names=True)["voltage"]
+            n = min(outcome.num_samples, len(recorded))
+            assert n >= outcome.num_samples - 1
+            np.testing.assert_allclose(recorded[:n], inputs[:n, 0], atol=1e-4)
+            trips.add((name, trip))
+    assert {name for name, trip in trips if trip != Trip.NONE} == {"policy"}, trips
+    assert ("chirp", Trip.NONE) in trips
+
+
+def test_without_latency_the_physics_is_that_of_the_plant(tmp_path):
+    body, (_, sequence) = body_of(latency=0.0, jitter=0.0), chirp(60, 6.0)
+    outcome, rig = simulated(tmp_path / "a.csv", body, SignalPlayer(sequence), 60)
+    assert outcome.is_complete
+    fine = at_interval(PLANT, NUM_READINGS)
+    held = jnp.asarray(np.repeat(sequence, NUM_READINGS, axis=0))
+    true = np.asarray(simulate(fine, body.params, held))
+    measured = read_record(tmp_path / "a.csv", AERO).outputs
+    half = 0.5 * AERO.outputs[0].resolution
+    assert np.abs(measured - true[::NUM_READINGS]).max() <= half * (1 + 1e-9)
+    largest = rig.facts()["true_max_abs_output"]
+    np.testing.assert_allclose(largest, np.abs(true).max(axis=0), rtol=1e-9)
+
+
+def test_a_record_with_latency_identifies_without_bias(tmp_path):
+    seen, (_, sequence) = [], chirp(NUM_SAMPLES, 5.0)
+    body = Body.draw(IDEAL, NUM_READINGS, 0.1, jax.random.key(1), latency=0.01, jitter=0.0)
+    rig = SimulatedRig(IDEAL, body, NUM_READINGS, is_real_time=False)
+    outcome, _ = experiment(tmp_path / "a.csv", rig, SignalPlayer(sequence), on_sample=seen.append)
+    assert outcome.is_complete
+    true = rig.facts()["true_params"]
+    record = read_record(tmp_path / "a.csv", IDEAL.description)
+    result = identify(IDEAL, [record])
+    for name, value in true.items():
+        off = abs(result.params[name] - value)
+        assert off < 4 * result.std_error[name], (name, result.params, true)
+    _check_tracker(seen, record, result)
+
+
+def _check_tracker(seen, record, result):
+    """Its last estimate is that of the estimator on all samples it has seen."""
+    tracker = Tracker(IDEAL, len(seen))
+    assert tracker.latest == {}
+    for sample in seen:
+        tracker(sample)
+    tracker.close()
+    experiments = Experiments(
+        inputs=jnp.asarray(record.inputs[:-1])[None],
+        measured=jnp.asarray(record.outputs)[None],
+        valid=jnp.asarray(np.arange(len(seen) + 1) < len(seen))[None],
+        initial_state=IDEAL.initial_state[None],
+        initial_state_known=True,
+    )
+    estimate = NLS()(IDEAL, experiments)
+    for value, (name, (ours, half)) in zip(estimate.params, tracker.latest.items(), strict=True):
+        assert ours == pytest.approx(float(value), rel=1e-6)
+        # The record has one measurement more.
+        assert half == pytest.approx(1.96 * result.std_error[name], rel=0.1)
+        assert abs(ours - result.params[name]) < 0.5 * half
+
+
+def test_lost_readings_repeat_the_one_before(tmp_path):
+    readings = {}
+    for dropout in (0.0, 0.5):
+        rig = SimulatedRig(PLANT, body_of(dropout=dropout), NUM_READINGS, is_real_time=False)
+        rig.open()
+        rig.write(np.array([10.0]))
+        readings[dropout] = np.array([rig.read().outputs[0] for _ in range(100)])
+    lost = readings[0.5] != readings[0.0]
+    assert 0.2 < lost[30:].mean() < 0.8
+    repeated = readings[0.5][1:] == readings[0.5][:-1]
+    assert repeated[lost[1:]].all()
+
+
+def test_a_rig_that_loses_all_readings_is_stopped(tmp_path):
+    body, (_, sequence) = body_of(dropout=1.0), chirp(60, 6.0)
+    outcome, _ = simulated(tmp_path / "a.csv", body, SignalPlayer(sequence), 60)
+    assert outcome.trip == Trip.STALE
+
+
+@pytest.mark.parametrize("numbers", [{"latency": 0.1}, {"latency": 0.097}, {"jitter": 0.095}])
+def test_an_input_that_would_act_after_the_next_is_refused(numbers):
+    with pytest.raises(ValueError, match="must be less than the sampling time"):
+        SimulatedRig(PLANT, body_of(**numbers), NUM_READINGS, is_real_time=False)
+
+
+def test_latency_is_a_part_of_the_plants_own_sampling_time():
+    fast = PLANT.changed(dt=0.004)
+    rig = SimulatedRig(fast, Body.draw(fast, 2, 0.0, jax.random.key(0)), 2, is_real_time=False)
+    assert rig.num_latency == 0
+
+
+# ------------------------------------------------------------------------ safety filter
+
+
+@pytest.fixture(scope="module")
+def safety():
+    return SafetyFilter.of(PLANT, 0.3)
+
+
+def test_the_filter_prevents_every_violation_and_only_these(many, safety):
+    shape = (200, NUM_READINGS)
+    strong, gentle = Chirp(amplitude=12.0), Chirp(amplitude=4.0)
+    bare = run_batch(many, strong, RULES, shape)
+    assert int(bare.is_violation.sum()) > 0
+    filtered = run_batch(many, strong, RULES, shape, safety, safety.start())
+    assert int(filtered.is_violation.sum()) == 0
+    assert int((filtered.num_interventions > 0).sum()) > 10
+    harmless = run_batch(many, gentle, RULES, shape, safety, safety.start())
+    assert int(harmless.num_interventions.sum()) == 0
+    _, sequence = chirp(200, 4.0)
+    np.testing.assert_allclose(harmless.inputs[3], sequence, atol=1e-9)
+
+
+def test_a_filtered_player_passes_on_what_is_harmless(safety):
+    heard = []
+
+    class Player(SignalPlayer):
+        def applied(self, input):
+            heard.append(input)
+
+        def facts(self):
+            return {"own": 1}
+
+    player = FilteredPlayer(Player(np.full((40, 1), 2.0)), safety)
+    assert player.num_steps == 40
+    for k in range(3):
+        np.testing.assert_array_equal(player(k, np.zeros(1)), [2.0])
+    assert player.facts() == {"own": 1, "filter_interventions": 0}
+    input = player(3, np.array([0.0]))
+    player.applied(input)
+    assert heard == [input]
+
+
+def test_a_filter_survives_what_is_no_number(safety):
+    player = FilteredPlayer(SignalPlayer(np.array([[math.nan], [1.0]])), safety)
+    assert np.isfinite(player(0, np.zeros(1))).all()
+    np.testing.assert_array_equal(player(1, np.array([math.nan])), [1.0])
+
+
+# ------------------------------------------------------------------------------ kill -9
+
+
+def test_a_killed_process_leaves_a_record_that_identifies(tmp_path):
+    plant, num_needed = IDEAL, 45
+    time_, inputs = 0.1 * np.arange(300), 4 * np.sin(2 * math.pi * 0.35 * 0.1 * np.arange(300))
+    (tmp_path / "u.csv").write_text(csv_text({"time": time_, "voltage": inputs}))
+    words = ["run", "--plant", "aero2", "--input", "u.csv", "--out", "r.csv", "--spread", "0.1"]
+    path = tmp_path / "r.csv"
+    source = str(Path(excite.__file__).parent.parent)
+    with subprocess.Popen(
+        [sys.executable, "-m", "excite", *words], cwd=tmp_path, text=True,
+        env={**os.environ, "PYTHONPATH": source, "EXCITE_CACHE": str(tmp_path / "cache")},
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+    ) as process:  # fmt: skip
+        try:
+            until = time.monotonic() + 120
+            while not path.exists() or path.read_text().count("\n") <= num_needed:
+                assert process.poll() is None, process.communicate()[0]
+                assert time.monotonic() < until
+                time.sleep(0.02)
+        finally:
+            process.kill()
+    assert json.loads(path.with_suffix(".json").read_text())["ended"] is None
+    record = read_record(path, plant.description)
+    assert len(record.time) >= num_needed
+    assert record.starts_at_initial_state
+    result = identify(plant, [record])
+    assert result.status == "successful"
+    for name, nominal in plant.nominal._asdict().items():
+        assert abs(result.params[name] / float(nominal) - 1) < 0.5

@@ -1,0 +1,270 @@
+"""`excite run`: exit codes, what is written and what is not, refusals, and life without JAX."""
+
+import importlib
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import excite
+from excite.cli import main
+from excite.files import csv_text
+from excite.plant import Aero2Detailed
+from excite.records import read_record
+
+command = importlib.import_module("excite.cli.run")  # its name is the command's, too
+AERO = Aero2Detailed.definition
+TESTS = Path(__file__).parent
+
+OWN_RIG = """
+import numpy as np
+from excite.rig import AbstractRig, Reading, RigError
+
+
+class Still(AbstractRig):
+    num_readings, is_real_time = 2, False
+
+    def open(self):
+        self.n = -1
+
+    def read(self):
+        self.n += 1
+        return Reading(self.n * self.description.dt / 2, np.array([0.001 * self.n]))
+
+    def write(self, input):
+        pass
+
+    def close(self):
+        pass
+
+    def facts(self):
+        return {"own": self.n}
+
+
+class Absent(Still):
+    def open(self):
+        raise RigError("nobody at home")
+
+
+class Clinging(Still):
+    def close(self):
+        raise RigError("the card does not answer")
+
+
+class Half(AbstractRig):
+    def open(self):
+        pass
+
+
+class Other:
+    pass
+"""
+
+
+@pytest.fixture
+def call(tmp_path, capsys, monkeypatch):
+    """`excite run` in this process, in an empty folder: exit code, stdout, stderr."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(command, "_tracker", lambda job, has_jax: None)  # it compiles for long
+    monkeypatch.setenv("EXCITE_CACHE", str(tmp_path.parent / "cache"))
+    (tmp_path / "own.py").write_text(OWN_RIG)
+    inputs = 3 * np.sin(0.25 * np.arange(30))
+    (tmp_path / "u.csv").write_text(csv_text({"time": 0.1 * np.arange(30), "voltage": inputs}))
+
+    def run(*words):
+        monkeypatch.setattr(sys, "argv", ["excite", "run", *map(str, words)])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as ending:
+            main()
+        return (int(ending.value.code or 0), *capsys.readouterr())
+
+    return run
+
+
+FAST = ("--fast", "--out", "r.csv")
+
+
+def test_an_experiment_that_completes_is_one_json_object_and_a_record(call):
+    code, out, err = call("--input", "u.csv", *FAST, "--json")
+    assert (code, err) == (0, "")
+    told = json.loads(out)
+    assert set(told) == {
+        "file", "live_estimate", "reason", "trip", "num_samples", "max_abs_output",
+        "late_ms_percentiles", "missed_deadlines", "rig", "player",
+    }  # fmt: skip
+    assert told["reason"] == "complete"
+    assert (told["trip"], told["num_samples"], told["missed_deadlines"]) == ("none", 29, 0)
+    assert set(told["rig"]["true_params"]) == {"J_p", "K_pu", "D_p"}
+    record = read_record("r.csv", AERO)
+    assert len(record.time) == 30
+    assert record.metadata["provenance"]["played"] == "u.csv"
+    assert record.metadata["ended"] == {
+        key: value for key, value in told.items() if key not in ("file", "live_estimate")
+    }
+
+
+def test_a_trip_is_a_failed_run_that_is_recorded_and_explained(call):
+    words = ("--policy", "aero2-ppo-all", "--steps", 60, "--fault", "dropout=0.99999")
+    code, out, err = call(*words, *FAST)
+    assert code == 1
+    assert "stood still" in out
+    assert "next: excite identify r.csv --plant aero2_detailed" in out
+    assert "Traceback" not in err
+    assert read_record("r.csv", AERO).metadata["ended"]["trip"] == "stale"
+
+
+def test_a_dry_run_writes_and_sends_nothing(call, tmp_path):
+    before = sorted(tmp_path.iterdir())
+    code, out, _ = call("--input", "u.csv", "--dry-run", "--json", "--out", "r.csv")
+    assert code == 0
+    told = json.loads(out)
+    assert told["num_steps"] == 29
+    assert told["inputs"]["voltage"]["largest"] == pytest.approx(3.0, abs=0.05)
+    assert call("--rig", "own.py:Absent", "--input", "u.csv", "--dry-run")[0] == 0
+    assert [p for p in sorted(tmp_path.iterdir()) if p.name != "__pycache__"] == before
+
+
+def test_a_record_is_replaced_only_where_that_is_wanted(call, tmp_path):
+    words = ("--rig", "own.py:Still", "--input", "u.csv", "--out", "r.csv", "--steps")
+    assert call(*words, 5)[0] == 0
+    code, _, err = call(*words, 6)
+    assert code == 2
+    assert "--overwrite" in err
+    assert len(read_record("r.csv", AERO).time) == 6
+    assert call(*words, 6, "--overwrite")[0] == 0
+    assert len(read_record("r.csv", AERO).time) == 7
+
+
+SIGNAL = ("--input", "u.csv")
+REFUSALS = {
+    "no record": (SIGNAL, "--out FILE.csv is missing"),
+    "record of another kind": ((*SIGNAL, "--out", "r.mat"), "line by line"),
+    "record in no folder": ((*SIGNAL, "--out", "no/r.csv"), "does not exist"),
+    "rig": ((*SIGNAL, *FAST, "--rig", "lego"), "unknown rig 'lego'"),
+    "policy": ((*FAST, "--policy", "best"), "no policy 'best' (there is aero2"),
+    "plant": ((*SIGNAL, *FAST, "--plant", "aero3"), "aero3"),
+    "policy of another plant": ((*FAST, "--policy", "emps"), "emps"),
+    "two players": ((*SIGNAL, *FAST, "--policy", "aero2-ppo-all"), "exclude each other"),
+    "fault": ((*SIGNAL, *FAST, "--fault", "wind=0.1"), "--fault wind=0.1 is not allowed"),
+    "fault of no number": ((*SIGNAL, *FAST, "--fault", "latency=nan"), "is not allowed"),
+    "negative fault": ((*SIGNAL, *FAST, "--fault", "dropout=-0.1"), "is not allowed"),
+    "latency": ((*SIGNAL, *FAST, "--fault", "latency=0.2"), "must be less than the sampling time"),
+    "slew": ((*SIGNAL, *FAST, "--slew", "-1"), "the slew limit must be positive"),
+    "steps": ((*SIGNAL, *FAST, "--steps", 30), "was made for 29 steps"),
+    "steps of a policy": (
+        (*FAST, "--policy", "aero2-ppo-all", "--steps", 501), "was made for 500 steps",
+    ),
+    "no file of steps": ((*FAST, "--input", "v.csv"), "no such file"),
+    "unit": ((*SIGNAL, *FAST, "--rig", "no.fmu"), "no.fmu"),
+    "own rig without file": ((*SIGNAL, *FAST, "--rig", "no.py:Still"), "no such file"),
+    "own rig without class": ((*SIGNAL, *FAST, "--rig", "own.py:Quick"), "no rig class 'Quick'"),
+    "own rig that is none": ((*SIGNAL, *FAST, "--rig", "own.py:Other"), "no rig class 'Other'"),
+    "own rig half made": ((*SIGNAL, *FAST, "--rig", "own.py:Half"), "not a complete rig"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", REFUSALS)
+def test_a_bad_option_is_one_sentence_and_exit_code_2(call, tmp_path, name):
+    words, sentence = REFUSALS[name]
+    code, out, err = call(*words)
+    assert (code, out) == (2, ""), err
+    lines = [line for line in err.splitlines() if not line.startswith("warning:")]
+    assert len(lines) == 1
+    assert lines[0].startswith("excite: ")
+    assert sentence in lines[0]
+    assert not (tmp_path / "r.csv").exists()
+    assert not (tmp_path / "r.json").exists()
+
+
+def test_a_class_of_ones_own_is_a_rig(call):
+    code, out, err = call("--rig", "own.py:Still", *SIGNAL, "--out", "r.csv", "--json")
+    assert (code, err) == (0, "")
+    assert json.loads(out)["rig"] == {"own": 58}
+    assert len(read_record("r.csv", AERO).time) == 30
+
+
+def test_a_rig_that_does_not_open_is_a_failed_run(call, tmp_path):
+    code, out, err = call("--rig", "own.py:Absent", *SIGNAL, "--out", "r.csv")
+    assert (code, out) == (1, "")
+    assert err == "excite: the rig failed: nobody at home\n"
+    assert not (tmp_path / "r.csv").exists()
+
+
+def test_a_rig_that_is_not_released_hides_no_outcome(call):
+    code, out, _ = call("--rig", "own.py:Clinging", *SIGNAL, "--out", "r.csv", "--json")
+    assert code == 1
+    told = json.loads(out)
+    expected = "complete; the rig was not released: the card does not answer"
+    assert told["reason"] == expected
+    assert told["num_samples"] == 29
+    assert read_record("r.csv", AERO).metadata["ended"]["reason"] == expected
+
+
+def test_a_filter_says_how_often_it_intervened(call):
+    code, out, _ = call(*SIGNAL, *FAST, "--filter", "--json")
+    assert code == 0
+    assert json.loads(out)["player"] == {"filter_interventions": 0}
+
+
+# ------------------------------------------------------------------------- without JAX
+
+NOTHING_ELSE = """
+import sys
+
+ALLOWED = {"excite", "numpy", "safetensors", "click", "rich", "pygments", "markdown_it",
+           "mdurl", "quanser", *sys.stdlib_module_names}
+
+
+class Absent:
+    def find_spec(self, name, path=None, target=None):
+        first = name.partition(".")[0]
+        if first not in ALLOWED and not first.startswith("_"):
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+
+sys.meta_path.insert(0, Absent())
+"""
+
+
+def bare(folder, *words):
+    """`excite run` on a computer that has NumPy and little else."""
+    (folder / "hook").mkdir()
+    (folder / "hook" / "sitecustomize.py").write_text(NOTHING_ELSE)
+    source = Path(excite.__file__).parent.parent
+    places = (folder / "hook", TESTS / "standin", source)
+    return subprocess.run(
+        [sys.executable, "-m", "excite", "run", *map(str, words)], cwd=folder, check=False,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, places))},
+        capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
+
+
+JAX_IS_MISSING = "JAX is not installed: the live estimate and the filter are off\n"
+
+
+@pytest.mark.parametrize("words", [("--policy", "aero2-ppo-all"), SIGNAL])
+def test_a_laboratory_computer_runs_without_jax(call, tmp_path, words):
+    words = ("--rig", "quanser", *words, "--out", "r.csv", "--steps", 20, "--json")
+    done = bare(tmp_path, *words)
+    assert done.stderr.startswith(JAX_IS_MISSING)
+    assert done.returncode == 0, done.stdout
+    told = json.loads(done.stdout)
+    assert told["reason"] == "complete"
+    assert told["live_estimate"] == {}
+    assert len(read_record(tmp_path / "r.csv", AERO).time) == 21
+
+
+@pytest.mark.parametrize(("words", "sentence"), [
+    ((*SIGNAL, "--rig", "simulated"), "need JAX, which is not installed"),
+    ((*SIGNAL, "--rig", "quanser", "--filter"), "--filter needs JAX, which is not installed"),
+])  # fmt: skip
+def test_what_needs_jax_says_so(call, tmp_path, words, sentence):
+    done = bare(tmp_path, *words, "--out", "r.csv")
+    assert done.returncode == 2
+    assert sentence in done.stderr
+    assert len(done.stderr.splitlines()) == 2
+    assert not (tmp_path / "r.csv").exists()
