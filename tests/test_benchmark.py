@@ -51,6 +51,44 @@ def rows() -> list[dict[str, Any]]:
     return run_benchmark(tiny())
 
 
+# On a simulated rig
+
+
+@pytest.fixture(scope="module")
+def on_rig() -> list[dict[str, Any]]:
+    methods = {
+        "gentle": {"excitation": "chirp", "amplitude": 5.0},
+        "strong": {"excitation": "chirp", "amplitude": 14.0},
+    }
+    return run_benchmark(
+        tiny(
+            plant="aero2_detailed", num_steps=200, methods=methods,
+            estimators={"nls": {"kind": "nls"}}, rig={"filter": True},
+        )
+    )  # fmt: skip
+
+
+def test_what_a_supervisor_ended_has_no_estimate_and_a_filter_prevents_it(on_rig):
+    gentle, strong = on_rig
+    quiet = {"trips": 0, "filtered_violations": 0, "filtered_trips": 0, "interventions": 0}
+    assert gentle["on_rig"] == quiet
+    assert gentle["failed"] == 0
+    assert strong["on_rig"]["trips"] > 0
+    assert strong["failures"]["tripped"] == strong["on_rig"]["trips"]
+    assert strong["failed"] >= strong["on_rig"]["trips"]
+    assert strong["on_rig"]["filtered_violations"] == 0
+    assert strong["on_rig"]["interventions"] > 0
+
+
+def test_latency_that_a_record_knows_costs_no_accuracy(on_rig):
+    for name in PARAMETERS:  # 10 ms that are not known cost half of D_p
+        assert on_rig[0]["rms_over_cramer_rao"][name] < 3
+
+
+def test_only_the_plant_itself_shows_no_rig(rows):
+    assert all("on_rig" not in row for row in rows)
+
+
 # Rows
 
 
@@ -62,7 +100,7 @@ def test_rows_are_methods_in_order_each_with_all_estimators(rows):
 
 def test_a_row_has_the_keys_that_are_documented(rows):
     for row in rows:
-        assert set(row) | {"bound_by_length"} == documented("benchmark")  # it is asked for
+        assert set(row) | {"bound_by_length", "on_rig"} == documented("benchmark")  # asked for
         assert set(row) >= {
             "method", "estimator", "evaluations", "failed", "violations", "max_abs_output",
             "relative_error_percent", "cramer_rao_percent",
@@ -209,6 +247,7 @@ def outcome(status: list[Status], estimated: list[list[float]]) -> Any:
         max_abs_output=np.full((len(status), 1), math.radians(10)),
         bound=np.full((len(status), 3), 0.05),
         log_det=np.full(len(status), 50.0),
+        on_rig={},
     )
 
 

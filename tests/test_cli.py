@@ -585,7 +585,8 @@ def test_a_benchmark_leaves_table_and_study(run, here):
     assert [(r["method"], r["estimator"]) for r in rows] == [
         ("random", "arx-rls"), ("prbs", "arx-rls"),
     ]  # fmt: skip
-    assert all(set(r) | {"bound_by_length"} == documented("benchmark") for r in rows)
+    elsewhere = {"bound_by_length", "on_rig"}
+    assert all(set(r) | elsewhere == documented("benchmark") for r in rows)
     assert "| prbs | as published |" in (folder / "table.md").read_text()
     table = list(csv.DictReader((folder / "table.csv").read_text().splitlines()))
     assert [float(line["evaluations"]) for line in table] == [8, 8]
@@ -721,6 +722,10 @@ BAD: dict[str, tuple[str, tuple[str, ...]]] = {
     "start for what does not search": (
         "identify good.csv --plant aero2 --estimator arx-rls --start J_p=0.02", ("--start",),
     ),
+    "held in what estimates all": (
+        "identify good.csv --plant aero2 --estimator arx-rls --hold J_p=0.02", ("--hold",),
+    ),
+    "a filter without a rig": ("evaluate aero2 --filter", ("--rig",)),
     "record that exists": ("simulate aero2 --out good.csv", ("good.csv", "--overwrite")),
     "record beside a foreign file": (
         "simulate aero2 --out notes.csv --overwrite", ("notes.json", "lost"),

@@ -69,8 +69,37 @@ def test_the_covariance_covers_repeated_noise():
         return jnp.stack(estimate.params), jnp.sqrt(jnp.diagonal(estimate.covariance))
 
     found, claimed = jax.vmap(one)(jax.random.split(jax.random.key(1), 200))
-    ratio = np.std(found, axis=0)[:2] / np.median(claimed, axis=0)[:2]  # inertia and damping
-    assert np.all((ratio > 0.5) & (ratio < 2.0))
+    ratio = np.std(found, axis=0) / np.median(claimed, axis=0)
+    assert np.all((ratio > 0.5) & (ratio < 2.0)), ratio
+
+
+@pytest.mark.parametrize("num_steps", [600, 2400, 6000])
+def test_what_is_left_when_the_decay_is_over_changes_nothing(num_steps):
+    plant = Oscillator()
+    noisy = plant.changed(sensor=dataclasses.replace(plant.sensor, noise_sd=jnp.array([2e-3])))
+    params = noisy.nominal._replace(c=jnp.asarray(1.0))
+    signal = Decay(amplitude=1.0, frequency=0.32, pump=120 / num_steps)
+    estimate = estimated(noisy, params, signal, num_steps)
+    assert estimate.status == Status.SUCCESSFUL
+    np.testing.assert_allclose(jnp.stack(estimate.params), jnp.stack(params), rtol=0.05)
+
+
+def test_too_few_swings_above_the_noise_are_no_decay():
+    plant = Oscillator()
+    noisy = plant.changed(sensor=dataclasses.replace(plant.sensor, noise_sd=jnp.array([2e-3])))
+    params = noisy.nominal._replace(c=jnp.asarray(5.0))
+    estimate = estimated(noisy, params, Decay(amplitude=1.0, frequency=0.32), 2000)
+    assert estimate.status == Status.ILL_CONDITIONED
+
+
+def test_a_record_that_begins_elsewhere_has_its_free_response_fitted():
+    plant = Oscillator()
+    away = plant.changed(initial_state=jnp.array([0.5, 0.0]))
+    signal = Decay(amplitude=1.0, frequency=0.32)
+    run = run_episode(away, away.nominal, signal, 600, jax.random.key(0))
+    data = stack_experiments(plant, [run.inputs], [run.measured], False)
+    estimate = Decrement()(plant, data)
+    np.testing.assert_allclose(jnp.stack(estimate.params), jnp.stack(plant.nominal), rtol=2e-3)
 
 
 def test_an_input_that_never_rests_has_no_decay():

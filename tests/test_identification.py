@@ -16,12 +16,13 @@ from documented import documented
 from experiments import NUM_STEPS, autoregressive, record_of, spread_params
 
 from excite.description import Input, Output, Parameter, PlantDescription, State
-from excite.estimation import ARX
-from excite.excitation import PRBS, Random, Replay
+from excite.estimation import ARX, NLS
+from excite.excitation import PRBS, Chirp, Random, Replay
 from excite.files import json_ready
 from excite.identification import Identification, best_possible, identify, write_run
-from excite.plant import EMPS, AbstractPlant, Aero2, DCMotor
+from excite.plant import EMPS, AbstractPlant, Aero2, Aero2Lag, DCMotor
 from excite.records import Record, read_record, write_record
+from excite.simulation import simulate
 
 ROOT = Path(__file__).parent.parent
 PLANT = Aero2()
@@ -112,6 +113,46 @@ def test_the_start_changes_no_estimate(result, chirp):
     moved = identify(PLANT, [chirp], start={"J_p": 0.018, "K_pu": 0.016, "D_p": 0.002})
     for name, value in moved.params.items():
         assert abs(value - result.params[name]) < 0.02 * result.std_error[name]
+
+
+def test_a_known_parameter_is_held_and_the_others_gain(chirp, result):
+    held = identify(PLANT, [chirp], NLS(hold=("K_pu",)), start={"K_pu": 0.012})
+    assert held.status == "successful"
+    assert held.held == ("K_pu",)
+    assert held.params["K_pu"] == pytest.approx(0.012, rel=1e-12)
+    assert np.isnan(held.std_error["K_pu"])
+    right = {"K_pu": result.params["K_pu"]}
+    known = identify(PLANT, [chirp], NLS(hold=("K_pu",)), start=right)
+    for name in ("J_p", "D_p"):
+        assert abs(known.params[name] - result.params[name]) < 0.05 * result.std_error[name]
+        assert known.std_error[name] <= result.std_error[name] * 1.001
+
+
+def test_a_lag_may_be_known_or_estimated():
+    plant = Aero2Lag()
+    signal = Chirp().sequence(plant, 300, jax.random.key(0))
+    truth = plant.nominal._replace(J_p=jnp.asarray(0.025), tau=jnp.asarray(0.2))
+    outputs = np.asarray(simulate(plant, truth, signal))
+    noisy = outputs + np.random.default_rng(0).normal(0, 2e-4, outputs.shape)
+    record = Record.of_episode(
+        np.arange(301) * 0.1, np.asarray(signal), noisy, {"starts_at_initial_state": True}
+    )
+    free = identify(plant, [record], initial_state="known")
+    known = identify(plant, [record], NLS(hold=("tau",)), start={"tau": 0.2}, initial_state="known")
+    wrong = identify(plant, [record], NLS(hold=("tau",)), start={"tau": 0.1}, initial_state="known")
+    assert abs(free.params["tau"] - 0.2) < 4 * free.std_error["tau"]
+    assert abs(known.params["J_p"] - 0.025) < 4 * known.std_error["J_p"]
+    assert known.structure["pitch"] > 0.01
+    assert "structure" in wrong.verdict[0]
+
+
+@pytest.mark.parametrize(
+    ("hold", "complaint"),
+    [(("J",), "no parameter 'J'"), (("J_p", "K_pu", "D_p"), "every parameter is held")],
+)
+def test_what_cannot_be_held_is_refused(chirp, hold, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        identify(PLANT, [chirp], NLS(hold=hold))
 
 
 # Initial states

@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,7 +20,8 @@ import pytest
 
 import excite
 from excite.estimation import NLS, Experiments
-from excite.excitation import Chirp, PolicyExcitation
+from excite.evaluation import evaluate
+from excite.excitation import Chirp, PolicyExcitation, Square
 from excite.files import csv_text
 from excite.identification import identify
 from excite.plant import Aero2, Aero2Detailed
@@ -35,11 +37,20 @@ from excite.rig import (
     Recorder,
     RigError,
     SignalPlayer,
+    base,
     interruptible,
     run,
 )
 from excite.rig.prediction import FilteredPlayer, SafetyFilter
-from excite.rig.simulated import Body, SimulatedRig, at_interval, bodies, run_batch
+from excite.rig.simulated import (
+    Body,
+    SimulatedRig,
+    at_interval,
+    bodies,
+    evaluate_on_rig,
+    readings_per_sample,
+    run_batch,
+)
 from excite.rig.tracking import Tracker
 from excite.safety import Supervision, Trip
 from excite.simulation import simulate
@@ -222,7 +233,8 @@ ENDINGS = {
     "the rig fails to read": ({"script": SHAKEN}, None, "the cable is out", None, 6),
     "its clock stands": ({"clock": 0.0}, None, "stood still", "stale", 1),
     "its clock is none": ({"clock": math.nan}, None, "stood still", "stale", 1),
-    "its clock runs": ({"clock": 1.5}, None, "lasted longer", "duration", 8),
+    "its clock runs": ({"clock": 1.5}, None, "left the plan", "duration", 6),
+    "SIGHUP": ({}, kill(signal.SIGHUP), "interrupted by SIGHUP", None, 5),
 }
 
 
@@ -330,12 +342,14 @@ def test_a_second_interrupt_ends_a_rig_that_hangs(tmp_path):
 
 
 def test_signals_are_given_back():
-    before = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
+    numbers = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
+    before = [signal.getsignal(n) for n in numbers]
     with interruptible() as stop:
         os.kill(os.getpid(), signal.SIGTERM)
-        os.kill(os.getpid(), signal.SIGTERM)
         assert stop.reason == "interrupted by SIGTERM"
-    assert [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)] == before
+        with pytest.raises(KeyboardInterrupt):  # of who cannot wait
+            os.kill(os.getpid(), signal.SIGTERM)
+    assert [signal.getsignal(n) for n in numbers] == before
 
 
 class FullDisk:
@@ -495,13 +509,53 @@ def test_the_loop_and_the_batch_are_one_experiment(many, tmp_path):
                 assert outcome.num_samples == np.count_nonzero(inputs) + is_sampled
             else:
                 assert outcome.num_samples == num_steps
-            recorded = np.genfromtxt(path, delimiter=",", names=True)["voltage"]
-            n = min(outcome.num_samples, len(recorded))
+            record = np.genfromtxt(path, delimiter=",", names=True)
+            n = min(outcome.num_samples, len(record))
             assert n >= outcome.num_samples - 1
-            np.testing.assert_allclose(recorded[:n], inputs[:n, 0], atol=1e-4)
+            np.testing.assert_allclose(record["voltage"][:n], inputs[:n, 0], atol=1e-4)
+            seen = np.asarray(runs.measured[i, :, 0])
+            n = n if trip != Trip.NONE else n + 1
+            # Of a sample in which it tripped, a record has the reading that did it.
+            np.testing.assert_allclose(record["pitch"][: n - 1], seen[: n - 1], atol=1e-9)
+            if trip == Trip.NONE:
+                assert record["pitch"][n - 1] == pytest.approx(seen[n - 1], abs=1e-9)
             trips.add((name, trip))
     assert {name for name, trip in trips if trip != Trip.NONE} == {"policy"}, trips
     assert ("chirp", Trip.NONE) in trips
+
+
+def test_experiments_on_rigs_are_scored_like_those_on_plants():
+    keys = jax.random.split(jax.random.key(3), 4)
+    bare = {"latency": 0.0, "jitter": 0.0}
+    fine = readings_per_sample(PLANT)
+    assert fine == 50
+    excitation = Chirp(amplitude=6.0)
+    scored, runs = evaluate_on_rig(
+        PLANT, excitation, bodies(PLANT, fine, 0.3, keys, **bare), RULES, 60
+    )
+    on_plants = evaluate(PLANT, excitation, 60, 0.3, keys)
+    for own, other in zip(scored.params, on_plants.params, strict=True):
+        np.testing.assert_array_equal(own, other)
+    # Without latency it is the same experiment but for steps of integration and the encoder's.
+    inputs = scored.trajectory.inputs, on_plants.trajectory.inputs
+    np.testing.assert_allclose(*inputs, atol=1e-12)
+    resolution = AERO.outputs[0].resolution
+    far = scored.trajectory.measured - on_plants.trajectory.outputs
+    assert float(jnp.abs(far).max()) < 0.6 * resolution
+    np.testing.assert_allclose(scored.information, on_plants.information, rtol=1e-9)
+    assert not np.asarray(runs.trip).any()
+    assert not np.asarray(scored.is_violation).any()
+
+
+def test_a_level_counts_between_samples_too():
+    keys = jax.random.split(jax.random.key(0), 8)
+    many = bodies(PLANT, readings_per_sample(PLANT), 0.3, keys)
+    scored, runs = evaluate_on_rig(PLANT, Chirp(amplitude=14.0), many, RULES, 200)
+    between = np.asarray(scored.max_abs_output)[:, 0]
+    at_samples = np.abs(np.asarray(scored.trajectory.measured)).max(axis=1)[:, 0]
+    assert (between >= at_samples - AERO.outputs[0].resolution).all()
+    np.testing.assert_array_equal(scored.is_violation, between >= CRITICAL)
+    assert (np.asarray(runs.trip) != Trip.NONE).any()
 
 
 def test_without_latency_the_physics_is_that_of_the_plant(tmp_path):
@@ -526,7 +580,7 @@ def test_a_record_with_latency_identifies_without_bias(tmp_path):
     assert outcome.is_complete
     true = rig.facts()["true_params"]
     record = read_record(tmp_path / "a.csv", IDEAL.description)
-    result = identify(IDEAL, [record])
+    result = identify(IDEAL, [record], initial_state="known")
     for name, value in true.items():
         off = abs(result.params[name] - value)
         assert off < 4 * result.std_error[name], (name, result.params, true)
@@ -535,7 +589,7 @@ def test_a_record_with_latency_identifies_without_bias(tmp_path):
 
 def _check_tracker(seen, record, result):
     """Its last estimate is that of the estimator on all samples it has seen."""
-    tracker = Tracker(IDEAL, len(seen))
+    tracker = Tracker(IDEAL, len(seen), starts_at_rest=True)
     assert tracker.latest == {}
     for sample in seen:
         tracker(sample)
@@ -622,16 +676,126 @@ def test_a_filtered_player_passes_on_what_is_harmless(safety):
     assert player.num_steps == 40
     for k in range(3):
         np.testing.assert_array_equal(player(k, np.zeros(1)), [2.0])
-    assert player.facts() == {"own": 1, "filter_interventions": 0}
+    assert player.facts() == {
+        "own": 1, "filter_interventions": 0, "filter_without_safe_input": 0,
+    }  # fmt: skip
     input = player(3, np.array([0.0]))
     player.applied(input)
     assert heard == [input]
 
 
-def test_a_filter_survives_what_is_no_number(safety):
-    player = FilteredPlayer(SignalPlayer(np.array([[math.nan], [1.0]])), safety)
-    assert np.isfinite(player(0, np.zeros(1))).all()
-    np.testing.assert_array_equal(player(1, np.array([math.nan])), [1.0])
+def test_what_is_no_number_is_left_to_the_supervisor(safety, tmp_path):
+    player = FilteredPlayer(SignalPlayer(np.array([[1.0], [math.nan], [1.0]])), safety)
+    np.testing.assert_array_equal(player(0, np.array([math.nan])), [1.0])
+    assert np.isnan(player(1, np.zeros(1))).all()
+    signal = FilteredPlayer(SignalPlayer(np.array([[1.0]] * 3 + [[math.inf]] * 3)), safety)
+    outcome, _ = simulated(tmp_path / "a.csv", body_of(), signal, 6)
+    assert outcome.trip == Trip.INPUT_NOT_FINITE
+    assert outcome.player["filter_interventions"] == 0
+
+
+def test_a_filter_that_has_lost_the_plant_lets_nothing_pass(safety):
+    states = np.array(safety.start().states)
+    states[3, 1] = 1e170  # finite, and beyond any prediction
+    lost = dataclasses.replace(safety.start(), states=jnp.asarray(states))
+    memory, input, is_changed = safety(lost, jnp.array([0.6]), jnp.array([24.0]))
+    assert is_changed
+    assert int(memory.num_unsafe) == 1
+    assert not float(input[0]) > 0
+
+
+@pytest.mark.parametrize("slew", [math.inf, 30.0])
+def test_no_plant_of_the_set_is_driven_over_the_level(slew):
+    """Full voltage either way, at and beside resonance, on every plant that the filter knows."""
+    safety = SafetyFilter.of(PLANT, 0.3, slew)
+    rules = dataclasses.replace(RULES, critical=np.full(1, np.inf), slew=np.full(1, slew * 0.1))
+    drawn = bodies(PLANT, NUM_READINGS, 0.0, jax.random.split(jax.random.key(0), 9))
+    corners = eqx.tree_at(lambda body: body.params, drawn, safety.params)
+    for frequency in (0.08, 0.12, 0.15, 0.2):
+        bang = Square(amplitude=24.0, frequency=frequency)
+        shape = 200, NUM_READINGS
+        runs = run_batch(corners, bang, rules, shape, safety, safety.start())
+        assert float(runs.max_abs_output.max()) < CRITICAL
+        assert (np.asarray(runs.num_interventions) > 10).all()
+        assert (np.asarray(runs.trip) == int(Trip.NONE)).all()
+
+
+# ------------------------------------------------------------------- what else may happen
+
+
+def test_a_policy_whose_network_overflows_ends_the_experiment(tmp_path):
+    policy = read_policy(shipped_policies()["aero2"])
+    *inner, (matrix, bias) = policy.weights
+    last = np.full_like(matrix, 3e38), np.full_like(bias, 3e38)
+    broken = dataclasses.replace(policy, weights=(*inner, last))
+    outcome, _ = experiment(tmp_path / "a.csv", ScriptedRig(), PolicyPlayer(broken))
+    assert outcome.trip == Trip.INPUT_NOT_FINITE
+
+
+def test_an_input_that_comes_a_sample_late_is_not_applied(tmp_path):
+    class Slow(ScriptedPlayer):
+        def __call__(self, k, measured):
+            if k == 4:
+                time.sleep(0.25)
+                return np.array([24.0])
+            return np.array([1.0])
+
+    rig = ScriptedRig()
+    rig.is_real_time = True
+    outcome, _ = experiment(tmp_path / "a.csv", rig, Slow())
+    assert outcome.trip == Trip.DEADLINES
+    assert "write 24" not in rig.log
+
+
+def test_readings_that_come_before_their_time_are_refused(tmp_path):
+    class Hasty(ScriptedRig):
+        is_real_time = True
+
+        def open(self):
+            super().open()
+            self.pacer.wait = lambda: 0.0
+
+    outcome, _ = experiment(tmp_path / "a.csv", Hasty(), ScriptedPlayer(num_steps=40))
+    assert "before they are due" in outcome.reason
+
+
+@pytest.mark.parametrize("clock", [0.9, 1.1])
+def test_a_clock_that_leaves_the_plan_ends_the_experiment(tmp_path, clock):
+    rig = ScriptedRig(clock=clock)
+    outcome, _ = experiment(tmp_path / "a.csv", rig, ScriptedPlayer(num_steps=80))
+    assert outcome.trip == Trip.DURATION
+
+
+def test_a_reading_of_another_shape_is_an_error_of_the_rig(tmp_path):
+    class Wide(ScriptedRig):
+        def read(self):
+            time, outputs = super().read()
+            return Reading(time, np.append(outputs, 0.0) if self.num_read > 5 else outputs)
+
+    outcome, _ = experiment(tmp_path / "a.csv", Wide())
+    assert "has 1 outputs" in outcome.reason
+    assert len(read_record(tmp_path / "a.csv", AERO).inputs) >= 2
+
+
+def test_a_full_disk_does_not_lose_the_reason(tmp_path, monkeypatch):
+    def full(path, content):
+        raise ValueError(f"{path}: cannot be written (No space left on device)")
+
+    path = tmp_path / "a.csv"
+    with ScriptedRig() as rig, Recorder(path, AERO, {}) as recorder:
+        monkeypatch.setattr(base, "write_bytes", full)
+        before = path.with_suffix(".json").stat().st_size
+        run(rig, ScriptedPlayer(), Supervision.of(AERO), recorder)
+    assert ended(path)["reason"] == "complete"
+    assert path.with_suffix(".json").stat().st_size <= before
+
+
+def test_a_record_is_never_a_folder(tmp_path):
+    path = tmp_path / "a.csv"
+    path.mkdir()
+    with pytest.raises(ValueError, match="is a folder"):
+        Recorder(path, AERO, {}, overwrite=True)
+    assert not path.with_suffix(".json").exists()
 
 
 # ------------------------------------------------------------------------------ kill -9

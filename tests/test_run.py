@@ -207,7 +207,8 @@ def test_a_rig_that_is_not_released_hides_no_outcome(call):
 def test_a_filter_says_how_often_it_intervened(call):
     code, out, _ = call(*SIGNAL, *FAST, "--filter", "--json")
     assert code == 0
-    assert json.loads(out)["player"] == {"filter_interventions": 0}
+    quiet = {"filter_interventions": 0, "filter_without_safe_input": 0}
+    assert json.loads(out)["player"] == quiet
 
 
 # ------------------------------------------------------------------------- without JAX
@@ -232,7 +233,7 @@ sys.meta_path.insert(0, Absent())
 
 def bare(folder, *words):
     """`excite run` on a computer that has NumPy and little else."""
-    (folder / "hook").mkdir()
+    (folder / "hook").mkdir(exist_ok=True)
     (folder / "hook" / "sitecustomize.py").write_text(NOTHING_ELSE)
     source = Path(excite.__file__).parent.parent
     places = (folder / "hook", TESTS / "standin", source)
@@ -248,8 +249,12 @@ JAX_IS_MISSING = "JAX is not installed: the live estimate and the filter are off
 
 @pytest.mark.parametrize("words", [("--policy", "aero2-ppo-all"), SIGNAL])
 def test_a_laboratory_computer_runs_without_jax(call, tmp_path, words):
-    words = ("--rig", "quanser", *words, "--out", "r.csv", "--steps", 20, "--json")
+    words = ("--rig", "quanser", *words, "--out", "r.csv", "--steps", 20, "--json", "--overwrite")
     done = bare(tmp_path, *words)
+    for _ in range(4):  # a computer that runs tests may lose a deadline
+        if '"trip": "deadlines"' not in done.stdout:
+            break
+        done = bare(tmp_path, *words)
     assert done.stderr.startswith(JAX_IS_MISSING)
     assert done.returncode == 0, done.stdout
     told = json.loads(done.stdout)

@@ -16,6 +16,7 @@ import pytest
 import scipy.stats
 from cluster import Cluster, wait_for
 
+from excite.benchmark import table
 from excite.benchmark.base import seed_folder, study_of
 from excite.benchmark.run import _live, opened, run_study
 from excite.benchmark.table import (
@@ -28,7 +29,7 @@ from excite.benchmark.table import (
 from excite.cli.study import _require_trainer
 from excite.engine import local_engine
 from excite.policy import read_policy
-from excite.study import read_study
+from excite.study import read_study, study_from
 
 TINY = """
 name = "tiny"
@@ -190,6 +191,22 @@ def test_the_best_seed_is_chosen_on_validation_episodes(run):
             for s in range(2)
         ]
         assert returns[best]["return"] == max(r["return"] for r in returns)
+
+
+def test_a_gradient_seed_that_is_worth_more_but_unsafe_is_not_the_best(tmp_path, monkeypatch):
+    looks = [
+        {"steps": 9.0, "return": -1.0, "worth": 20.0, "violation_rate": 0.0},
+        {"steps": 9.0, "return": 5.0, "worth": 22.0, "violation_rate": 0.3},
+    ]
+    study = study_from(
+        {
+            "name": "x", "plant": "aero2", "seeds": 2, "estimators": {"nls": {"kind": "nls"}},
+            "agents": {"A": {"method": "gradient"}},
+        },
+        "x",
+    )  # fmt: skip
+    monkeypatch.setattr(table, "_metrics", lambda *key: {"validation": looks[key[-1]]})
+    assert best_seeds(study, tmp_path) == {"A": 0}
 
 
 # Interruption

@@ -21,9 +21,9 @@ The floor plan, from left to right; a module imports only what stands left of it
     design         robust and clairvoyant signals by gradient, classical ones tuned
     study          every choice of a comparison and of its agents, read from a TOML file
     engine         processes of this computer, or a Dask cluster
-    benchmark      methods and agents x estimators on common plants and noise
     rig            experiments in real time: contract, loop, record; simulated and real rigs
     identification from recorded experiments to parameters with confidence
+    benchmark      methods and agents x estimators on common plants and noise
     report         records to tables and figures
     export         a policy as ONNX, for other tools
     cli            the command line

@@ -51,17 +51,20 @@ def evaluate(
     def episode(key: PRNGKeyArray) -> Episodes:
         params_key, episode_key = jax.random.split(key)
         params = draw_params(plant, params_key, spread)
-        trajectory = run_episode(plant, params, excitation, num_steps, episode_key)
-        information = experiment_information(plant, params, trajectory.inputs)
-        true = jnp.stack(params)
-        relative = relative_size(plant, params) / jnp.abs(true)
-        return Episodes(
-            params=params,
-            trajectory=trajectory,
-            is_violation=is_violation(trajectory.outputs, critical_levels(plant.definition)),
-            max_abs_output=max_abs_output(trajectory.outputs),
-            information=information,
-            bound=cramer_rao_bound(information) * relative,
-        )
+        return scored(plant, params, run_episode(plant, params, excitation, num_steps, episode_key))
 
     return jax.vmap(episode)(keys)
+
+
+def scored(plant: AbstractPlant, params: Params, trajectory: Trajectory) -> Episodes:
+    """One experiment, and how informative and how safe it was."""
+    information = experiment_information(plant, params, trajectory.inputs)
+    relative = relative_size(plant, params) / jnp.abs(jnp.stack(params))
+    return Episodes(
+        params=params,
+        trajectory=trajectory,
+        is_violation=is_violation(trajectory.outputs, critical_levels(plant.definition)),
+        max_abs_output=max_abs_output(trajectory.outputs),
+        information=information,
+        bound=cramer_rao_bound(information) * relative,
+    )

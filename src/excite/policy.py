@@ -125,13 +125,18 @@ def observe(xp: Any, layout: Layout, window: Window, k: AnyArray) -> AnyArray:
     return xp.concatenate(parts).astype(xp.float32)
 
 
-def forward(xp: Any, weights: Weights, observation: AnyArray) -> AnyArray:
-    """Action in [-1, 1]: hyperbolic tangents, a linear last layer, clipped; 0 if not finite."""
+def network(xp: Any, weights: Weights, observation: AnyArray) -> AnyArray:
+    """Hyperbolic tangents and a linear last layer."""
     x = observation
     for matrix, bias in weights[:-1]:
         x = xp.tanh(matrix @ x + bias)
     matrix, bias = weights[-1]
-    action = matrix @ x + bias
+    return matrix @ x + bias
+
+
+def forward(xp: Any, weights: Weights, observation: AnyArray) -> AnyArray:
+    """Action in [-1, 1]: what the network says, clipped; 0 if not finite."""
+    action = network(xp, weights, observation)
     return xp.where(xp.isfinite(action), xp.clip(action, -1.0, 1.0), 0.0)
 
 

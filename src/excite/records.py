@@ -188,6 +188,8 @@ def require_record_path(path: Path, overwrite: bool) -> None:
     _require_record_ending(path)
     if not path.parent.is_dir():
         raise ValueError(f"{path}: the folder {path.parent} does not exist")
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder; choose another name")
     sidecar = path.with_suffix(".json")
     if sidecar.is_file() and not _read_sidecar(path):
         raise ValueError(f"{sidecar} is no sidecar of a record and would be lost; rename one")

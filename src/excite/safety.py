@@ -120,7 +120,7 @@ _TRIPS = {
     Trip.STALE: "a measurement stood still while the plant was moving or driven",
     Trip.INPUT_NOT_FINITE: "the excitation asked for an input that is not a finite number",
     Trip.DEADLINES: "deadlines were lost",
-    Trip.DURATION: "the experiment lasted longer than allowed",
+    Trip.DURATION: "the rig's clock left the plan, too fast or too slow",
 }
 
 

@@ -9,14 +9,13 @@ the estimator's.
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import hashlib
 import json
 import math
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import equinox as eqx
@@ -29,10 +28,12 @@ from ..description import PlantDescription, display_unit, names_of
 from ..estimation import AbstractEstimator, Status, stack_experiments
 from ..evaluation import Episodes, evaluate
 from ..excitation import AbstractExcitation
-from ..files import folder_word, new_run_folder, write_json
+from ..files import folder_word
 from ..information import d_optimality, require_noise
 from ..plant import AbstractPlant
-from ..safety import watched_output
+from ..rig.prediction import SafetyFilter
+from ..rig.simulated import bodies, evaluate_on_rig, readings_per_sample
+from ..safety import Supervision, Trip, watched_output
 from ..simulation import Trajectory
 from ..study import Study, study_from
 
@@ -63,9 +64,12 @@ def episode_keys(study: Study) -> Key[Array, " episode"]:
     return jax.random.split(jax.random.key(study.seed), study.episodes)
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """All episodes of one method and one estimator, on NumPy arrays."""
+class Outcome(eqx.Module):
+    """All episodes of one method and one estimator, on NumPy arrays.
+
+    Attributes:
+        on_rig: what else happened on a simulated rig, by name; empty without one.
+    """
 
     true: Float[np.ndarray, "episode param"]
     estimated: Float[np.ndarray, "episode param"]
@@ -75,21 +79,41 @@ class Outcome:
     max_abs_output: Float[np.ndarray, "episode output"]
     bound: Float[np.ndarray, "episode param"]
     log_det: Float[np.ndarray, " episode"]
+    on_rig: Mapping[str, np.ndarray]
 
 
-def run_benchmark(study: Study, progress: Progress = lambda *_: None) -> list[dict[str, Any]]:
-    """Rows of the study's methods in order, each with all estimators."""
-    plant = study.build_plant()
-    methods, rows = study.build_methods(plant), []
-    parts = -(-study.episodes // CHUNK)
-    for m, (name, excitation) in enumerate(methods.items()):
+Play = Callable[[AbstractExcitation, Any], tuple[Episodes, dict[str, np.ndarray]]]
+"""Plays an excitation once for every key; with what else happened on a rig."""
 
-        def in_method(c: int, name: str = name, before: int = m * parts) -> None:
-            progress(name, before + c, len(methods) * parts)
 
-        rows += evaluate_method(study, plant, name, excitation, in_method)[0]
-    progress("done", len(methods) * parts, len(methods) * parts)
-    return rows
+def num_chunks(study: Study) -> int:
+    """Calls in which the episodes of one method are computed."""
+    return -(-study.episodes // CHUNK)
+
+
+def player_of(study: Study, plant: AbstractPlant) -> Play:
+    """How the study's experiments are made: on the plant, or on its simulated rig."""
+    if study.rig is None:
+        return lambda excitation, keys: (
+            evaluate(plant, excitation, study.num_steps, study.spread, keys),
+            {},
+        )
+    rules, numbers = Supervision.of(plant.description), study.rig.numbers()
+    safety = SafetyFilter.of(plant, study.spread) if study.rig.filter else None
+
+    def play(excitation: AbstractExcitation, keys: Any) -> tuple[Episodes, dict[str, np.ndarray]]:
+        many = bodies(plant, readings_per_sample(plant), study.spread, keys, **numbers)
+        on_rig = plant, excitation, many, rules, study.num_steps
+        episodes, runs = evaluate_on_rig(*on_rig)
+        seen = {"trips": runs.trip != int(Trip.NONE)}
+        if safety is not None:
+            _, runs = evaluate_on_rig(*on_rig, safety, safety.start())
+            seen["filtered_violations"] = runs.is_violation
+            seen["filtered_trips"] = runs.trip != int(Trip.NONE)
+            seen["interventions"] = runs.num_interventions
+        return episodes, {name: np.asarray(counts) for name, counts in seen.items()}
+
+    return play
 
 
 def evaluate_method(
@@ -111,15 +135,15 @@ def evaluate_method(
     middle = np.mean(plant.input_limits, axis=0)
     keys = episode_keys(study)
     outcomes: dict[str, list[Outcome]] = {e: [] for e in estimators}
-    squares = []
+    play, squares = player_of(study, plant), []
     for c, first in enumerate(range(0, study.episodes, CHUNK)):
         progress(c)
         chunk = keys[first : first + CHUNK]
-        episodes = evaluate(plant, excitation, study.num_steps, study.spread, chunk)
+        episodes, on_rig = play(excitation, chunk)
         inputs = np.asarray(episodes.trajectory.inputs) - middle
         squares.append(np.mean(inputs**2, axis=1))
         for e, estimator in estimators.items():
-            outcomes[e].append(outcome(plant, estimator, episodes))
+            outcomes[e].append(outcome(plant, estimator, episodes, on_rig))
     own = _of_method(study, plant, excitation)
     rows = [
         {**table_row(study, plant.description, (name, e), joined(parts)), **own}
@@ -146,7 +170,12 @@ def _of_method(
     return {"bound_by_length": {"num_steps": list(study.lengths), "cramer_rao_percent": percent}}
 
 
-def outcome(plant: AbstractPlant, estimator: AbstractEstimator, episodes: Episodes) -> Outcome:
+def outcome(
+    plant: AbstractPlant,
+    estimator: AbstractEstimator,
+    episodes: Episodes,
+    on_rig: Mapping[str, np.ndarray] = MappingProxyType({}),
+) -> Outcome:
     """What an estimator makes of a batch of episodes."""
     estimated, std_error, status = estimate_all(plant, estimator, episodes.trajectory)
     return Outcome(
@@ -158,13 +187,13 @@ def outcome(plant: AbstractPlant, estimator: AbstractEstimator, episodes: Episod
         max_abs_output=np.asarray(episodes.max_abs_output),
         bound=np.asarray(episodes.bound),
         log_det=np.asarray(jax.vmap(d_optimality)(episodes.information)),
+        on_rig=on_rig,
     )
 
 
 def joined(parts: list[Outcome]) -> Outcome:
     """Several batches as one."""
-    names = [field.name for field in dataclasses.fields(Outcome)]
-    return Outcome(**{n: np.concatenate([getattr(p, n) for p in parts]) for n in names})
+    return jax.tree.map(lambda *arrays: np.concatenate(arrays), *parts)
 
 
 def table_row(
@@ -175,13 +204,15 @@ def table_row(
     Args:
         names: of method and estimator.
     """
-    good = outcome.status == Status.SUCCESSFUL
+    is_tripped = outcome.on_rig.get("trips", np.zeros(len(outcome.status), bool))
+    good = (outcome.status == Status.SUCCESSFUL) & ~is_tripped
     error = (outcome.estimated / outcome.true - 1)[good]
     std_error = (outcome.std_error / np.abs(outcome.true))[good]
     violations, count = int(outcome.is_violation.sum()), len(good)
     watched = watched_output(description)
     unit, factor = display_unit(description.outputs[watched].unit)
-    reasons = [Status(s).name.lower() for s in outcome.status[~good]]
+    reasons = ["tripped"] * int(is_tripped.sum())
+    reasons += [Status(s).name.lower() for s in outcome.status[~good & ~is_tripped]]
 
     def by_name(values: Any) -> dict[str, Any]:
         return dict(zip(names_of(description.parameters), values, strict=True))
@@ -194,6 +225,7 @@ def table_row(
         "failures": {reason: reasons.count(reason) for reason in sorted(set(reasons))},
         "violations": violations,
         "violation_rate": violation_rate(violations, count),
+        **_on_rig(outcome.on_rig),
         "max_abs_output": {
             "output": description.outputs[watched].name,
             **mean_sd(factor * outcome.max_abs_output[:, watched]),
@@ -208,6 +240,11 @@ def table_row(
         "coverage95_percent": by_name(100 * _fraction(np.abs(error) < 1.959964 * std_error)),
         "beyond_6_std_errors": int(np.any(np.abs(error) > 6 * std_error, axis=1).sum()),
     }
+
+
+def _on_rig(seen: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """What a row has beside the rest where experiments were made on a simulated rig."""
+    return {"on_rig": {name: int(counts.sum()) for name, counts in seen.items()}} if seen else {}
 
 
 def _paired_log_det(study: Study, outcome: Outcome) -> dict[str, float]:
@@ -262,30 +299,6 @@ def wilson(successes: int, count: int) -> tuple[float, float]:
     return max(0.0, (centre - half) / scale), min(1.0, (centre + half) / scale)
 
 
-def write_benchmark(
-    study: Study,
-    rows: list[dict[str, Any]],
-    shown: Mapping[str, bytes],
-    path: Path,
-    overwrite: bool = False,
-) -> None:
-    """Leaves a run folder: the study, its rows as JSON, and what people look at.
-
-    Args:
-        shown: tables and figures, ready made, by file name.
-
-    Raises:
-        ValueError: where `path` holds something else, or a run and not `overwrite`.
-    """
-    with new_run_folder(path, overwrite) as folder:
-        for name, content in shown.items():
-            (folder / name).write_bytes(content)
-        write_json(folder / "table.json", {"rows": rows})
-        plant = study.build_plant().description
-        write_json(folder / "study.json", study.model_dump())
-        write_json(folder / "run.json", {"kind": "excite benchmark", "plant": plant.to_dict()})
-
-
 def seed_folder(folder: Path, agent: str, seed: int) -> Path:
     """Where a seed of an agent keeps its files."""
     return folder / "seeds" / folder_word(agent) / str(seed)
@@ -329,12 +342,6 @@ def unpacked(
                 f"({source['hash'][:8]})"
             )
         yield study, plant
-
-
-def methods_task(study: Mapping[str, Any], plant: Mapping[str, Any]) -> dict[str, Any]:
-    """Rows of a study's own methods; what a worker is called for."""
-    with unpacked(study, plant) as (chosen, _):
-        return {"rows": run_benchmark(chosen)}
 
 
 def study_of(folder: Path) -> Study:

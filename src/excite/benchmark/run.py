@@ -33,7 +33,7 @@ FREE |= {"agents", "decision", "training", "gradient", "seeds"}
 _Target = tuple[str, str, int]
 
 _TASKS = {
-    "methods": "excite.benchmark.base:methods_task",
+    "methods": "excite.benchmark.methods:methods_task",
     "clairvoyant": "excite.benchmark.clairvoyant:clairvoyant_task",
     "seed": "excite.benchmark.seeds:seed_task",
 }

@@ -16,11 +16,11 @@ from ..estimation import ARX
 from ..estimation.arx import running_params
 from ..evaluation import evaluate
 from ..excitation import PolicyExcitation
-from ..objective import InformationGain
 from ..plant import AbstractARXPlant, AbstractPlant
 from ..policy import read_policy
 from ..records import Record
 from ..study import Study
+from ..training.gradient import GradientSettings, rank
 from .base import (
     damaged,
     episode_keys,
@@ -75,6 +75,7 @@ def _with_efficiency(
     """
     params = _params(folder)
     shapes = [_row_shape(params, str, e) for e in study.estimators]
+    shapes = [{**shape, "log_det_of_clairvoyant_plants": _NUMBER} for shape in shapes]
     best = _read(folder / "clairvoyant.json", {"rows": shapes})["rows"]
     reference = best[0]["log_det_of_clairvoyant_plants"]
 
@@ -204,6 +205,7 @@ def across_seeds(metrics: list[dict[str, Any]], estimator: int) -> dict[str, Any
         "failures": _sums([r["failures"] for r in rows]),
         "violations": violations,
         "violation_rate": violation_rate(violations, evaluations),
+        **({"on_rig": _sums([r["on_rig"] for r in rows])} if "on_rig" in rows[0] else {}),
         "max_abs_output": {
             **rows[0]["max_abs_output"],
             **_mean_sd([r["max_abs_output"]["mean"] for r in viable]),
@@ -319,13 +321,18 @@ def finished_table(folder: Path) -> dict[str, Any]:
 def best_seeds(study: Study, folder: Path) -> dict[str, int]:
     """By agent, the seed that was worth most in the validation episodes.
 
-    By the objective where training tells it, else by the return.
+    By the objective among those that are safe enough where training tells it, else by the
+    return, which counts safety.
     """
 
-    def value(agent: str, seed: int) -> float:
-        look = _metrics(study, folder, agent, seed)["validation"]
-        reward = look.get("worth", look["return"])
-        return -math.inf if math.isnan(reward) else reward
+    def value(agent: str, seed: int) -> tuple[float, float]:
+        look, training = (
+            _metrics(study, folder, agent, seed)["validation"],
+            study.agent(agent).training,
+        )
+        if isinstance(training, GradientSettings) and "worth" in look:
+            return rank(training, look)
+        return 0.0, -math.inf if math.isnan(look["return"]) else look["return"]
 
     seeds = range(study.seeds)
     return {a: max(seeds, key=lambda seed, a=a: value(a, seed)) for a in study.agents}
@@ -386,15 +393,3 @@ def _running(
         if isinstance(estimator, ARX) and isinstance(plant, AbstractARXPlant):
             return name, np.asarray(running_params(estimator, plant, inputs, measured))
     return "", np.full((len(measured), len(names_of(plant.definition.parameters))), np.nan)
-
-
-def bound_curves(study: Study) -> list[str]:
-    """Agents whose learning curves hold the Cramér-Rao bound in the place of errors."""
-    plant = study.build_plant()
-    return [
-        name
-        for name in study.agents
-        if isinstance(
-            study.agent(name).env(plant, study.spread, study.num_steps).objective, InformationGain
-        )
-    ]

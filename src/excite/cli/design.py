@@ -51,7 +51,9 @@ from .door import (
 )
 @click.option("--spread", type=float, default=0.3, show_default=True, help="Of the parameters.")
 @click.option("--noise", type=NUMBERS, multiple=True, help="An output's noise, in its unit.")
-@click.option("--seed", type=WholeNumber(0), default=0, show_default=True, help="Of the search.")
+@click.option(
+    "--seed", type=WholeNumber(0, 2**63 - 2), default=0, show_default=True, help="Of the search."
+)
 @click.option("--starts", type=WholeNumber(1), default=4, show_default=True, help="Of the search.")
 @click.option("--updates", type=WholeNumber(1), help="Steps of the search, or trials of a tuning.")
 @plot_option
@@ -69,6 +71,8 @@ def design(
 
     from ..design import signal_env
     from ..evaluation import evaluate
+    from ..excitation import Replay
+    from ..information import require_noise
     from ..names import plant_named, with_sensor
     from ..records import require_record_path, write_record
     from ..report import episode_figure, save
@@ -77,15 +81,17 @@ def design(
     if not 0 <= options["spread"] < 1:
         raise ValueError(f"--spread must lie in [0, 1): got {options['spread']:g}")
     chosen = with_sensor(plant_named(plant), merged(options["noise"]), {})
+    require_noise(chosen)
     env = signal_env(chosen, options["steps"], options["spread"], options["criterion"])
     is_nominal = options["kind"] == "clairvoyant"
     if is_nominal:  # the plant is known, what an experiment is worth stays the same
         env = dataclasses.replace(env, spread=0.0)
     with progress_bar(f"designing for {plant}") as progress:
-        inputs, found, played = _designed(env, options, lambda i, n: progress("", i, n))
+        inputs, found, tuned = _designed(env, options, lambda i, n: progress("", i, n))
     count = 1 if is_nominal else 1000
     keys = jax.random.split(jax.random.key(options["seed"] + 1), count)
-    judged = evaluate(chosen, played, options["steps"], float(env.spread), keys)
+    # The file is played as it stands, whatever closed a loop or drew numbers to make it.
+    judged = evaluate(chosen, Replay(inputs), options["steps"], float(env.spread), keys)
     information = np.linalg.slogdet(np.asarray(judged.information))[1]
     description = chosen.description
     record = _record(chosen, inputs, found)
@@ -109,9 +115,13 @@ def design(
             f"log det {summary['log_det_information']:.2f}, {summary['violations']} violations on "
             + ("the nominal plant" if is_nominal else f"{count} fresh plants")
         )
-        if "options" in found:
-            settings = ",".join(f"{k}={json.dumps(v)}" for k, v in found["options"].items())
-            click.echo(f"the same: --excitation {options['kind']} --set {settings}")
+        if tuned is not None:
+            settings = ",".join(f"{k}={json.dumps(v)}" for k, v in tuned.options.items())
+            click.echo(
+                f"as an excitation, drawn or closed anew each time: --excitation "
+                f"{tuned.excitation} --set {settings}; {tuned.violations} violations on "
+                f"{tuned.episodes} fresh plants"
+            )
 
 
 def _record(plant: Any, inputs: Any, found: dict[str, Any]) -> Any:
@@ -132,7 +142,7 @@ def _record(plant: Any, inputs: Any, found: dict[str, Any]) -> Any:
 
 
 def _designed(env: Any, options: dict[str, Any], report: Any) -> tuple[Any, dict[str, Any], Any]:
-    """Inputs, how they were found, and the excitation to be judged."""
+    """Inputs, how they were found, and the tuned excitation they are of, if they are."""
     import dataclasses
 
     import jax
@@ -140,7 +150,6 @@ def _designed(env: Any, options: dict[str, Any], report: Any) -> tuple[Any, dict
 
     from ..design import clairvoyant_signals, robust_signal
     from ..design.optimal import CLAIRVOYANT, ROBUST
-    from ..excitation import Replay
 
     kind, seed, updates = options["kind"], options["seed"], options["updates"]
     found = {"design": kind, "criterion": options["criterion"], "seed": seed}
@@ -155,7 +164,7 @@ def _designed(env: Any, options: dict[str, Any], report: Any) -> tuple[Any, dict
         key = jax.random.split(jax.random.key(seed), 1)
         made = clairvoyant_signals(env, key, options["starts"], settings, report)
     inputs, by_start = jnp.asarray(made.inputs[0]), made.worth_by_start[0]
-    return inputs, {**found, "worth_by_start": by_start.tolist()}, Replay(inputs)
+    return inputs, {**found, "worth_by_start": by_start.tolist()}, None
 
 
 def _tuned(
@@ -185,4 +194,6 @@ def _tuned(
     played: Any = excitation_named(kind, best.options, plant)
     key = jax.random.key(options["seed"])
     run = run_episode(plant, plant.nominal, played, env.layout.num_steps, key)
-    return run.inputs, {**found, "options": dict(best.options), "trials": trials}, played
+    own = {"violations": best.violations, "evaluations": best.episodes}
+    found |= {"options": dict(best.options), "trials": trials, "as_excitation": own}
+    return run.inputs, found, best

@@ -46,6 +46,12 @@ from .door import (
     help="Where the search begins; default the nominal parameters.",
 )
 @click.option(
+    "--hold",
+    type=NUMBERS,
+    multiple=True,
+    help="Known values, not to be estimated: tau=0.162.",
+)
+@click.option(
     "--validate",
     "validation",
     type=OUT_FILE,
@@ -78,6 +84,8 @@ def identify(
     Several records are fitted together: they share the parameters, each has an initial
     state of its own.
     """
+    import dataclasses
+
     from ..estimation import NLS
     from ..files import require_free_run_folder
     from ..identification import identify as run
@@ -89,8 +97,12 @@ def identify(
     if out is not None:
         require_free_run_folder(out, options["overwrite"])
     chosen, method = plant_named(options["plant"]), estimator_named(options["estimator"])
-    if options["start"] and not isinstance(method, NLS):
-        raise ValueError(f"{method.name} does not search and takes no --start")
+    for name in ("start", "hold"):
+        if options[name] and not isinstance(method, NLS):
+            raise ValueError(f"{method.name} estimates all at once and takes no --{name}")
+    held = merged(options["hold"])
+    if held:
+        method = dataclasses.replace(method, hold=tuple(held))
     mapping = merged(options["column"]), merged(options["scale"])
     records = [read_record(file, chosen.description, *mapping) for file in files]
     held_out = [read_record(file, chosen.description, *mapping) for file in options["validation"]]
@@ -99,7 +111,7 @@ def identify(
             chosen,
             records,
             method,
-            start=merged(options["start"]),
+            start={**merged(options["start"]), **held},
             initial_state=options["initial_state"],
             validation=held_out,
         )

@@ -65,6 +65,8 @@ def policies(as_json: bool) -> None:
 @click.option("--spread", type=float, default=0.3, show_default=True, help="Of the parameters.")
 @click.option("--noise", type=NUMBERS, multiple=True, help="An output's noise, in its unit.")
 @click.option("--estimators", metavar="NAME,...", help="Default nls, and arx-rls where it can.")
+@click.option("--rig", "on_rig", is_flag=True, help="On the plant's simulated rig.")
+@click.option("--filter", "filtered", is_flag=True, help="There, once more behind a safety filter.")
 @json_option
 @computing
 def evaluate(policy: str, as_json: bool, **options: Any) -> None:
@@ -88,6 +90,8 @@ def _study(policy: str, options: dict[str, Any]) -> Any:
     from ..policy import policy_path, read_policy, shipped_policies
     from ..study import study_from
 
+    if options["filtered"] and not options["on_rig"]:
+        raise ValueError("--filter is a part of a rig; it needs --rig")
     path = policy_path(policy)
     if path is None:
         raise unknown("policy", policy, [*shipped_policies(), "path/to/policy.safetensors"])
@@ -105,6 +109,7 @@ def _study(policy: str, options: dict[str, Any]) -> Any:
             "sensor": {n: {"noise_sd": sd} for n, sd in merged(options["noise"]).items()},
             "methods": {Path(policy).stem: {"excitation": policy}},
             "estimators": {kind: {"kind": kind} for kind in kinds},
+            "rig": {"filter": options["filtered"]} if options["on_rig"] else None,
         },
         "evaluate",
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-import time
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,11 +39,25 @@ class Job:
     player: AbstractPlayer
     name: str
 
-    def metadata(self) -> dict[str, Any]:
+    def metadata(self, options: dict[str, Any]) -> dict[str, Any]:
         """What the sidecar says before the experiment."""
+        import numpy as np
+
         from .. import __version__
 
-        return {"provenance": {"excite": __version__, "played": self.name, **self.player.facts()}}
+        rig, asked = self.rig, ("rig", "address", "slew", "filtered", "spread", "seed", "fault")
+        return {
+            "starts_at_initial_state": rig.starts_at_rest,
+            "provenance": {
+                "excite": __version__,
+                "numpy": np.__version__,
+                "played": self.name,
+                **self.player.origin(),
+                **{name: options[name] for name in asked},
+                "num_readings": rig.num_readings,
+                "num_latency": rig.num_latency,
+            },
+        }
 
     def check_latency(self) -> None:
         """Raises ValueError where a step of the player takes too long for the sampling time."""
@@ -69,6 +83,14 @@ def job_from(options: dict[str, Any], has_jax: bool) -> Job:
     policy, name = (None, "") if options["signal"] else _policy(options)
     plant, rig = _rig(options, policy, has_jax)
     d = rig.description
+    if plant is not None and not _fits(plant.description, d):
+        if options["plant"] or options["filtered"]:
+            raise ValueError(
+                f"the rig is of {d.name!r}, with other inputs, outputs, levels or another "
+                f"sampling time than the plant {plant.description.name!r}: --plant and --filter "
+                "need the rig's"
+            )
+        plant = None
     if policy is not None:
         try:
             warning = mismatch(policy, d)
@@ -83,6 +105,16 @@ def job_from(options: dict[str, Any], has_jax: bool) -> Job:
         raise ValueError(f"{name} was made for {player.num_steps} steps; --steps asks for {steps}")
     player.num_steps = steps
     return Job(rig, plant, make, player, name or str(options["signal"]))
+
+
+def _fits(plant: PlantDescription, rig: PlantDescription) -> bool:
+    """Whether a filter and a live estimate for the plant may look at the rig."""
+
+    def seen(d: PlantDescription) -> Any:
+        inputs = [(i.name, i.lower, i.upper) for i in d.inputs]
+        return d.dt, inputs, [(o.name, o.critical_level) for o in d.outputs]
+
+    return seen(plant) == seen(rig)
 
 
 def _policy(options: dict[str, Any]) -> tuple[Any, str]:
@@ -142,10 +174,10 @@ def _described(policy: Any) -> PlantDescription:
 def _simulated(options: dict[str, Any], plant: Any) -> AbstractRig:
     import jax
 
-    from ..rig.simulated import Body, SimulatedRig
+    from ..rig.simulated import Body, SimulatedRig, readings_per_sample
     from .door import merged
 
-    num_readings = max(1, round(500 * float(plant.dt)))
+    num_readings = readings_per_sample(plant)
     faults = merged(options["fault"])
     for name, value in faults.items():
         if name not in ("latency", "jitter", "dropout") or not 0 <= value < 1:
@@ -192,7 +224,8 @@ def _maker(
         raise ValueError("--filter needs JAX, which is not installed")
     from ..rig.prediction import FilteredPlayer, SafetyFilter
 
-    filter = SafetyFilter.of(plant, options["spread"])
+    slew = float("inf") if options["slew"] is None else options["slew"]
+    filter = SafetyFilter.of(plant, options["spread"], slew)
     return lambda: FilteredPlayer(bare(), filter)
 
 
@@ -202,18 +235,26 @@ class LiveView:
     def __init__(self, description: PlantDescription, tracker: Any, num_steps: int) -> None:
         """`tracker` may be None."""
         self._description, self._tracker = description, tracker
-        self._duration, self._shown = num_steps * description.dt, -1.0
-        self._is_on = sys.stderr.isatty()
+        self._duration, self._latest = num_steps * description.dt, None
+        self._end = threading.Event()
+        # A terminal may stop taking what is written to it; the loop must not wait for that.
+        self._thread = threading.Thread(target=self._draw, daemon=True)
+        if sys.stderr.isatty():
+            self._thread.start()
 
     def __call__(self, sample: Sample) -> None:
-        """Draws now and then; keeps the estimate going."""
+        """Keeps the estimate going; the sample is drawn now or later."""
         if self._tracker is not None:
             self._tracker(sample)
-        now = time.perf_counter()
-        if self._is_on and now - self._shown > _SHOWN_EVERY:
-            self._shown = now
-            sys.stderr.write("\r\x1b[2K" + self.line(sample))
-            sys.stderr.flush()
+        self._latest = sample
+
+    def _draw(self) -> None:
+        shown = None
+        while not self._end.wait(_SHOWN_EVERY):
+            if (sample := self._latest) is not None and sample is not shown:
+                sys.stderr.write("\r\x1b[2K" + self.line(sample))
+                sys.stderr.flush()
+                shown = sample
 
     def line(self, sample: Sample) -> str:
         """What is shown of a sample."""
@@ -229,7 +270,9 @@ class LiveView:
 
     def end(self) -> None:
         """Leaves the line."""
-        if self._is_on:
+        self._end.set()
+        if self._thread.is_alive():
+            self._thread.join(1.0)
             sys.stderr.write("\n")
 
 

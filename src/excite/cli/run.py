@@ -27,6 +27,7 @@ _EXIT_CODES = {
     "interrupted by SIGINT": 130,
     "interrupted": 130,  # by a second Ctrl-C
     "interrupted by SIGTERM": 143,
+    "interrupted by SIGHUP": 129,
 }
 
 
@@ -95,7 +96,7 @@ def run(out: Path | None, overwrite: bool, dry_run: bool, as_json: bool, **optio
     job.check_latency()
     tracker = _tracker(job, has_jax)
     view = LiveView(job.rig.description, tracker, job.player.num_steps)
-    recorder = Recorder(out, job.rig.description, job.metadata(), overwrite)
+    recorder = Recorder(out, job.rig.description, job.metadata(options), overwrite)
     outcome = None
     try:
         with interruptible() as stop, job.rig, recorder as record:
@@ -109,9 +110,11 @@ def run(out: Path | None, overwrite: bool, dry_run: bool, as_json: bool, **optio
         with contextlib.suppress(OSError, ValueError):
             recorder.end(outcome.to_dict())
     finally:
-        view.end()
-        if tracker is not None:
-            tracker.close()
+        # The record is complete: nothing of what shows it may change how the command ends.
+        with contextlib.suppress(Exception, KeyboardInterrupt):
+            view.end()
+            if tracker is not None:
+                tracker.close()
     _show(job, outcome, tracker, out, as_json)
     return 0 if outcome.is_complete else _EXIT_CODES.get(outcome.reason, 1)
 
@@ -126,22 +129,25 @@ def _has_jax() -> bool:
 
 
 def _tracker(job: Job, has_jax: bool) -> Any:
-    if not has_jax:
+    if not has_jax or job.plant is None:
         return None
     from ..rig.tracking import Tracker
 
-    return Tracker(job.plant, job.player.num_steps)
+    return Tracker(job.plant, job.player.num_steps, job.rig.starts_at_rest)
 
 
 def _show_dry_run(job: Job, rules: Any, as_json: bool) -> int:
     """What the player would send on a plant that stays at rest: all of a signal."""
     import numpy as np
 
+    from ..safety import Watch, allowed
+
     d, rest = job.rig.description, np.zeros(len(job.rig.description.outputs))
-    inputs = []
+    inputs, watch = [], Watch.start(np, rules, rest)
     for k in range(job.player.num_steps):
-        inputs.append(np.clip(job.player(k, rest), rules.lower, rules.upper))
-        job.player.applied(inputs[-1])
+        watch, input = allowed(np, rules, watch, job.player(k, rest))
+        job.player.applied(input)
+        inputs.append(input)
     sent = np.array(inputs)
     summary = {
         "played": job.name, "num_steps": len(sent), "dt": d.dt,
@@ -183,7 +189,9 @@ def _show(job: Job, outcome: Any, tracker: Any, out: Path, as_json: bool) -> Non
         shown = ", ".join(f"{p} %: {v:.3g}" for p, v in late.items())
         rows.append(["readings late, ms", f"{shown}; {outcome.num_missed} deadlines missed"])
     if "filter_interventions" in outcome.player:
-        rows.append(["filter interventions", str(outcome.player["filter_interventions"])])
+        unsafe = outcome.player["filter_without_safe_input"]
+        told = f"; at {unsafe} samples no input was safe for every plant" if unsafe else ""
+        rows.append(["filter interventions", f"{outcome.player['filter_interventions']}{told}"])
     true = outcome.rig.get("true_params", {})
     for name, (value, half) in estimate.items():
         told = f"; true {true[name]:.5g}" if name in true else ""

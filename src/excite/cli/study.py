@@ -141,7 +141,6 @@ def _finish(chosen: Any, folder: Path) -> None:
     """Writes the table and the figures into the run folder."""
     from ..benchmark.table import (
         best_seeds,
-        bound_curves,
         example_episodes,
         learning_curves,
         study_table,
@@ -173,7 +172,7 @@ def _finish(chosen: Any, folder: Path) -> None:
     if chosen.agents:
         plant = chosen.build_plant().description
         learnt = learning_curves(chosen, folder)
-        curves = curves_figure(plant, learnt, title, bound_curves(chosen))
+        curves = curves_figure(plant, learnt, title, chosen.bound_curves())
         episodes = agents_figure(plant, example_episodes(chosen, folder), title)
         shown |= {"curves.png": image(curves, "png"), "episodes.png": image(episodes, "png")}
         content["best_seeds"] = best_seeds(chosen, folder)

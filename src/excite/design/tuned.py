@@ -105,13 +105,18 @@ def tuned_signal(
     study.enqueue_trial(_usual(plant, num_steps))
     study.optimize(objective, n_trials=trials)
     fresh, judged = jax.random.split(judging, 1000), []
-    for trial in sorted(study.trials, key=lambda t: -(t.value or 0.0))[:NUM_FINALISTS]:
+    for trial in sorted(study.trials, key=_cost)[:NUM_FINALISTS]:
         options = trial.user_attrs["options"]
         value, violations = scored(options, fresh, 1.0)
         judged.append(Tuned(excitation, options, value, violations, len(fresh), trials))
         if violations == 0:
             break
     return min(judged, key=lambda tuned: tuned.violations)
+
+
+def _cost(trial: Any) -> float:
+    """What is sorted by: a trial without a value comes last."""
+    return np.inf if trial.value is None else -trial.value
 
 
 def _usual(plant: AbstractPlant, num_steps: int) -> dict[str, Any]:
@@ -123,6 +128,7 @@ def _usual(plant: AbstractPlant, num_steps: int) -> dict[str, Any]:
     low, high = (min(max(f, 1 / (num_steps * d.dt)), nyquist) for f in d.band)
     return {
         **amplitudes, "amplitude": 0.5, "gain": 1.0, "damping": 1.0, "hold": 1, "clock": 1,
+        "register": 0,
         "start_frequency": low, "stop_frequency": high, "frequency": (low * high) ** 0.5,
         "logarithmic": False, "pump": 0.3,
     }  # fmt: skip
@@ -179,7 +185,10 @@ _HOLDS = (1, 2, 3, 5, 8, 12, 20, 35, 60)
 
 _OPTIONS: Mapping[str, Callable[[Any, AbstractPlant, int], dict[str, Any]]] = {
     "random": lambda trial, plant, _: {"hold": trial.suggest_categorical("hold", _HOLDS)},
-    "prbs": lambda trial, plant, _: {"clock": trial.suggest_categorical("clock", _HOLDS)},
+    "prbs": lambda trial, plant, _: {
+        "clock": trial.suggest_categorical("clock", _HOLDS),
+        "register": trial.suggest_categorical("register", (0, 6, 7, 8, 9, 10, 11)),
+    },
     "chirp": lambda trial, plant, num_steps: {
         **_band(trial, plant, num_steps),
         "logarithmic": trial.suggest_categorical("logarithmic", (False, True)),

@@ -29,7 +29,10 @@ from .base import (
 MIN_SWINGS = 3
 """Half swings that a decay must show."""
 
-SMALL_GAIN = 1e-6
+MIN_PEAK = 8.0
+"""Standard deviations of the sensor that a peak of the decay must have; below is its noise."""
+
+SMALL = 1e-6
 
 
 class Line(eqx.Module):
@@ -71,26 +74,25 @@ class Decrement(AbstractEstimator):
         if len(experiments.inputs) != 1:
             raise ValueError(f"'decrement' takes one record: got {len(experiments.inputs)}")
         rate, frequency, count = _decay(plant, experiments)
-        sigma, omega = -rate.slope, jnp.pi / frequency.slope
-        c_0, c_1 = omega**2 + sigma**2, 2 * sigma
-        # So small a gain keeps the response linear, and that is all it is for.
-        unit = plant.from_transfer_function(c_0, c_1, jnp.asarray(SMALL_GAIN))
-        response = simulate_experiments(plant, unit, experiments, experiments.initial_state)
-        response = jnp.where(experiments.valid[..., None], response, 0.0)
-        power = jnp.sum(response**2)
-        gain = jnp.sum(response * experiments.measured) / power
-        residual = residual_of(experiments, gain * response)
-        variance_omega = frequency.variance * (jnp.pi / frequency.slope**2) ** 2
-        spread = jnp.stack([variance_omega, rate.variance, jnp.mean(residual**2) / power])
+        poles = jnp.stack([jnp.pi / frequency.slope, -rate.slope])
+        variance = jnp.stack(
+            [frequency.variance * (jnp.pi / frequency.slope**2) ** 2, rate.variance]
+        )
+        gain, response = _gain(plant, experiments, poles)
+        # What the poles' errors do to the gain; the gain's own error comes on top.
+        slope = jax.jacfwd(lambda poles: _gain(plant, experiments, poles)[0].slope)(poles)
+        mixing = jnp.concatenate([jnp.eye(2), slope[None]])
+        own = jnp.zeros((3, 3)).at[2, 2].set(gain.variance)
+        spread = (mixing * variance[None]) @ mixing.T + own
 
-        def physical(poles: Float[Array, "3"]) -> Float[Array, " param"]:
-            omega, sigma, gain = poles
+        def physical(found: Float[Array, "3"]) -> Float[Array, " param"]:
+            omega, sigma, gain = found
             squares = omega**2 + sigma**2
-            return jnp.stack(plant.from_transfer_function(squares, 2 * sigma, SMALL_GAIN * gain))
+            return jnp.stack(plant.from_transfer_function(squares, 2 * sigma, SMALL * gain))
 
-        found = jnp.stack([omega, sigma, gain])
-        slope = jax.jacfwd(physical)(found)
-        covariance = (slope * spread[None]) @ slope.T
+        found = jnp.concatenate([poles, gain.slope[None]])
+        to_params = jax.jacfwd(physical)(found)
+        covariance = to_params @ spread @ to_params.T
         params = plant.Params(*physical(found))
         status = status_of(plant, params, jnp.asarray(Status.SUCCESSFUL))
         return Estimate(
@@ -99,8 +101,37 @@ class Decrement(AbstractEstimator):
             information=relative_information(plant, params, covariance),
             status=jnp.where(count < MIN_SWINGS, Status.ILL_CONDITIONED, status),
             initial_state=experiments.initial_state,
-            residual=residual,
+            residual=residual_of(experiments, response),
         )
+
+
+def _gain(
+    plant: AbstractARXPlant, experiments: Experiments, poles: Float[Array, "2"]
+) -> tuple[Line, Float[Array, "1 sample output"]]:
+    """The gain that fits the whole response best, and the response.
+
+    Where the initial state is not known, the free response to it is fitted along.
+    """
+    omega, sigma = poles
+    c_0, c_1 = omega**2 + sigma**2, 2 * sigma
+    # So small a gain keeps the response linear, and that is all it is for.
+    unit = plant.from_transfer_function(c_0, c_1, jnp.asarray(SMALL))
+    columns = [simulate_experiments(plant, unit, experiments, experiments.initial_state)]
+    if not experiments.initial_state_known:
+        silent = eqx.tree_at(lambda e: e.inputs, experiments, 0 * experiments.inputs)
+        rest = plant.initial_state
+        columns = [simulate_experiments(plant, unit, experiments, rest[None])]
+        columns += [
+            simulate_experiments(plant, unit, silent, (rest + SMALL * away)[None])
+            for away in jnp.eye(len(rest))
+        ]
+    seen = experiments.valid[0]
+    X = jnp.stack([jnp.where(seen, column[0, :, 0], 0.0) for column in columns], axis=1)
+    inverse = jnp.linalg.inv(X.T @ X)
+    factors = inverse @ (X.T @ jnp.where(seen, experiments.measured[0, :, 0], 0.0))
+    response = (X @ factors)[None, :, None]
+    power = jnp.sum(residual_of(experiments, response) ** 2) / jnp.sum(seen)
+    return Line(factors[0], power * inverse[0, 0]), response
 
 
 def _decay(plant: AbstractPlant, experiments: Experiments) -> tuple[Line, Line, Array]:
@@ -118,12 +149,16 @@ def _decay(plant: AbstractPlant, experiments: Experiments) -> tuple[Line, Line, 
     times = plant.dt * (index[:-1] + fraction)
     number = jnp.cumsum(crossing)
     swing = jnp.concatenate([jnp.zeros(1, number.dtype), number])  # of every sample
-    is_whole = is_free & (swing >= 1) & (swing < number[-1])
-    peaks = jax.ops.segment_max(jnp.where(is_whole, jnp.abs(y), 0.0), swing, len(y))
+    peaks = jax.ops.segment_max(jnp.where(is_free, jnp.abs(y), 0.0), swing, len(y))
+    # The decay ends with the last half swing before the first that sinks into the noise.
+    is_low = (peaks < MIN_PEAK * plant.sensor.sd[0]) & (jnp.arange(len(y)) >= 1)
+    last_swing = jnp.minimum(jnp.argmax(is_low), number[-1])
+    is_whole = is_free & (swing >= 1) & (swing < last_swing)
     is_peak = is_whole & (jnp.abs(y) == peaks[swing]) & (y != 0)
+    crossing = crossing & (number <= last_swing)
     top, when = _vertex(jnp.abs(y))
     rate = _line((index + when) * plant.dt, jnp.log(jnp.where(is_peak, top, 1.0)), is_peak)
-    return rate, _line(number.astype(float), times, crossing), number[-1] - 1
+    return rate, _line(number.astype(float), times, crossing), last_swing - 1
 
 
 def _vertex(y: Float[Array, " sample"]) -> tuple[Array, Array]:

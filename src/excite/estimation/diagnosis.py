@@ -5,6 +5,8 @@ Everything here runs once, after a fit, on NumPy arrays; nothing is differentiat
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import scipy.special
 from jaxtyping import Float
@@ -41,6 +43,50 @@ def ljung_box(*residuals: Float[np.ndarray, " _sample"], num_lags: int = 25) -> 
         statistic += float(n * (n + 2) * np.sum(r**2 / (n - lags)))
         degrees += len(lags)
     return float(scipy.special.chdtrc(degrees, statistic)) if degrees else float("nan")
+
+
+def input_dependence(
+    residuals: Sequence[Float[np.ndarray, " _sample"]],
+    inputs: Sequence[Float[np.ndarray, "_sample input"]],
+    num_lags: int = 20,
+    order: int = 10,
+) -> float:
+    """p-value of the hypothesis that the residuals of some records do not follow past inputs.
+
+    What follows the input is not noise: the structure of the model is wrong (cross-correlation
+    test, L. Ljung, System Identification, 2nd ed. 1999, section 16.6). An autoregression is
+    fitted to each residual first, and takes the residual's own memory from it and from the
+    inputs, so that coloured noise alone is no reason. Not a number for residuals of zeros.
+    """
+    statistic, degrees = 0.0, 0
+    for residual, record in zip(residuals, inputs, strict=True):
+        centred, past = residual - residual.mean(), min(order, residual.size // 20)
+        lags = min(num_lags, residual.size // 10)
+        own = _lagged(centred[:, None], past)
+        memory = np.linalg.lstsq(own[past:], centred[past:], rcond=None)[0]
+        white = (centred - own @ memory)[past + lags :]
+        filtered = record - sum(
+            (memory[i] * _lagged(record, i + 1)[:, -record.shape[1] :] for i in range(past)),
+            start=np.zeros_like(record),
+        )
+        regressors = _lagged(filtered, lags)[past + lags :]
+        left, sizes, _ = np.linalg.svd(regressors - regressors.mean(axis=0), full_matrices=False)
+        seen = left[:, sizes > 1e-6 * max(sizes[0], 1e-300)]
+        power = float(np.mean((white - white.mean()) ** 2))
+        if power > 0:
+            statistic += float(np.sum((seen.T @ white) ** 2)) / power
+            degrees += seen.shape[1]
+    return float(scipy.special.chdtrc(degrees, statistic)) if degrees else float("nan")
+
+
+def _lagged(
+    values: Float[np.ndarray, "sample part"], num_lags: int
+) -> Float[np.ndarray, "sample column"]:
+    """Values 1, 2, ... samples before each sample, side by side; zero before the first."""
+    padded = np.concatenate([np.zeros((num_lags, values.shape[1])), values])
+    starts = range(num_lags - 1, -1, -1)
+    columns = [padded[start : start + len(values)] for start in starts]
+    return np.concatenate(columns, axis=1) if columns else np.zeros((len(values), 0))
 
 
 def chance_of_fit(

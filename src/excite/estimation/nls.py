@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
+from ..description import names_of
 from ..information import marginal_information, relative_size, require_double_precision
 from ..plant import AbstractPlant, Params
 from .base import (
@@ -41,11 +42,13 @@ class NLS(AbstractEstimator):
         tolerance: of the last search, in search coordinates and relative to the residual;
             the first searches stop at 0.1.
         max_steps: of each search.
+        hold: names of parameters that are known: they stay where the search starts.
     """
 
     horizons: tuple[float, ...] = eqx.field(static=True, default=(0.08, 0.16, 0.32, 0.6, 1.0))
     tolerance: float = eqx.field(static=True, default=1e-5)
     max_steps: int = eqx.field(static=True, default=200)
+    hold: tuple[str, ...] = eqx.field(static=True, default=())
     name: str = eqx.field(static=True, default="nls", kw_only=True)
 
     @eqx.filter_jit
@@ -58,9 +61,22 @@ class NLS(AbstractEstimator):
     ) -> Estimate:
         """Estimate; the initial states are estimated along unless they are known."""
         require_double_precision()
+        others = ~jnp.asarray(self.held(plant))
+        free = others if free is None else free & others
         problem = _Problem(plant, experiments, plant.nominal if start is None else start, free)
         unknowns, converged = self._search(problem)
         return problem.estimate(unknowns, converged)
+
+    def held(self, plant: AbstractPlant) -> tuple[bool, ...]:
+        """Which parameters of a plant are held; ValueError for a name it does not have."""
+        names = names_of(plant.definition.parameters)
+        for name in self.hold:
+            if name not in names:
+                raise ValueError(
+                    f"plant {plant.definition.name!r} has no parameter {name!r} to hold; it has "
+                    f"{', '.join(names)}"
+                )
+        return tuple(name in self.hold for name in names)
 
     @eqx.filter_jit
     def sensitivity(

@@ -44,6 +44,7 @@ class Identification:
             or held at a bound that they reached.
         covariance, information: of the estimates; see `excite.estimation.Estimate`.
         whiteness: by output, p-value of the residual being white (Ljung-Box).
+        structure: by output, p-value of the residual not following past inputs.
         verdict: sentences on what the data can see and how far to trust the intervals.
         fitted, validation: records beside their simulation.
         initial_state_known: whether initial states were taken as known.
@@ -58,6 +59,7 @@ class Identification:
     covariance: Float[np.ndarray, "param param"]
     information: Float[np.ndarray, "param param"]
     whiteness: Mapping[str, float]
+    structure: Mapping[str, float]
     verdict: tuple[str, ...]
     fitted: tuple[Fitted, ...]
     validation: tuple[Fitted, ...]
@@ -111,6 +113,7 @@ class Identification:
             "initial_state": "known" if self.initial_state_known else "free",
             "correlation": correlation(self.covariance),
             "whiteness_p_value": dict(self.whiteness),
+            "structure_p_value": dict(self.structure),
             "verdict": list(self.verdict),
         }
 

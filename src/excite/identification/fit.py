@@ -24,6 +24,7 @@ from ..estimation.diagnosis import (
     chance_of_fit,
     fit_percent,
     identifiability,
+    input_dependence,
     ljung_box,
     robust_covariance,
     widened,
@@ -66,7 +67,7 @@ def identify(
 
     Raises:
         ValueError: for records too short, of different sampling times, or in which no
-            parameter can be seen, and for a start that is not allowed.
+            parameter can be seen, and for a start or a held value that is not allowed.
     """
     estimator = NLS() if estimator is None else estimator
     known = initial_state == "known" or (
@@ -84,7 +85,12 @@ def identify(
         name: _whiteness([r[:, i] for r in residual], plant.definition.outputs[i].scale)
         for i, name in enumerate(names_of(plant.definition.outputs))
     }
+    structure = {
+        name: _dependence(residual, records, i, plant.definition.outputs[i].scale)
+        for i, name in enumerate(whiteness)
+    }
     covariance, verdict = _confidence(plant, experiments, estimator, fit, whiteness)
+    verdict = (*(_wrong_structure(structure) if fit.is_successful else ()), *verdict)
     verdict += tuple(s for record in [*records, *validation] for s in _other_plant(record, plant))
     names, d = names_of(plant.definition.parameters), plant.description
     sd = np.where(fit.free, np.sqrt(np.maximum(np.diag(covariance), 0.0)), np.nan)
@@ -98,6 +104,7 @@ def identify(
         covariance=covariance,
         information=np.asarray(fit.estimate.information),
         whiteness=whiteness,
+        structure=structure,
         verdict=verdict,
         fitted=fitted,
         validation=tuple(_validated(plant, record, fit.estimate.params) for record in validation),
@@ -152,12 +159,22 @@ def _experiments(plant: AbstractPlant, records: Sequence[Record], known: bool) -
     return stack_experiments(plant, inputs, [jnp.asarray(r.outputs) for r in records], known)
 
 
+def _known(plant: AbstractPlant, estimator: AbstractEstimator) -> np.ndarray:
+    """Which parameters the estimator holds because they are known; ValueError where all are."""
+    names = names_of(plant.definition.parameters)
+    held = estimator.held(plant) if isinstance(estimator, NLS) else (False,) * len(names)
+    if all(held):
+        raise ValueError("every parameter is held; nothing is left to estimate")
+    return np.array(held)
+
+
 @dataclass(frozen=True)
 class _Fit:
-    """An estimate, which parameters were free, and a sentence for each held one."""
+    """An estimate, which parameters were free or known, and a sentence for each held one."""
 
     estimate: Estimate
     free: np.ndarray
+    known: np.ndarray
     reasons: tuple[str, ...]
 
     @property
@@ -166,20 +183,24 @@ class _Fit:
 
     @property
     def status(self) -> str:
-        if self.is_successful and not self.free.all():
+        if self.is_successful and not (self.free | self.known).all():
             return "partly identifiable"
         return Status(int(self.estimate.status)).name.lower().replace("_", " ")
 
 
 def _fit(
-    plant: AbstractPlant, experiments: Experiments, estimator: AbstractEstimator, start: Params
+    plant: AbstractPlant,
+    experiments: Experiments,
+    estimator: AbstractEstimator,
+    start: Params,
 ) -> _Fit:
     """Fits; holds what ends at a bound or cannot be seen, and fits again."""
     names = names_of(plant.definition.parameters)
-    free, reasons = np.ones(len(names), bool), ()
+    known = _known(plant, estimator)
+    free, reasons = ~known, ()
     while True:
         estimate = estimator(plant, experiments, start, jnp.asarray(free))
-        fit = _Fit(estimate, free, reasons)
+        fit = _Fit(estimate, free, known, reasons)
         # ARX estimates all parameters or none.
         if not isinstance(estimator, NLS) or estimate.status == Status.NOT_FINITE:
             return fit
@@ -272,6 +293,27 @@ def _fitted(description: PlantDescription, record: Record, residual: np.ndarray)
 def _whiteness(residuals: list[np.ndarray], scale: float) -> float:
     """p-value of white residuals; not a number where only rounding is left of them."""
     return ljung_box(*(r for r in residuals if np.abs(r).max() > 1e-8 * scale))
+
+
+def _dependence(
+    residual: Sequence[np.ndarray], records: Sequence[Record], output: int, scale: float
+) -> float:
+    """p-value of an output's residual not following the input; see `_whiteness`."""
+    pairs = [(r[:, output], record.inputs) for r, record in zip(residual, records, strict=True)]
+    pairs = [(r, inputs) for r, inputs in pairs if np.abs(r).max() > 1e-8 * scale]
+    return input_dependence([r for r, _ in pairs], [inputs for _, inputs in pairs])
+
+
+def _wrong_structure(structure: Mapping[str, float]) -> tuple[str, ...]:
+    """A sentence where a residual follows the input."""
+    wrong = [name for name, p in structure.items() if p < _WHITE]
+    if not wrong:
+        return ()
+    return (
+        f"the residual of {' and '.join(wrong)} follows the input: the structure of this plant is "
+        "wrong for these data, or time, input or sensor are not what it takes them for; no "
+        "interval covers that",
+    )
 
 
 def _require_explanation(

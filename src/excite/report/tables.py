@@ -20,7 +20,9 @@ def table_header(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     for name in rows[0]["relative_error_percent"]:
         header += [f"{name} error %", "bound %"]
     header += [f"max {largest['output']} {largest['unit']}", "violations (95 %)", "failed"]
-    header += ["log det", "D-efficiency"] if "d_efficiency" in rows[0] else []
+    header += _rig_cells(rows[0]).keys()
+    header += ["log det"] if "log_det_information" in rows[0] else []
+    header += ["D-efficiency"] if "d_efficiency" in rows[0] else []
     return [*header, "viable seeds", "training"] if "seeds" in rows[0] else header
 
 
@@ -37,10 +39,25 @@ def table_cells(row: Mapping[str, Any]) -> list[str]:
     count = f"{row['violations']}/{row['evaluations']} ({100 * low:.1f}–{100 * high:.1f} %)"
     largest = row["max_abs_output"]
     failed = f"{row['failed']}/{row['evaluations']}"
-    cells += [mean_sd(largest["mean"], largest["sd"]), count, failed]
+    cells += [mean_sd(largest["mean"], largest["sd"]), count, failed, *_rig_cells(row).values()]
+    if "log_det_information" in row:
+        cells.append(number(row["log_det_information"], 4))
     if "d_efficiency" in row:
-        cells += [number(row.get("log_det_information"), 4), number(row["d_efficiency"], 2)]
+        cells.append(number(row["d_efficiency"], 2))
     return [*cells, *_training_cells(row)] if "seeds" in row else cells
+
+
+def _rig_cells(row: Mapping[str, Any]) -> dict[str, str]:
+    """What happened on a simulated rig, by the column's title; nothing without one."""
+    seen, count = row.get("on_rig"), row["evaluations"]
+    if seen is None:
+        return {}
+    cells = {"trips": f"{seen['trips']}/{count}"}
+    if "interventions" in seen:
+        cells["violations, filter"] = f"{seen['filtered_violations']}/{count}"
+        cells["trips, filter"] = f"{seen['filtered_trips']}/{count}"
+        cells["interventions"] = f"{number(seen['interventions'] / count)} an experiment"
+    return cells
 
 
 def _training_cells(row: Mapping[str, Any]) -> list[str]:
@@ -58,7 +75,8 @@ def reference_cells(row: Mapping[str, Any], reference: Mapping[str, Any]) -> lis
         published = reference["relative_error_percent"].get(name)
         cells += ["–" if published is None else mean_sd(*published), "–"]
     cells += [mean_sd(*reference["max_abs_output"]), reference["violations"], "–"]
-    cells += ["–", "–"] if "d_efficiency" in row else []
+    cells += ["–"] * len(_rig_cells(row))
+    cells += ["–"] * sum(key in row for key in ("log_det_information", "d_efficiency"))
     return [*cells, reference.get("viable_seeds") or "–", "–"] if "seeds" in row else cells
 
 
@@ -110,10 +128,17 @@ def footnotes(study: Mapping[str, Any]) -> list[str]:
             "exploration noise."
         )
     if study.get("clairvoyant"):
+        count = min(study["clairvoyant"]["plants"], study["episodes"])
         notes.append(
             "log det is that of the relative Fisher information. The D-efficiency compares it, on "
-            f"the first {study['clairvoyant']['plants']} plants, with signals designed for each "
-            "plant as if its parameters were known: 1 is what no experiment can beat."
+            f"the first {count} plants, with signals designed for each plant as if its parameters "
+            "were known: 1 is what no experiment can beat."
+        )
+    if study.get("rig"):
+        notes.append(
+            "Experiments were made on the plant's simulated rig, with its latency and jitter, "
+            "watched by the supervisor; one that it ended (a trip) has no estimate. Columns with "
+            "a filter are of the same experiments behind the predictive safety filter."
         )
     if study.get("ours"):
         notes.append("Ours, other than the source: " + "; ".join(study["ours"]) + ".")
@@ -143,6 +168,8 @@ def benchmark_csv(rows: Sequence[Mapping[str, Any]]) -> str:
     for key in ("viable_seeds", "seeds", "train_seconds"):
         if key in rows[0]:
             columns[key] = [math.nan if row[key] is None else row[key] for row in rows]
+    for key in rows[0].get("on_rig", {}):
+        columns[key] = [row["on_rig"][key] for row in rows]
     for key in ("log_det_information", "log_det_information_sd", "d_efficiency"):
         if key in rows[0]:
             columns[key] = [row.get(key, math.nan) for row in rows]

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import abc
 import contextlib
+import os
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -23,10 +24,11 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from ..description import PlantDescription
-from ..files import write_json
+from ..files import json_text, write_bytes
 from ..policy import (
     Policy,
     empty_window,
+    network,
     observe,
     scaled_action,
     with_input,
@@ -34,6 +36,8 @@ from ..policy import (
 )
 from ..records import RECORD_KIND, require_record_path
 from ..safety import safe_input
+
+_RESERVE = 16_384  # spaces in a sidecar, in whose place its end is written on a full disk
 
 
 class RigError(Exception):
@@ -78,12 +82,14 @@ class AbstractRig(abc.ABC):
         num_latency: readings from a write to its action, less than `num_readings`. A record
             holds the reading at the action, so that its inputs change when it says.
         is_real_time: whether its time is that of the wall.
+        starts_at_rest: whether the plant is at its initial state when the rig is open.
     """
 
     description: PlantDescription
     num_readings: int = 1
     num_latency: int = 0
     is_real_time: bool = True
+    starts_at_rest: bool = False
 
     @abc.abstractmethod
     def open(self) -> None:
@@ -142,7 +148,7 @@ class Pacer:
         self._count = -1
 
     def wait(self) -> float:
-        """Returns at the next instant, or at once where it is over; its time since the first."""
+        """Returns at the next instant, or at once where it is over; the time since the first."""
         self._count += 1
         if self._count == 0:
             self._start = time.perf_counter()
@@ -150,7 +156,7 @@ class Pacer:
         while (left := self._start + due - time.perf_counter()) > 0:
             # A sleep ends late by up to a tenth of a millisecond: the last part is waited awake.
             time.sleep(left - 2e-4 if left > 4e-4 else 0)
-        return due
+        return time.perf_counter() - self._start
 
 
 class AbstractPlayer(abc.ABC):
@@ -169,6 +175,10 @@ class AbstractPlayer(abc.ABC):
     def applied(self, input: np.ndarray) -> None:
         """Called with the input that was applied in its place."""
         del input
+
+    def origin(self) -> dict[str, Any]:
+        """Where its inputs come from, JSON-ready; before the experiment."""
+        return {}
 
     def facts(self) -> dict[str, Any]:
         """What a record should say of it, JSON-ready; after the end of an experiment."""
@@ -200,14 +210,18 @@ class PolicyPlayer(AbstractPlayer):
     def __call__(self, k: int, measured: np.ndarray) -> np.ndarray:
         """The network's input for the window that ends with this measurement."""
         self._window = with_measurement(np, self._layout, self._window, measured)
-        action = self._policy(observe(np, self._layout, self._window, k))
-        return scaled_action(np, self._layout, action.astype(float))
+        observation = observe(np, self._layout, self._window, k)
+        with np.errstate(over="ignore", invalid="ignore"):
+            action = network(np, self._policy.weights, observation).astype(float)
+        # Clipping leaves alone what is no number: the supervisor ends the experiment for it.
+        infinite = np.where(np.isfinite(action), action, np.nan)
+        return scaled_action(np, self._layout, np.clip(infinite, -1.0, 1.0))
 
     def applied(self, input: np.ndarray) -> None:
         """The window remembers what was applied."""
         self._window = with_input(np, self._layout, self._window, input)
 
-    def facts(self) -> dict[str, Any]:
+    def origin(self) -> dict[str, Any]:
         """The policy's hash."""
         return {"policy_hash": self._policy.hash}
 
@@ -243,11 +257,13 @@ class Recorder:
         require_record_path(path, overwrite)
         if path.suffix.lower() != ".csv":
             raise ValueError(f"{path}: an experiment is recorded as .csv, line by line")
+        if "clock" in description.columns:
+            raise ValueError("no input or output may be called 'clock': a record has its own")
         self._path, self._description = path, description
         self._metadata = {
             "plant": description.to_dict(),
             "plant_hash": description.hash,
-            "starts_at_initial_state": True,
+            "starts_at_initial_state": False,
             **metadata,
             "kind": RECORD_KIND,
             "dt": description.dt,
@@ -255,10 +271,12 @@ class Recorder:
         self.num_samples = 0
 
     def __enter__(self) -> Self:
-        """Writes the sidecar and the header."""
-        self._write_sidecar({"ended": None})
-        self._file = self._path.open("wb", buffering=0)  # a line is one call, whole or not at all
+        """Writes the sidecar and the header; what was there before stays where one cannot."""
+        # A line is one call, whole or not at all.
+        self._file = self._path.open("ab", buffering=0)
         try:
+            self._write_sidecar({"ended": None}, _RESERVE)
+            self._file.truncate(0)
             self._line([*self._description.columns, "clock"])
         except BaseException:
             self._file.close()
@@ -277,8 +295,17 @@ class Recorder:
         self.num_samples += 1
 
     def end(self, ended: Mapping[str, Any]) -> None:
-        """Says in the sidecar how the experiment ended."""
-        self._write_sidecar({"ended": dict(ended)})
+        """Says in the sidecar how the experiment ended, on a full disk as well."""
+        try:
+            self._write_sidecar({"ended": dict(ended)})
+        except ValueError:
+            text = json_text({**self._metadata, "ended": dict(ended)}).encode()
+            with self._path.with_suffix(".json").open("r+b") as file:
+                if len(text) > file.seek(0, os.SEEK_END):
+                    raise
+                file.seek(0)
+                file.write(text)
+                file.truncate()
 
     def __exit__(self, *_: object) -> None:
         """Closes the file."""
@@ -290,5 +317,6 @@ class Recorder:
             self._file.truncate(before)  # half a line would spoil all others
             raise OSError(f"{self._path}: the disk is full")
 
-    def _write_sidecar(self, more: Mapping[str, Any]) -> None:
-        write_json(self._path.with_suffix(".json"), {**self._metadata, **more})
+    def _write_sidecar(self, more: Mapping[str, Any], reserve: int = 0) -> None:
+        text = json_text({**self._metadata, **more}) + " " * reserve + "\n"
+        write_bytes(self._path.with_suffix(".json"), text.encode())

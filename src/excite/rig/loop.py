@@ -94,16 +94,20 @@ class Stop:
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[Stop]:
-    """SIGINT and SIGTERM end an experiment at its next reading; a second SIGINT at once."""
+    """Signals end an experiment at its next reading; a second one at once.
+
+    Also the one that a terminal sends when it is closed.
+    """
     stop, before = Stop(), {}
 
     def ask(number: int, _: object) -> None:
-        if stop.reason and number == signal.SIGINT:
+        if stop.reason:
             raise KeyboardInterrupt
         stop.reason = f"interrupted by {signal.Signals(number).name}"
 
-    for number in (signal.SIGINT, signal.SIGTERM):
-        before[number] = signal.signal(number, ask)
+    for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK"):
+        if (number := getattr(signal, name, None)) is not None:
+            before[number] = signal.signal(number, ask)
     try:
         yield stop
     finally:
@@ -155,6 +159,12 @@ class _Run:
 
     def look(self, reading: Reading) -> None:
         """What the supervisor sees in a reading, and in when it came."""
+        expected = self.rules.critical.shape
+        if np.shape(reading.outputs) != expected:
+            raise RigError(
+                f"a reading of this plant has {expected[0]} outputs: got an array of shape "
+                f"{np.shape(reading.outputs)}"
+            )
         elapsed = reading.time - self.last.time
         self.watch = check_reading(np, self.rules, self.watch, reading.outputs, elapsed)
         self.last = reading
@@ -166,14 +176,27 @@ class _Run:
             self._look_at_clock()
         self.num_readings += 1
 
-    def _look_at_clock(self) -> None:
+    def lateness(self) -> float:
+        """How long the next reading has been due [s]."""
         interval = self.rules.dt / self.rig.num_readings
-        late = time.perf_counter() - self.start - self.num_readings * interval
+        return time.perf_counter() - self.start - self.num_readings * interval
+
+    def _look_at_clock(self) -> None:
+        interval, late = self.rules.dt / self.rig.num_readings, self.lateness()
+        if late < -self.rules.dt:
+            raise RigError(
+                f"readings come {-late:.3g} s before they are due: in real time `read` must wait"
+            )
         self.outcome.late.append(late)
         self.num_late = self.num_late + 1 if late > interval else 0
         self.outcome.num_missed += late > interval
         # A whole sample late, or late in a row for as long as one: the plan no longer holds.
         if late > self.rules.dt or self.num_late > max(self.rig.num_readings, 2):
+            self.trip(Trip.DEADLINES)
+
+    def look_at_player(self) -> None:
+        """Whether an input comes so late that it was meant for another state."""
+        if self.rig.is_real_time and self.lateness() > self.rules.dt:
             self.trip(Trip.DEADLINES)
 
     def record(
@@ -265,19 +288,21 @@ def _play(
         run.watch = check_sample(np, run.rules, run.watch)
         is_last = k == player.num_steps
         proposed = rig.safe_input if is_last or run.is_over else player(k, run.last.outputs)
+        run.look_at_player()
         run.watch, input = allowed(np, run.rules, run.watch, proposed)
         rig.write(input)
         if not is_last:
             player.applied(input)
             run.outcome.num_samples = k + 1
         for i in range(rig.num_readings + 1):
-            if i == latency or run.is_over:
+            if i == latency:
                 run.record(recorder, on_sample, k, input)
             if run.is_over or (is_last and i == latency):
                 return
             if i < rig.num_readings:
                 run.look(rig.read())
-        if run.time > 1.1 * (player.num_steps + 1) * run.rules.dt:
+        planned = (k + 1) * run.rules.dt
+        if abs(run.time - planned) > 0.02 * planned + 2 * run.rules.dt:
             run.trip(Trip.DURATION)
 
 

@@ -1,10 +1,11 @@
 """A predictive safety filter: the smallest change of an input that keeps every plant safe.
 
-An input may pass if, after it, a known feedback can bring every plant of a set, the
-corners of the prior and its middle, to rest without reaching the limit (K. Wabersich,
-M. Zeilinger, A predictive safety filter for learning-based control, Automatica 2021, with
-a fixed backup law). Otherwise it is moved towards what that feedback would do, as little
-as is enough. Every plant of the set follows the experiment with an observer of its own.
+An input may pass if, after it, one known feedback brings every plant of a set, the corners
+of the prior and its middle, to rest without reaching the limit (K. Wabersich, M. Zeilinger,
+A predictive safety filter for learning-based control, Automatica 2021, with a fixed backup
+law). Otherwise it is moved towards what that feedback would do, as little as is enough.
+Every plant of the set follows the experiment with an observer of its own; the feedback,
+which cannot know which of them is the true one, takes the mean of what they ask for.
 
 Feedback and observers are linear-quadratic, from a linearisation over the typical size of
 each state: a derivative at rest would see nothing but a dead zone.
@@ -13,6 +14,7 @@ each state: a derivative at rest would see nothing but a dead zone.
 from __future__ import annotations
 
 import itertools
+import math
 from typing import Any
 
 import equinox as eqx
@@ -20,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ..plant import AbstractPlant, Params
 from ..safety import critical_levels, safe_input
@@ -29,6 +31,20 @@ from .base import AbstractPlayer
 
 MAX_CORNERS = 16
 """Of the prior's box; beyond, as many are drawn at random."""
+
+
+class Memory(eqx.Module):
+    """What a filter remembers of an experiment.
+
+    Attributes:
+        states: of the plants of its set, as their observers see them.
+        input: that it let through last.
+        num_unsafe: samples at which no input was safe for all plants.
+    """
+
+    states: Float[Array, "plant state"]
+    input: Float[Array, " input"]
+    num_unsafe: Int[Array, ""]
 
 
 class SafetyFilter(eqx.Module):
@@ -40,6 +56,7 @@ class SafetyFilter(eqx.Module):
         feedback: of the backup law u = rest - K (x - x_rest).
         observer: gain of the observers.
         rest: input at rest.
+        slew: largest change of an input from sample to sample, infinite for any.
         level: outputs beyond this fraction of their critical levels are not allowed.
         horizon: samples in which the backup law must have turned every plant around.
         num_candidates: inputs tried between the proposed one and the backup law's.
@@ -50,52 +67,69 @@ class SafetyFilter(eqx.Module):
     feedback: Float[Array, "input state"]
     observer: Float[Array, "state output"]
     rest: Float[Array, " input"]
-    level: float = eqx.field(static=True, default=0.95)
-    horizon: int = eqx.field(static=True, default=16)
+    slew: Float[Array, " input"]
+    level: float = eqx.field(static=True, default=0.92)
+    horizon: int = eqx.field(static=True, default=24)
     num_candidates: int = eqx.field(static=True, default=3)
 
     @classmethod
-    def of(cls, plant: AbstractPlant, spread: float, **choices: Any) -> SafetyFilter:
+    def of(
+        cls, plant: AbstractPlant, spread: float, slew: float = math.inf, **choices: Any
+    ) -> SafetyFilter:
         """A filter for parameters within ± `spread` times their scale.
+
+        Args:
+            slew: largest change of every input in one second, in its unit.
 
         Raises:
             ValueError: for a plant that the backup law cannot hold.
         """
         feedback, observer = _linear_quadratic(plant)
         rest = jnp.asarray(safe_input(plant.definition))
-        return cls(plant, _corners(plant, spread), feedback, observer, rest, **choices)
+        change = jnp.full(len(rest), slew * float(plant.dt))
+        return cls(plant, _corners(plant, spread), feedback, observer, rest, change, **choices)
 
-    def start(self) -> Float[Array, "plant state"]:
-        """States before the experiment: all at rest."""
-        return jnp.tile(self.plant.initial_state, (len(self.params[0]), 1))
+    def start(self) -> Memory:
+        """Before the experiment: all at rest."""
+        states = jnp.tile(self.plant.initial_state, (len(self.params[0]), 1))
+        return Memory(states, self.rest, jnp.asarray(0))
 
     def __call__(
-        self,
-        states: Float[Array, "plant state"],
-        measured: Float[Array, " output"],
-        proposed: Float[Array, " input"],
-    ) -> tuple[Float[Array, "plant state"], Float[Array, " input"], Bool[Array, ""]]:
-        """States before the next sample, the input to apply, and whether it is another."""
-        states = jax.vmap(self._corrected, (0, 0, None))(states, self.params, measured)
-        lower, upper = self.plant.input_limits
-        wanted = jnp.clip(jnp.where(jnp.isfinite(proposed), proposed, self.rest), lower, upper)
-        backup = jnp.clip(jnp.mean(jax.vmap(self._backup)(states), axis=0), lower, upper)
+        self, memory: Memory, measured: Float[Array, " output"], proposed: Float[Array, " input"]
+    ) -> tuple[Memory, Float[Array, " input"], Bool[Array, ""]]:
+        """Memory before the next sample, the input to apply, and whether it is another.
+
+        An input that is not finite passes as it is: it is the supervisor's, who then ends the
+        experiment and says why. So does one that no observer can tell any more.
+        """
+        states = jax.vmap(self._corrected, (0, 0, None))(memory.states, self.params, measured)
+        wanted = self._within(proposed, memory.input)
+        backup = self._within(self._backup(states), memory.input)
         share = jnp.linspace(0.0, 1.0, self.num_candidates)[:, None]
         candidates = wanted[None] + share * (backup - wanted)[None]
-        reach = jax.vmap(self._reach, (0, None))(candidates, states)
-        is_safe = reach < self.level
-        # The first that is safe; where none is, the one that stays furthest away.
-        best = jnp.where(jnp.any(is_safe), jnp.argmax(is_safe), jnp.argmin(reach))
+        is_safe = jax.vmap(self._reach, (0, None))(candidates, states) < self.level
+        # The first that is safe; where none is, what the backup law does.
+        best = jnp.where(jnp.any(is_safe), jnp.argmax(is_safe), self.num_candidates - 1)
         input = candidates[best]
         states = jax.vmap(self._next, (0, 0, None))(states, self.params, input)
-        return states, input, best > 0
+        memory = Memory(states, input, memory.num_unsafe + ~jnp.any(is_safe))
+        is_finite = jnp.all(jnp.isfinite(proposed))
+        return memory, jnp.where(is_finite, input, proposed), is_finite & (best > 0)
+
+    def _within(self, input: Array, before: Array) -> Array:
+        """The nearest input that limits and slew allow."""
+        return jnp.clip(
+            jnp.clip(input, before - self.slew, before + self.slew), *self.plant.input_limits
+        )
 
     def _corrected(self, state: Array, params: Params, measured: Array) -> Array:
         error = measured - self.plant.output(state, params)
         return state + self.observer @ jnp.where(jnp.isfinite(error), error, 0.0)
 
-    def _backup(self, state: Array) -> Array:
-        return self.rest - self.feedback @ (state - self.plant.initial_state)
+    def _backup(self, states: Array) -> Array:
+        """What the feedback asks for, in the mean over the plants."""
+        away = jnp.mean(states, axis=0) - self.plant.initial_state
+        return self.rest - self.feedback @ away
 
     def _next(self, state: Array, params: Params, input: Array) -> Array:
         return step(self.plant, state, input, params)
@@ -103,28 +137,26 @@ class SafetyFilter(eqx.Module):
     def _reach(self, input: Array, states: Array) -> Array:
         """Largest output over its critical level, over all plants and the horizon."""
         critical = critical_levels(self.plant.definition)
-        lower, upper = self.plant.input_limits
 
-        def one(state: Array, params: Params) -> Array:
-            def advance(carry: tuple, k: Array) -> tuple[tuple, Array]:
-                state, applied = carry
-                state = self._next(state, params, applied)
-                size = jnp.max(jnp.abs(self.plant.output(state, params)) / critical)
-                return (state, jnp.clip(self._backup(state), lower, upper)), size
+        def advance(carry: tuple, _: None) -> tuple[tuple, Array]:
+            states, applied = carry
+            states = jax.vmap(self._next, (0, 0, None))(states, self.params, applied)
+            outputs = jax.vmap(self.plant.output)(states, self.params)
+            size = jnp.max(jnp.abs(outputs) / critical[None])
+            return (states, self._within(self._backup(states), applied)), size
 
-            sizes = jax.lax.scan(advance, (state, input), jnp.arange(self.horizon))[1]
-            return jnp.max(jnp.where(jnp.isfinite(sizes), sizes, jnp.inf))
-
-        return jnp.max(jax.vmap(one)(states, self.params))
+        sizes = jax.lax.scan(advance, (states, input), None, length=self.horizon)[1]
+        return jnp.max(jnp.where(jnp.isfinite(sizes), sizes, jnp.inf))
 
 
 def _corners(plant: AbstractPlant, spread: float) -> Params:
     """The prior's middle and corners, leading axis the plant."""
     middle = np.array([float(value) for value in plant.nominal])
     reach = spread * np.array([p.scale for p in plant.definition.parameters])
-    signs = np.array(list(itertools.islice(itertools.product((-1, 1), repeat=len(reach)), 4096)))
-    if len(signs) > MAX_CORNERS:
-        signs = np.random.default_rng(0).permutation(signs)[:MAX_CORNERS]
+    if 2 ** len(reach) > MAX_CORNERS:
+        signs = np.random.default_rng(0).choice((-1, 1), (MAX_CORNERS, len(reach)))
+    else:
+        signs = np.array(list(itertools.product((-1, 1), repeat=len(reach))))
     every = np.vstack([middle, middle + signs * reach])
     return plant.Params(*(jnp.asarray(column) for column in every.T))
 
@@ -179,15 +211,15 @@ class FilteredPlayer(AbstractPlayer):
         """Compiles the filter."""
         self._player, self._filter = player, filter
         self.num_steps, self.num_interventions = player.num_steps, 0
-        self._states = filter.start()
+        self._memory = filter.start()
         outputs = jnp.zeros(len(filter.plant.definition.outputs))
-        _filtered(filter, self._states, outputs, filter.rest)
+        _filtered(filter, self._memory, outputs, filter.rest)
 
     def __call__(self, k: int, measured: np.ndarray) -> np.ndarray:
         """The input that the filter lets through."""
         proposed = jnp.asarray(self._player(k, measured), float)
-        self._states, input, is_changed = _filtered(
-            self._filter, self._states, jnp.asarray(measured), proposed
+        self._memory, input, is_changed = _filtered(
+            self._filter, self._memory, jnp.asarray(measured), proposed
         )
         self.num_interventions += int(is_changed)
         return np.array(input)
@@ -196,6 +228,12 @@ class FilteredPlayer(AbstractPlayer):
         """Tells the player."""
         self._player.applied(input)
 
+    def origin(self) -> dict[str, Any]:
+        """The player's."""
+        return self._player.origin()
+
     def facts(self) -> dict[str, Any]:
-        """The player's, and how often the filter intervened."""
-        return {**self._player.facts(), "filter_interventions": self.num_interventions}
+        """The player's, how often the filter intervened, and how often nothing was safe."""
+        own = {"filter_interventions": self.num_interventions}
+        own["filter_without_safe_input"] = int(self._memory.num_unsafe)
+        return {**self._player.facts(), **own}

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray
 
 from ..description import names_of
+from ..evaluation import Episodes, scored
 from ..excitation import AbstractExcitation
 from ..plant import AbstractPlant, Params, draw_params
 from ..safety import (
@@ -30,7 +31,7 @@ from ..safety import (
     is_violation,
     safe_input,
 )
-from ..simulation import measure, step
+from ..simulation import Trajectory, measure, step
 from .base import AbstractRig, Pacer, Reading
 
 
@@ -154,6 +155,8 @@ _write = eqx.filter_jit(Body.write)
 class SimulatedRig(AbstractRig):
     """A body behind the contract of a rig."""
 
+    starts_at_rest = True
+
     def __init__(
         self, plant: AbstractPlant, body: Body, num_readings: int, is_real_time: bool
     ) -> None:
@@ -214,7 +217,8 @@ class Runs(eqx.Module):
         is_violation: whether a critical level was reached, also after a trip.
         trip: a `Trip`.
         num_interventions: samples at which a filter changed the input.
-        inputs, measured: at sampling instants.
+        inputs: of each sampling time.
+        measured: when the inputs begin to act, and at the end; as a record has them.
     """
 
     max_abs_output: Float[Array, "*run output"]
@@ -222,7 +226,7 @@ class Runs(eqx.Module):
     trip: Int[Array, "*run"]
     num_interventions: Int[Array, "*run"]
     inputs: Float[Array, "*run time input"]
-    measured: Float[Array, "*run time output"]
+    measured: Float[Array, "*run sample output"]
 
 
 Filter = Callable[[Any, Array, Array], tuple[Any, Array, Array]]
@@ -265,8 +269,9 @@ def _one_run(
     num_steps, num_readings = shape
     filter, memory = filtering
     interval = rules.dt / num_readings
+    latency = jnp.round(body.latency / interval).astype(int)
 
-    def reading(carry: tuple, _: None) -> tuple[tuple, None]:
+    def reading(carry: tuple, _: None) -> tuple[tuple, Array]:
         state, watch = carry
         state = body.advance(state)
         was_running = watch.trip == int(Trip.NONE)
@@ -274,7 +279,14 @@ def _one_run(
         is_new = was_running & (watch.trip != int(Trip.NONE))
         safe = body.write(state, jnp.asarray(rules.safe_input, float))
         state = jax.tree.map(lambda a, b: jnp.where(is_new, a, b), safe, state)
-        return (state, watch), None
+        return (state, watch), state.shown
+
+    def hold(state: BodyState, watch: Watch, input: Array) -> tuple[tuple, Array]:
+        """The readings of one sampling time, and the one at which the input begins to act."""
+        now = state.shown
+        carry = body.write(state, input), watch
+        carry, shown = jax.lax.scan(reading, carry, None, length=num_readings)
+        return carry, jnp.concatenate([now[None], shown])[latency]
 
     def sample(carry: tuple, _: None) -> tuple[tuple, tuple]:
         state, watch, player, memory, count = carry
@@ -283,9 +295,9 @@ def _one_run(
         player, proposed = excitation(player, measured)
         memory, proposed, is_changed = filter(memory, measured, proposed)
         watch, input = allowed(jnp, rules, watch, proposed)
-        player, state = excitation.applied(player, input), body.write(state, input)
-        (state, watch), _ = jax.lax.scan(reading, (state, watch), None, length=num_readings)
-        return (state, watch, player, memory, count + is_changed), (input, measured)
+        player = excitation.applied(player, input)
+        (state, watch), acted_on = hold(state, watch, input)
+        return (state, watch, player, memory, count + is_changed), (input, acted_on)
 
     state = body.start()
     # A signal is made for the sampling time, not for the interval between two readings.
@@ -296,8 +308,11 @@ def _one_run(
     (state, watch, *_, count), (inputs, measured) = jax.lax.scan(
         sample, carry, None, length=num_steps
     )
+    trip, safe = watch.trip, jnp.asarray(rules.safe_input, float)
+    (state, _), last = hold(state, watch, safe)
+    measured = jnp.concatenate([measured, last[None]])
     is_over = is_violation(state.largest[None], jnp.asarray(rules.critical))
-    return Runs(state.largest, is_over, watch.trip, count, inputs, measured)
+    return Runs(state.largest, is_over, trip, count, inputs, measured)
 
 
 def bodies(
@@ -307,5 +322,38 @@ def bodies(
     keys: Key[Array, " run"],
     **numbers: float,
 ) -> Body:
-    """One body a key; see `Body.draw`."""
+    """One body a key, with the same plant as in `excite.evaluation`; see `Body.draw`."""
     return eqx.filter_vmap(lambda key: Body.draw(plant, num_readings, spread, key, **numbers))(keys)
+
+
+def readings_per_sample(plant: AbstractPlant) -> int:
+    """How often a simulated rig is read in one sampling time: 500 times a second."""
+    return max(1, round(500 * float(plant.dt)))
+
+
+def evaluate_on_rig(
+    plant: AbstractPlant,
+    excitation: AbstractExcitation,
+    many: Body,
+    rules: Supervision,
+    num_steps: int,
+    *filtering: Any,
+) -> tuple[Episodes, Runs]:
+    """One experiment on every body, scored as `excite.evaluation` scores those on plants.
+
+    What follows from the record (information, estimates) is that of a whole experiment, also
+    where a trip ended it; a level counts as reached at any reading.
+
+    Args:
+        many: made by `bodies`.
+        filtering: a safety filter and its memory, where there is one; see `run_batch`.
+    """
+    runs = run_batch(many, excitation, rules, (num_steps, readings_per_sample(plant)), *filtering)
+    time = jnp.arange(num_steps + 1) * plant.dt
+
+    def score(params: Params, run: Runs) -> Episodes:
+        return scored(plant, params, Trajectory(time, run.inputs, run.measured, run.measured))
+
+    episodes = jax.jit(jax.vmap(score))(many.params, runs)
+    safety = runs.is_violation, runs.max_abs_output
+    return eqx.tree_at(lambda e: (e.is_violation, e.max_abs_output), episodes, safety), runs

@@ -25,9 +25,13 @@ _FIRST = 40  # samples before the first fit, the shortest horizon of the estimat
 class Tracker:
     """Estimates of one experiment under way."""
 
-    def __init__(self, plant: AbstractPlant, num_steps: int) -> None:
-        """Compiles the estimator, which takes seconds, before the experiment begins."""
-        self._plant, self._count = plant, 0
+    def __init__(self, plant: AbstractPlant, num_steps: int, starts_at_rest: bool) -> None:
+        """Compiles the estimator, which takes seconds, before the experiment begins.
+
+        Args:
+            starts_at_rest: whether the initial state is the plant's, or to be estimated.
+        """
+        self._plant, self._starts_at_rest, self._count = plant, starts_at_rest, 0
         self._inputs = np.zeros((num_steps, len(plant.definition.inputs)))
         self._measured = np.zeros((num_steps + 1, len(plant.definition.outputs)))
         self._pool, self._fit = ThreadPoolExecutor(1), Future[Estimate]()
@@ -70,7 +74,7 @@ class Tracker:
             measured=jnp.asarray(self._measured)[None],
             valid=jnp.asarray(seen)[None],
             initial_state=self._plant.initial_state[None],
-            initial_state_known=True,
+            initial_state_known=self._starts_at_rest,
         )
         # Otherwise whoever looks at it waits for it, and that is the loop.
         return jax.block_until_ready(NLS()(self._plant, experiments))

@@ -28,6 +28,7 @@ from ..names import (
     unknown,
     with_sensor,
 )
+from ..objective import InformationGain
 from ..plant import AbstractARXPlant, AbstractPlant
 from ..policy import POLICY_ENDING
 from ..training.base import PPOSettings
@@ -71,6 +72,25 @@ class ClairvoyantSettings(Settings):
     starts: Count = 4
 
 
+class RigSettings(Settings):
+    """Experiments on the plant's simulated rig (`excite.rig.simulated`), not on the plant.
+
+    Attributes:
+        latency, jitter: of an input's action [s], by default the rig's.
+        dropout: probability that a reading repeats the one before it.
+        filter: whether every method runs once more, behind the predictive safety filter.
+    """
+
+    latency: Magnitude | None = None
+    jitter: Magnitude | None = None
+    dropout: Annotated[float, Field(ge=0, lt=1, strict=True)] | None = None
+    filter: Annotated[bool, Field(strict=True)] = False
+
+    def numbers(self) -> dict[str, float]:
+        """Those of the rig that are set."""
+        return self.model_dump(exclude={"filter"}, exclude_none=True)
+
+
 class ReferenceRow(Settings):
     """A published row of the same table: mean and standard deviation of each column."""
 
@@ -99,6 +119,7 @@ class Study(Settings):
         training, gradient: hyper-parameters of all agents trained by PPO, and by gradient.
         clairvoyant: signals to measure the methods by.
         lengths: numbers of steps at which every method's Cramér-Rao bound is computed.
+        rig: where experiments are made on a simulated rig.
         inferred: settings that the source of the study does not state, in words.
         ours: settings that differ from the source's, in words.
         reference: published rows by method, shown in tables for comparison.
@@ -122,6 +143,7 @@ class Study(Settings):
     gradient: dict[str, Any] = {}
     clairvoyant: ClairvoyantSettings | None = None
     lengths: list[Count] = []
+    rig: RigSettings | None = None
     inferred: list[str] = []
     ours: list[str] = []
     reference: dict[str, ReferenceRow] = {}
@@ -192,6 +214,14 @@ class Study(Settings):
         shared = {"ppo": self.training, "gradient": self.gradient}[own.method]
         return Agent.of(own, self.decision, shared, self.estimators)
 
+    def bound_curves(self) -> list[str]:
+        """Agents whose learning curves hold the Cramér-Rao bound in the place of errors."""
+        plant = self.build_plant()
+        envs = {
+            name: self.agent(name).env(plant, self.spread, self.num_steps) for name in self.agents
+        }
+        return [n for n, env in envs.items() if isinstance(env.objective, InformationGain)]
+
     def checked(self, where: str) -> Study:
         """Itself, checked down to every option; ValueError, naming `where`, for a mistake."""
         try:
@@ -260,6 +290,7 @@ class Study(Settings):
 _TABLES = {
     "": Study,
     "clairvoyant": ClairvoyantSettings,
+    "rig": RigSettings,
     "sensor": SensorSettings,
     "reference": ReferenceRow,
     "agents": AgentSettings,

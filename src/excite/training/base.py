@@ -226,7 +226,7 @@ def look(env: Env, weights: Weights, num_episodes: int) -> dict[str, float]:
     errors = np.asarray(seen.relative_errors).mean(axis=0)
     return {
         "return": float(np.mean(seen.total_reward)),
-        "violation_rate": float(np.mean(seen.is_violation)),
+        "violation_rate": float(np.mean(np.asarray(seen.is_violation), dtype=float)),
         "rms_action": float(np.sqrt(np.mean(np.asarray(seen.rms_action) ** 2))),
         **{f"relative_error_{n}": float(e) for n, e in zip(names, errors, strict=True)},
     }

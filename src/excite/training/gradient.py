@@ -55,7 +55,7 @@ class GradientSettings:
         penalty_weight: of the penalty, at the beginning and at least.
         near: fraction of a critical level that counts as too near to it.
         penalty_growth, penalty_decay: what is added to the weight's logarithm after a batch
-            that came too near, and taken away after another.
+            of which more than `violation_rate` came too near, and taken away after another.
         violation_rate: allowed on held-out plants.
         watch_every: updates between two looks at the policy.
         watch_episodes: episodes of such a look.
@@ -181,7 +181,7 @@ def update(
     (cost, batch), gradient = eqx.filter_value_and_grad(loss, has_aux=True)(now.player)
     gradient = jax.tree.map(lambda leaf: jnp.where(jnp.isfinite(cost), leaf, jnp.nan), gradient)
     step, adam = _optimiser(settings).update(gradient, now.adam)
-    is_near = jnp.any(batch.nearness >= settings.near)
+    is_near = jnp.mean(batch.nearness >= settings.near) > settings.violation_rate
     change = jnp.where(is_near, settings.penalty_growth, -settings.penalty_decay)
     player = eqx.apply_updates(now.player, step)
     weight = jnp.maximum(now.penalty_weight * jnp.exp(change), settings.penalty_weight)
@@ -243,7 +243,7 @@ def train_all(
             course.num_updates += 1
     best = course.best.weights
     weights = [jax.tree.map(lambda x, s=s: np.asarray(x[s]), best) for s in range(len(seeds))]
-    looks = [max(c, key=lambda row: _rank(settings, row)) for c in course.curves]
+    looks = [max(c, key=lambda row: rank(settings, row)) for c in course.curves]
     return [Trained(*parts) for parts in zip(weights, course.curves, looks, strict=True)]
 
 
@@ -315,9 +315,9 @@ def _looked(
         seen = look(env, own.player.weights, settings.watch_episodes)
         judged = _judged(env, own.player, watch_keys(settings.watch_episodes))
         curve.append({"steps": steps, **judged, **seen, **_state(own)})
-        rank = _rank(settings, curve[-1])
-        if rank > tuple(course.rank[s]):
-            course.rank[s] = rank
+        own_rank = rank(settings, curve[-1])
+        if own_rank > tuple(course.rank[s]):
+            course.rank[s] = own_rank
             course.best = jax.tree.map(
                 lambda best, x, s=s: best.at[s].set(x), course.best, own.player
             )
@@ -335,13 +335,14 @@ def _judged(env: Env, player: Network, keys: Key[Array, " plant"]) -> dict[str, 
     }
 
 
-def _rank(settings: GradientSettings, row: Mapping[str, float]) -> tuple[float, float]:
+def rank(settings: GradientSettings, row: Mapping[str, float]) -> tuple[float, float]:
     """How good a look was: the violation rate beyond the one allowed, then the worth.
 
     The first look, at a policy that learnt nothing yet, is the last choice.
     """
     too_many = max(0.0, row["violation_rate"] - settings.violation_rate)
-    return (-too_many if row["steps"] else -math.inf, row["worth"])
+    worth = -math.inf if math.isnan(row["worth"]) else row["worth"]
+    return (-too_many if row["steps"] else -math.inf, worth)
 
 
 def _optimiser(settings: GradientSettings) -> optax.GradientTransformation:

@@ -54,6 +54,7 @@ class Device:
         self.timeout, self.reloaded = math.inf, 0.0
         self.fired_at: float | None = None
         self.pitch, self.rate, self.offsets = 0.0, 0.0, np.zeros(4, np.int64)
+        self.is_held = False  # by hand
         self.mode, self.room, self.samples, self.num_lost = 0, 0, deque(), 0
         self._num_ticks, self._simulated, self._start = 0, 0.0, time.perf_counter()
 
@@ -94,7 +95,7 @@ class Device:
         first, second = self.voltages * self.enabled
         u = (first - second) / 2
         acceleration = 2 * 0.0125 * u - 0.045 * self.rate - 0.88 * math.sin(self.pitch)
-        self.rate += acceleration / RATE
+        self.rate = 0.0 if self.is_held else self.rate + acceleration / RATE
         self.pitch += self.rate / RATE
         if "task_start" in self.resources:
             if len(self.samples) == self.room:
@@ -165,6 +166,11 @@ class HIL:
         self._check(channels, num_channels, range(4), counts, np.int32)
         d = self._device
         d.offsets[channels] += counts - d.counts[channels]
+
+    def read_encoder(self, channels, num_channels, buffer):
+        self._call("read_encoder")
+        self._check(channels, num_channels, range(4), buffer, np.int32)
+        buffer[:] = self._device.counts[channels]
 
     def write_analog(self, channels, num_channels, buffer):
         self._call("write_analog", volts=buffer.tolist())
