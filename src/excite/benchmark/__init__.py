@@ -7,3 +7,5 @@ from .base import evaluate as evaluate
 from .base import run_benchmark as run_benchmark
 from .base import wilson as wilson
 from .base import write_benchmark as write_benchmark
+from .episodes import episodes_data as episodes_data
+from .episodes import example_episodes as example_episodes

@@ -16,7 +16,7 @@ from .. import __version__
 from .benchmark import benchmark
 from .design import design
 from .doctor import doctor
-from .door import RunFailedError
+from .door import RememberingGroup, RunFailedError
 from .export import export
 from .identify import identify
 from .information import information
@@ -30,7 +30,7 @@ from .train import train
 _DEBUG = "--debug"
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(cls=RememberingGroup, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="excite")
 @click.option(_DEBUG, is_flag=True, help="Show the traceback of an error.")
 def cli(debug: bool) -> None:

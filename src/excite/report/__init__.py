@@ -10,7 +10,9 @@ from .base import image as image
 from .base import number as number
 from .base import require_plot_path as require_plot_path
 from .base import save as save
+from .figures import autocorrelation_figure as autocorrelation_figure
 from .figures import benchmark_figure as benchmark_figure
+from .figures import correlation_figure as correlation_figure
 from .figures import episode_figure as episode_figure
 from .figures import episodes_figure as episodes_figure
 from .figures import identification_figure as identification_figure
@@ -23,10 +25,14 @@ from .tables import all_cells as all_cells
 from .tables import benchmark_csv as benchmark_csv
 from .tables import benchmark_latex as benchmark_latex
 from .tables import benchmark_markdown as benchmark_markdown
+from .tables import differences_cells as differences_cells
 from .tables import differences_csv as differences_csv
 from .tables import differences_markdown as differences_markdown
 from .tables import fitting_tables as fitting_tables
 from .tables import footnotes as footnotes
+from .tables import largest_correlation as largest_correlation
+from .tables import parameter_cells as parameter_cells
+from .tables import parameter_header as parameter_header
 from .tables import reference_cells as reference_cells
 from .tables import table_cells as table_cells
 from .tables import table_header as table_header
