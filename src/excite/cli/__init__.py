@@ -22,6 +22,7 @@ from .identify import identify
 from .information import information
 from .plants import plants
 from .policies import evaluate, policies
+from .report import report
 from .run import run
 from .simulate import simulate
 from .study import study
@@ -40,7 +41,7 @@ def cli(debug: bool) -> None:
 
 for command in (
     plants, policies, simulate, information, identify, design, train, evaluate, run, export,
-    benchmark, study, doctor,
+    benchmark, study, report, doctor,
 ):  # fmt: skip
     cli.add_command(command)
 

@@ -19,6 +19,7 @@ from .figures import identification_figure as identification_figure
 from .figures import information_figure as information_figure
 from .frontier import frontier_figure as frontier_figure
 from .frontier import lengths_figure as lengths_figure
+from .html import report_html as report_html
 from .study import agents_figure as agents_figure
 from .study import curves_figure as curves_figure
 from .tables import all_cells as all_cells
