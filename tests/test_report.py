@@ -7,6 +7,7 @@ import sys
 from typing import Any
 
 import matplotlib.figure
+import matplotlib.path
 import numpy as np
 import pytest
 from catalogue import TwoMasses
@@ -18,9 +19,11 @@ from excite.report import (
     PLOT_ENDINGS,
     agents_figure,
     all_cells,
+    autocorrelation_figure,
     benchmark_csv,
     benchmark_figure,
     benchmark_markdown,
+    correlation_figure,
     curves_figure,
     differences_markdown,
     digits_for,
@@ -460,6 +463,49 @@ def test_an_estimate_of_zero_can_be_drawn(tmp_path):
     result["params"]["K_pu"] |= {"estimate": 0.0, "std_error": 1.0}
     save(identification_figure(AERO2, result, record, record.outputs), tmp_path / "a.svg")
     assert (tmp_path / "a.svg").is_file()
+
+
+def test_an_ellipse_holds_95_percent_of_a_normal_distribution():
+    sd, correlation = np.array([0.02, 0.5]), np.array([[1.0, -0.8], [-0.8, 1.0]])
+    param = {"estimate": 2.0, "std_error": 0.02}
+    other = {"estimate": -5.0, "std_error": 0.5}
+    held = {"estimate": 1.0, "std_error": None}
+    result = {"params": {"a": param, "b": held, "c": other}, "correlation": np.eye(3).tolist()}
+    result["correlation"][0][2] = -0.8
+    figure = correlation_figure(result)
+    assert figure is not None
+    (axis,) = figure.axes
+    assert (axis.get_xlabel(), axis.get_ylabel()) == ("a [%]", "c [%]")
+    assert axis.get_title() == "correlation -0.800"
+    ellipse = axis.get_lines()[0].get_xydata()
+    drawn = np.random.default_rng(0).multivariate_normal(
+        np.zeros(2), correlation * np.outer(sd, sd), 20_000
+    )
+    inside = matplotlib.path.Path(ellipse).contains_points(100 * drawn / np.array([2.0, 5.0]))
+    assert inside.mean() == pytest.approx(0.95, abs=0.005)
+
+
+def test_without_a_pair_there_is_no_ellipse():
+    param = {"estimate": 2.0, "std_error": 0.02}
+    assert correlation_figure({"params": {"a": param}, "correlation": [[1.0]]}) is None
+
+
+def test_the_autocorrelation_of_white_noise_lies_between_the_dashed_lines():
+    rng = np.random.default_rng(0)
+    white = [rng.normal(size=(2000, 1)) for _ in range(2)]
+    walk = [np.cumsum(w, axis=0) for w in white]
+    for residuals, least, most in ((white, 0.9, 1.0), (walk, 0.0, 0.0)):
+        (axis,) = autocorrelation_figure(AERO2, residuals).axes
+        bars = np.array([bar[1, 1] for bar in axis.collections[0].get_segments()])
+        level = max(np.asarray(line.get_ydata(), float)[0] for line in axis.get_lines())
+        assert len(bars) == 25
+        assert level == pytest.approx(1.96 / math.sqrt(4000))
+        assert least <= np.mean(np.abs(bars) < level) <= most
+    one = walk[0][:, 0] - walk[0].mean()
+    (axis,) = autocorrelation_figure(AERO2, walk[:1]).axes
+    assert axis.collections[0].get_segments()[0][1, 1] == pytest.approx(
+        one[1:] @ one[:-1] / (one @ one)
+    )
 
 
 def test_a_figure_that_cannot_be_written_leaves_nothing(figures, tmp_path):

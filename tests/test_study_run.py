@@ -118,6 +118,26 @@ def test_a_study_leaves_tables_figures_policies_and_curves(run):
             assert list(place.glob("tensorboard/**/events*"))
 
 
+def test_a_report_needs_nothing_but_the_run_folder(run, tmp_path):
+    episodes = json.loads((run / "episodes.json").read_text())
+    assert list(episodes) == ["chirp", "RL(all)", "RL(K_pu)"]
+    seeds = {name: own["seed"] for name, own in episodes.items() if "seed" in own}
+    assert seeds == finished_table(run)["best_seeds"]
+    for own in episodes.values():
+        assert len(own["inputs"]["voltage"]) == len(own["estimate_over_true"]["J_p"]) == 61
+    about = json.loads((run / "run.json").read_text())
+    assert about["command"].endswith(f"--out {run} --workers 1")
+    assert finished_table(run)["bound_curves"] == []
+    out = tmp_path / "report.html"
+    done = excite("report", run, "--out", out)
+    assert done.returncode == 0, done.stderr
+    page = out.read_text()
+    assert "<img" not in page
+    for name, seed in seeds.items():
+        assert f">{name}, seed {seed}<" in page
+    assert about["command"] in page
+
+
 def test_rows_are_methods_then_agents_with_what_a_benchmark_row_has(run):
     content = finished_table(run)
     assert [(r["method"], r["estimator"]) for r in content["rows"]] == [

@@ -24,7 +24,7 @@ The floor plan, from left to right; a module imports only what stands left of it
     rig            experiments in real time: contract, loop, record; simulated and real rigs
     identification from recorded experiments to parameters with confidence
     benchmark      methods and agents x estimators on common plants and noise
-    report         records to tables and figures
+    report         records to tables, figures and pages
     export         a policy as ONNX, for other tools
     cli            the command line
     policies       policies that are shipped, as data

@@ -17,7 +17,7 @@ import re
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +60,56 @@ def folder_word(name: str) -> str:
 def write_json(path: Path, value: Any) -> None:
     """Writes `value` as JSON, whole or not at all."""
     write_bytes(path, (json_text(value) + "\n").encode())
+
+
+def read_json(path: Path, *keys: str, advice: str = "") -> dict[str, Any]:
+    """Content of a JSON file that was written here, an object with these keys.
+
+    Args:
+        advice: what helps where the file is damaged; it ends the message.
+
+    Raises:
+        ValueError: where it cannot be read, or holds something else.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read ({error.strerror})") from None
+    except (ValueError, RecursionError):
+        raise damaged(path, advice) from None
+    if not isinstance(content, dict) or not set(keys) <= content.keys():
+        raise damaged(path, advice)
+    return content
+
+
+def read_columns(path: Path, names: Iterable[str] = (), advice: str = "") -> dict[str, np.ndarray]:
+    """Columns of a CSV file that `csv_text` made, these among them.
+
+    Raises:
+        ValueError: where it cannot be read, or holds something else.
+    """
+    try:
+        header, *rows = (line.split(",") for line in path.read_text("utf-8").splitlines())
+        columns = dict(zip(header, np.array(rows, float).T, strict=True))
+    except (OSError, ValueError):
+        raise damaged(path, advice) from None
+    if not set(names) <= columns.keys():
+        raise damaged(path, advice)
+    return columns
+
+
+def numbers_of(value: Any) -> Any:
+    """A copy of what JSON held, None become the numbers that do not exist again."""
+    if isinstance(value, dict):
+        return {key: numbers_of(part) for key, part in value.items()}
+    if isinstance(value, list):
+        return [numbers_of(part) for part in value]
+    return math.nan if value is None else value
+
+
+def damaged(path: Path, advice: str = "") -> ValueError:
+    """The error for a file that is not as it was written, and what helps."""
+    return ValueError(f"{path} is damaged" + f"; {advice}" * bool(advice))
 
 
 def write_bytes(path: Path, content: bytes) -> None:

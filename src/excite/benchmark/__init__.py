@@ -5,5 +5,7 @@ from .base import Progress as Progress
 from .base import estimate_all as estimate_all
 from .base import evaluate as evaluate
 from .base import wilson as wilson
+from .episodes import episodes_data as episodes_data
+from .episodes import example_episodes as example_episodes
 from .methods import run_benchmark as run_benchmark
 from .methods import write_benchmark as write_benchmark

@@ -13,7 +13,7 @@ import hashlib
 import json
 import math
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
+from .. import files
 from ..description import PlantDescription, display_unit, names_of
 from ..estimation import AbstractEstimator, Status, stack_experiments
 from ..evaluation import Episodes, evaluate
@@ -357,30 +358,13 @@ def study_of(folder: Path) -> Study:
         raise damaged(path) from None
 
 
-def numbers_of(value: Any) -> Any:
-    """A copy of rows read from a file, None become the numbers that do not exist again."""
-    if isinstance(value, dict):
-        return {key: numbers_of(part) for key, part in value.items()}
-    if isinstance(value, list):
-        return [numbers_of(part) for part in value]
-    return math.nan if value is None else value
-
-
 def read_json(path: Path, *keys: str) -> dict[str, Any]:
     """Content of a file of a run folder, an object with these keys.
 
     Raises:
         ValueError: where it cannot be read, or holds something else.
     """
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be read ({error.strerror})") from None
-    except (ValueError, RecursionError):
-        raise damaged(path) from None
-    if not isinstance(content, dict) or not set(keys) <= content.keys():
-        raise damaged(path)
-    return content
+    return files.read_json(path, *keys, advice=_advice(path))
 
 
 _REMEDIES = {
@@ -392,7 +376,16 @@ _REMEDIES = {
 }
 
 
+def read_columns(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
+    """Columns of a CSV file of a run folder, these among them; ValueError for another file."""
+    return files.read_columns(path, names, advice=_advice(path))
+
+
+def _advice(path: Path) -> str:
+    of_seed = f"delete {path.parent}: 'excite study run' trains that seed from the beginning"
+    return _REMEDIES.get(path.name, of_seed)
+
+
 def damaged(path: Path) -> ValueError:
     """The error for a file of a run folder that is not as it was written, and what helps."""
-    of_seed = f"delete {path.parent}: 'excite study run' trains that seed from the beginning"
-    return ValueError(f"{path} is damaged; {_REMEDIES.get(path.name, of_seed)}")
+    return files.damaged(path, _advice(path))

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from .. import __version__
 from ..files import new_run_folder, write_json
 from ..study import Study
 from .base import Progress, evaluate_method, num_chunks, unpacked
@@ -38,11 +39,13 @@ def write_benchmark(
     shown: Mapping[str, bytes],
     path: Path,
     overwrite: bool = False,
+    command: str = "",
 ) -> None:
     """Leaves a run folder: the study, its rows as JSON, and what people look at.
 
     Args:
-        shown: tables and figures, ready made, by file name.
+        shown: tables, figures and episodes, ready made, by file name.
+        command: that made it, for those who want to do it again.
 
     Raises:
         ValueError: where `path` holds something else, or a run and not `overwrite`.
@@ -53,4 +56,5 @@ def write_benchmark(
         write_json(folder / "table.json", {"rows": rows})
         plant = study.build_plant().description
         write_json(folder / "study.json", study.model_dump())
-        write_json(folder / "run.json", {"kind": "excite benchmark", "plant": plant.to_dict()})
+        about = {"kind": "excite benchmark", "excite": __version__, "command": command}
+        write_json(folder / "run.json", {**about, "plant": plant.to_dict()})

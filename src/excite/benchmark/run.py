@@ -40,7 +40,7 @@ _TASKS = {
 
 
 @contextlib.contextmanager
-def opened(study: Study, folder: Path) -> Iterator[dict[str, dict[str, Any]]]:
+def opened(study: Study, folder: Path, command: str = "") -> Iterator[dict[str, dict[str, Any]]]:
     """A run folder of this study, new or begun, for one process at a time.
 
     Yields the arguments of every task that is not finished, by its name.
@@ -55,7 +55,7 @@ def opened(study: Study, folder: Path) -> Iterator[dict[str, dict[str, Any]]]:
         raise ValueError(f"{folder} exists and is no run folder; choose another name")
     with _locked(folder):
         plant, text = study.build_plant(), _plant_text(study)
-        marker = _marker(study, plant, text)
+        marker = {**_marker(study, plant, text), "command": command}
         if is_begun:
             _require_same_study(study, marker, folder)
         tasks = _missing(study, plant, folder, every)
@@ -185,17 +185,19 @@ def run_study(
     engine: Engine,
     progress: Progress = lambda *_: None,
     on_done: Callable[[str], None] = lambda _: None,
+    command: str = "",
 ) -> dict[str, Exception]:
     """Computes what the run folder lacks.
 
     Args:
         progress: called about once a second, in thousandths of a task.
         on_done: called with the name of every task that was finished.
+        command: that runs it, kept in `run.json` for those who want to do it again.
 
     Returns:
         Why, for every task that failed in spite of all tries.
     """
-    with opened(study, folder) as tasks:
+    with opened(study, folder, command) as tasks:
         targets = _names(study)
         if tasks:  # a table of before is not that of this study
             (folder / "table.json").unlink(missing_ok=True)

@@ -3,29 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 import scipy.stats
 
 from ..description import PlantDescription, names_of
-from ..estimation import ARX
-from ..estimation.arx import running_params
-from ..evaluation import evaluate
-from ..excitation import PolicyExcitation
-from ..plant import AbstractARXPlant, AbstractPlant
-from ..policy import read_policy
-from ..records import Record
+from ..files import numbers_of
 from ..study import Study
 from ..training.gradient import GradientSettings, rank
 from .base import (
     damaged,
-    episode_keys,
     mean_sd,
-    numbers_of,
+    read_columns,
     read_json,
     seed_folder,
     study_of,
@@ -344,52 +336,8 @@ def learning_curves(study: Study, folder: Path) -> dict[str, list[dict[str, np.n
     seeds, curves = range(study.seeds), {}
     for agent in study.agents:
         paths = [seed_folder(folder, agent, seed) / "curve.csv" for seed in seeds]
-        curves[agent] = [_curve(path, names) for path in paths]
+        curves[agent] = [read_columns(path, names) for path in paths]
         lengths = [len(curve["steps"]) for curve in curves[agent]]
         if min(lengths) < max(lengths):  # every seed is looked at as often
             raise damaged(paths[lengths.index(min(lengths))])
     return curves
-
-
-def _curve(path: Path, names: Set[str]) -> dict[str, np.ndarray]:
-    """Columns of a learning curve, these among them."""
-    try:
-        header, *rows = (line.split(",") for line in path.read_text("utf-8").splitlines())
-        curve = dict(zip(header, np.array(rows, float).T, strict=True))
-    except (OSError, ValueError):
-        raise damaged(path) from None
-    if not names <= curve.keys():
-        raise damaged(path)
-    return curve
-
-
-def example_episodes(study: Study, folder: Path) -> dict[str, tuple[Record, np.ndarray]]:
-    """The first evaluation episode of every agent's best seed, and its running estimates.
-
-    The estimates are those of the study's first ARX estimator, over the true parameters;
-    not numbers where there is none.
-    """
-    plant, episodes = study.build_plant(), {}
-    first = episode_keys(study)[:1]
-    for agent, seed in best_seeds(study, folder).items():
-        path = seed_folder(folder, agent, seed) / "policy.safetensors"
-        try:
-            excitation = PolicyExcitation.of(read_policy(path))
-        except ValueError:
-            raise damaged(path) from None
-        batch = evaluate(plant, excitation, study.num_steps, study.spread, first)
-        run, params = jax.tree.map(lambda leaf: leaf[0], (batch.trajectory, batch.params))
-        estimator, estimates = _running(study, plant, run.inputs, run.measured)
-        about = {"seed": seed, "estimator": estimator}
-        record = Record.of_episode(run.time, run.inputs, run.outputs, about)
-        episodes[agent] = record, estimates / np.stack(params)
-    return episodes
-
-
-def _running(
-    study: Study, plant: AbstractPlant, inputs: Any, measured: Any
-) -> tuple[str, np.ndarray]:
-    for name, estimator in study.build_estimators(plant).items():
-        if isinstance(estimator, ARX) and isinstance(plant, AbstractARXPlant):
-            return name, np.asarray(running_params(estimator, plant, inputs, measured))
-    return "", np.full((len(measured), len(names_of(plant.definition.parameters))), np.nan)

@@ -16,12 +16,13 @@ from .. import __version__
 from .benchmark import benchmark
 from .design import design
 from .doctor import doctor
-from .door import RunFailedError
+from .door import RememberingGroup, RunFailedError
 from .export import export
 from .identify import identify
 from .information import information
 from .plants import plants
 from .policies import evaluate, policies
+from .report import report
 from .run import run
 from .simulate import simulate
 from .study import study
@@ -30,7 +31,7 @@ from .train import train
 _DEBUG = "--debug"
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(cls=RememberingGroup, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="excite")
 @click.option(_DEBUG, is_flag=True, help="Show the traceback of an error.")
 def cli(debug: bool) -> None:
@@ -40,7 +41,7 @@ def cli(debug: bool) -> None:
 
 for command in (
     plants, policies, simulate, information, identify, design, train, evaluate, run, export,
-    benchmark, study, doctor,
+    benchmark, study, report, doctor,
 ):  # fmt: skip
     cli.add_command(command)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import sys
 from pathlib import Path
@@ -11,6 +12,7 @@ import click
 
 from .door import (
     OUT_FILE,
+    command_line,
     computing,
     json_option,
     plot_option,
@@ -34,7 +36,7 @@ def benchmark(
     study: Path, out: Path | None, plot: Path | None, as_json: bool, **options: Any
 ) -> None:
     """Compare the methods of STUDY.toml under identical conditions."""
-    from ..benchmark import run_benchmark, write_benchmark
+    from ..benchmark import example_episodes, run_benchmark, write_benchmark
     from ..files import require_free_run_folder
     from ..report import benchmark_figure, save
 
@@ -51,7 +53,9 @@ def benchmark(
     if plot is not None:
         save(benchmark_figure(rows, chosen.title or chosen.name), plot)
     if out is not None:
-        write_benchmark(chosen, rows, comparison_files(rows, settings), out, overwrite)
+        shown = comparison_files(rows, settings)
+        shown["episodes.json"] = episodes_file(chosen, example_episodes(chosen))
+        write_benchmark(chosen, rows, shown, out, overwrite, command_line())
     if as_json:
         show_json({"rows": rows})
     else:
@@ -82,6 +86,15 @@ def comparison_files(rows: Any, settings: Any) -> dict[str, bytes]:
         "table.csv": benchmark_csv(rows).encode(),
         "errors.png": image(figure, "png"),
     }
+
+
+def episodes_file(study: Any, episodes: Any) -> bytes:
+    """Example episodes of a study as the content of a file; shared with `study`."""
+    from ..benchmark import episodes_data
+    from ..files import json_ready
+
+    data = episodes_data(study.build_plant().description, episodes)
+    return json.dumps(json_ready(data), ensure_ascii=False).encode()
 
 
 def show_comparison(rows: Any, settings: Any, out: Path | None) -> None:

@@ -7,6 +7,7 @@ import functools
 import json
 import os
 import re
+import shlex
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -17,6 +18,23 @@ import click
 
 class RunFailedError(Exception):
     """A run that failed through no mistake in its options: exit code 1."""
+
+
+class RememberingGroup(click.Group):
+    """A group that remembers the words it was called with, for `command_line`."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """As any group does it, which uses up the words."""
+        ctx.meta[_WORDS] = list(args)
+        return super().parse_args(ctx, args)
+
+
+_WORDS = "excite.words"
+
+
+def command_line() -> str:
+    """The command that is running, as one would type it again."""
+    return shlex.join(["excite", *click.get_current_context().meta.get(_WORDS, [])])
 
 
 class Assignments(click.ParamType):

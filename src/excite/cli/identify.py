@@ -11,6 +11,7 @@ from .door import (
     NAMES,
     NUMBERS,
     OUT_FILE,
+    command_line,
     computing,
     json_option,
     merged,
@@ -120,7 +121,7 @@ def identify(
         first = result.fitted[0]
         save(identification_figure(result.plant, data, first.record, first.simulated), plot)
     if out is not None:
-        write_run(result, out, options["overwrite"])
+        write_run(result, out, options["overwrite"], command_line())
     if as_json:
         show_json(data)
     else:
@@ -129,16 +130,13 @@ def identify(
 
 
 def _show(description: Any, data: dict[str, Any], out: Path | None) -> None:
-    from ..report import digits_for, number
+    from ..report import largest_correlation, number, parameter_cells, parameter_header
 
     show_table(
         f"{data['plant']}, {data['estimator']}, initial state {data['initial_state']}: "
         f"{data['status']}",
-        ["symbol", "unit", "estimate", "standard error", "95 % interval", "relative to nominal"],
-        [
-            _row(name, p, number, digits_for(p["estimate"], p["std_error"]))
-            for name, p in data["params"].items()
-        ],
+        parameter_header(),
+        [parameter_cells(name, p) for name, p in data["params"].items()],
     )
     for name, percent in data["fit_percent"].items():
         whiteness = data["whiteness_p_value"][name]
@@ -151,27 +149,6 @@ def _show(description: Any, data: dict[str, Any], out: Path | None) -> None:
     for sentence in data["verdict"]:
         click.echo(sentence)
     if len(description.parameters) > 1:
-        click.echo(f"largest correlation: {_largest_correlation(data)}")
+        click.echo(f"largest correlation: {largest_correlation(data)}")
     if out is not None:
         click.echo(f"run folder: {out}")
-
-
-def _row(name: str, p: dict[str, Any], number: Any, digits: int) -> list[str]:
-    relative = p["relative_to_nominal"]
-    relative = "–" if relative is None else f"{relative:.4f}"
-    if p["held"]:
-        return [name, p["unit"], f"{number(p['estimate'], 5)} (held)", "–", "–", relative]
-    low, high = p["ci95"]
-    interval = f"{number(low, digits)} to {number(high, digits)}"
-    return [
-        name, p["unit"], number(p["estimate"], digits), number(p["std_error"]), interval, relative,
-    ]  # fmt: skip
-
-
-def _largest_correlation(data: dict[str, Any]) -> str:
-    import numpy as np
-
-    names, table = list(data["params"]), np.array(data["correlation"], float)
-    table = np.nan_to_num(np.triu(table, 1))
-    i, j = np.unravel_index(np.argmax(np.abs(table)), table.shape)
-    return f"{table[i, j]:+.3f} between {names[i]} and {names[j]}"

@@ -9,11 +9,12 @@ from typing import Any
 
 import click
 
-from .benchmark import comparison_files, show_comparison, study_in
+from .benchmark import comparison_files, episodes_file, show_comparison, study_in
 from .door import (
     OUT_FILE,
     RunFailedError,
     WholeNumber,
+    command_line,
     computing,
     json_option,
     progress_bar,
@@ -74,7 +75,7 @@ def run_study_here(
 
     try:
         with progress_bar(chosen.name) as progress:
-            failures = run_study(chosen, out, machine, progress, finished)
+            failures = run_study(chosen, out, machine, progress, finished, command_line())
         if failures:
             raise _failed(failures, out)
         _finish(chosen, out)
@@ -139,12 +140,8 @@ def _engine(engine: str, address: str | None, workers: int | None) -> Any:
 
 def _finish(chosen: Any, folder: Path) -> None:
     """Writes the table and the figures into the run folder."""
-    from ..benchmark.table import (
-        best_seeds,
-        example_episodes,
-        learning_curves,
-        study_table,
-    )
+    from ..benchmark import example_episodes
+    from ..benchmark.table import best_seeds, learning_curves, study_table
     from ..files import write_bytes, write_json
     from ..report import (
         agents_figure,
@@ -169,13 +166,15 @@ def _finish(chosen: Any, folder: Path) -> None:
         shown["frontier.png"] = image(frontier_figure(rows, title), "png")
     if chosen.lengths:
         shown["lengths.png"] = image(lengths_figure(rows, title), "png")
+    seeds = best_seeds(chosen, folder)
+    episodes = example_episodes(chosen, folder, seeds)
+    shown["episodes.json"] = episodes_file(chosen, episodes)
     if chosen.agents:
-        plant = chosen.build_plant().description
-        learnt = learning_curves(chosen, folder)
-        curves = curves_figure(plant, learnt, title, chosen.bound_curves())
-        episodes = agents_figure(plant, example_episodes(chosen, folder), title)
-        shown |= {"curves.png": image(curves, "png"), "episodes.png": image(episodes, "png")}
-        content["best_seeds"] = best_seeds(chosen, folder)
+        plant, bounds = chosen.build_plant().description, chosen.bound_curves()
+        curves = curves_figure(plant, learning_curves(chosen, folder), title, bounds)
+        played = agents_figure(plant, {agent: episodes[agent] for agent in seeds}, title)
+        shown |= {"curves.png": image(curves, "png"), "episodes.png": image(played, "png")}
+        content |= {"best_seeds": seeds, "bound_curves": bounds}
     for name, data in shown.items():
         write_bytes(folder / name, data)
     write_json(folder / "table.json", content)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from .. import __version__
 from ..description import PlantDescription, names_of
 from ..estimation.diagnosis import correlation, fit_percent
 from ..files import csv_text, new_run_folder, write_json
@@ -118,8 +119,13 @@ class Identification:
         }
 
 
-def write_run(result: Identification, path: Path, overwrite: bool = False) -> None:
+def write_run(
+    result: Identification, path: Path, overwrite: bool = False, command: str = ""
+) -> None:
     """Leaves a run folder: records, simulated outputs, residuals, estimate, information.
+
+    Args:
+        command: that made it, for those who want to do it again.
 
     Raises:
         ValueError: where `path` holds something else, or a run and not `overwrite`.
@@ -146,4 +152,5 @@ def write_run(result: Identification, path: Path, overwrite: bool = False) -> No
                 "covariance": result.covariance,
             },
         )
-        write_json(folder / "run.json", {"kind": "excite identification", "plant": d.to_dict()})
+        about = {"kind": "excite identification", "excite": __version__, "command": command}
+        write_json(folder / "run.json", {**about, "plant": d.to_dict()})

@@ -7,13 +7,16 @@ from __future__ import annotations
 
 import io
 import math
+import re
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
+import matplotlib.axis
 import matplotlib.figure
 import matplotlib.pyplot as plt
+import matplotlib.ticker
 import numpy as np
 
 from ..description import Input, Output, PlantDescription, display_unit
@@ -69,6 +72,72 @@ def image(figure: matplotlib.figure.Figure, kind: str) -> bytes:
     figure.savefig(buffer, format=kind, dpi=150)
     plt.close(figure)
     return buffer.getvalue()
+
+
+PAGE_STYLE: dict[Any, Any] = {
+    "svg.fonttype": "none",  # text stays text: it can be searched, and the file is smaller
+    "svg.hashsalt": "excite",  # the same figure is the same file
+    "text.parse_math": False,  # a name with $ is a name
+    "legend.frameon": False,
+}
+"""Matplotlib's settings under which a figure for `inline_svg` is drawn."""
+
+_NAMED = {"blue": BLUE, "orange": ORANGE, "green": GREEN, "red": RED, "grey": GREY}
+_NAMED |= {"pink": _COLOURS[4], "sky": _COLOURS[5]}
+_PAGE_COLOURS = {value.lower(): f"var(--{name})" for name, value in _NAMED.items()}
+_PAGE_COLOURS["#000000"] = "currentColor"
+
+
+class _PlainLog(matplotlib.ticker.LogFormatter):
+    """Powers of ten as numbers, without mathematics that a page would have to set."""
+
+    def _num_to_string(self, x: float, *_: Any) -> str:
+        return f"{x:g}"
+
+
+def inline_svg(figure: matplotlib.figure.Figure, prefix: str) -> str:
+    """A figure as an element of a page, whose style says what its colours are.
+
+    It has no title: a page has headings and captions.
+
+    Args:
+        prefix: of the figure's ids, which no other figure of the page may have.
+    """
+    if figure.get_suptitle():
+        figure.suptitle("")
+    for axes in figure.axes:
+        for axis in (axes.xaxis, axes.yaxis):
+            if axis.get_scale() in ("log", "symlog"):
+                _set_plain(axis)
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
+    plt.close(figure)
+    svg = buffer.getvalue()
+    svg = re.sub("<metadata>.*?</metadata>|<style.*?</style>", "", svg, flags=re.DOTALL)
+    used = set(re.findall(r'(?:href="|url\()#(\w+)', svg))
+    tags = re.sub("<[^>]*>", lambda tag: _of_page(tag[0], prefix, used), svg)
+    return re.sub(r"\s*\n\s*", "\n", tags[tags.index("<svg") :])
+
+
+def _set_plain(axis: matplotlib.axis.Axis) -> None:
+    """Marks of a logarithmic axis as plain numbers, and few of them: a page has many axes."""
+    axis.set_major_formatter(_PlainLog())
+    axis.set_minor_formatter(_PlainLog())
+    low, high = sorted(axis.get_view_interval())
+    if low <= 0 or high / low > 100:  # its powers of ten are enough
+        axis.set_minor_locator(matplotlib.ticker.NullLocator())
+
+
+def _of_page(tag: str, prefix: str, used: Collection[str]) -> str:
+    """One of Matplotlib's tags: ids of its own, the page's colours and font, shorter numbers."""
+    tag = re.sub(r' id="([^"]*)"', lambda m: f' id="{prefix}-{m[1]}"' if m[1] in used else "", tag)
+    tag = tag.replace('xlink:href="#', f'href="#{prefix}-').replace("url(#", f"url(#{prefix}-")
+    if tag.startswith("<svg"):
+        width, box = re.findall(r' (?:width|viewBox)="([^"]*)"', tag)
+        return f'<svg viewBox="{box}" style="--width: {width}">'
+    tag = re.sub(r" font-family: [^;]*;", "", tag)
+    tag = re.sub(r"(\.\d\d)\d+", r"\1", tag)  # hundredths of a point cannot be seen
+    return re.sub("#[0-9a-f]{6}", lambda m: _PAGE_COLOURS.get(m[0], m[0]), tag)
 
 
 def colour_of(i: int) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -70,6 +71,60 @@ def _draw_intervals(axis: Any, params: Mapping[str, Mapping[str, Any]]) -> None:
     axis.set(ylim=(len(params) - 0.4, -0.9), xlabel="95 % interval [% of the estimate]")
 
 
+def autocorrelation_figure(
+    description: PlantDescription, residuals: Sequence[Float[np.ndarray, "sample output"]]
+) -> matplotlib.figure.Figure:
+    """Autocorrelation of the residuals of all records, and where 95 % of it lies if white."""
+    outputs = description.outputs
+    figure, axes = new_figure(1, len(outputs), width=4.0 * len(outputs), sharey="row")
+    count = sum(len(r) for r in residuals)
+    for i, (axis, part) in enumerate(zip(axes[0], outputs, strict=True)):
+        lags = np.arange(1, min(25, min(len(r) for r in residuals) // 5) + 1)  # Ljung-Box's
+        centred = [r[:, i] - r[:, i].mean() for r in residuals]
+        power = sum(float(c @ c) for c in centred) or math.nan
+        values = [sum(float(c[lag:] @ c[:-lag]) for c in centred) / power for lag in lags]
+        axis.vlines(lags, 0, values, color=ORANGE, lw=2)
+        axis.axhline(0, color="black", lw=0.6)
+        for sign in (1, -1):
+            axis.axhline(sign * 1.96 / math.sqrt(count), color=GREY, ls="--", lw=1)
+        axis.set(title=part.name, xlabel="lag [samples]")
+    axes[0, 0].set(ylabel="autocorrelation")
+    return figure
+
+
+def correlation_figure(result: Mapping[str, Any]) -> matplotlib.figure.Figure | None:
+    """95 % ellipse of every pair of estimated parameters; None where there is no pair."""
+    params = list(result["params"].items())
+    free = [
+        i
+        for i, (_, p) in enumerate(params)
+        if p["estimate"] and math.isfinite(p["std_error"] or math.nan)
+    ]
+    pairs = list(itertools.combinations(free, 2))
+    if not pairs:
+        return None
+    columns = min(len(pairs), 3)
+    rows = -(-len(pairs) // columns)
+    figure, axes = new_figure(rows, columns, height=2.8, width=3.2 * columns)
+    angle = np.linspace(0, 2 * np.pi, 200)
+    for axis in axes.ravel()[len(pairs) :]:
+        axis.set_visible(False)
+    for axis, (i, j) in zip(axes.ravel(), pairs, strict=False):
+        correlation = result["correlation"][i][j]
+        # Radius at which two normal variables lie within 95 times in 100.
+        radii = [245 * p["std_error"] / abs(p["estimate"]) for _, p in (params[i], params[j])]
+        rest = math.sqrt(max(0.0, 1 - correlation**2))
+        tilted = correlation * np.cos(angle) + rest * np.sin(angle)
+        axis.fill(radii[0] * np.cos(angle), radii[1] * tilted, color=BLUE, alpha=0.2, lw=0)
+        axis.plot(radii[0] * np.cos(angle), radii[1] * tilted, color=BLUE, lw=1.2)
+        axis.plot(0, 0, "+", color=BLUE, ms=8)
+        (first, _), (second, _) = params[i], params[j]
+        axis.set(xlabel=f"{first} [%]", ylabel=f"{second} [%]")
+        axis.set(title=f"correlation {correlation:+.3f}")
+        axis.locator_params(nbins=5)
+    return figure
+
+
 def episode_figure(description: PlantDescription, record: Record) -> matplotlib.figure.Figure:
     """Inputs and outputs of one experiment, with the safety levels."""
     figure, axes = new_figure(len(description.inputs) + len(description.outputs))
@@ -125,7 +180,8 @@ def benchmark_figure(rows: Sequence[Mapping[str, Any]], title: str) -> matplotli
     names = list(rows[0]["relative_error_percent"])
     methods = list(dict.fromkeys(row["method"] for row in rows))
     estimators = list(dict.fromkeys(row["estimator"] for row in rows))
-    figure, axes = new_figure(1, len(names), height=3.2, width=3.2 * len(names))
+    each = max(3.2, 0.3 * len(methods))  # inches
+    figure, axes = new_figure(1, len(names), height=each, width=each * len(names))
     for axis, name in zip(axes[0], names, strict=True):
         for e, estimator in enumerate(estimators):
             chosen = [r for r in rows if r["estimator"] == estimator]

@@ -9,8 +9,10 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from ..files import csv_text
-from .base import mean_sd, number
+from .base import digits_for, mean_sd, number
 
 
 def table_header(rows: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -231,24 +233,62 @@ def differences_markdown(differences: Sequence[Mapping[str, Any]]) -> str:
     """Differences in the errors of the study's first estimator, as a section of its table."""
     if not differences:
         return ""
+    header, cells = differences_cells(differences)
+    lines = [f"## Differences, {differences[0]['estimator']}", "", DIFFERENCES, ""]
+    lines += ["| " + " | ".join(header) + " |", "|" + " --- |" * len(header)]
+    lines += ["| " + " | ".join(row) + " |" for row in cells]
+    return "\n".join(["", *lines]) + "\n"
+
+
+DIFFERENCES = (
+    "Mean error of the first method minus that of the second, in points of percent, with "
+    "the 95 % interval over the seeds; plants and noise are common to both."
+)
+
+
+def differences_cells(
+    differences: Sequence[Mapping[str, Any]],
+) -> tuple[list[str], list[list[str]]]:
+    """Column titles and rows of the differences in the errors of the study's first estimator."""
     first, names = differences[0]["estimator"], list(differences[0]["relative_error_percent"])
-    lines = [
-        "",
-        f"## Differences, {first}",
-        "",
-        "Mean error of the first method minus that of the second, in points of percent, with "
-        "the 95 % interval over the seeds; plants and noise are common to both.",
-        "",
-        "| method | minus | " + " | ".join(names) + " |",
-        "|" + " --- |" * (2 + len(names)),
+    chosen = [pair for pair in differences if pair["estimator"] == first]
+    return ["method", "minus", *names], [
+        [p["method"], p["minus"], *(_gap(p["relative_error_percent"][n]) for n in names)]
+        for p in chosen
     ]
-    for pair in differences:
-        if pair["estimator"] == first:
-            gaps = [_gap(pair["relative_error_percent"][name]) for name in names]
-            lines.append("| " + " | ".join([pair["method"], pair["minus"], *gaps]) + " |")
-    return "\n".join(lines) + "\n"
 
 
 def _gap(gap: Mapping[str, Any]) -> str:
     low, high = gap["ci95"]
     return f"{number(gap['mean'])} ({number(low)} to {number(high)})"
+
+
+def parameter_header() -> list[str]:
+    """Column titles of a table of estimates."""
+    return ["symbol", "unit", "estimate", "standard error", "95 % interval", "relative to nominal"]
+
+
+def parameter_cells(name: str, param: Mapping[str, Any]) -> list[str]:
+    """One estimate as `estimate.json` has it, to two digits of its error."""
+    relative = param["relative_to_nominal"]
+    relative = "–" if relative is None else f"{relative:.4f}"
+    if param["held"]:
+        estimate = f"{number(param['estimate'], 5)} (held)"
+        return [name, param["unit"], estimate, "–", "–", relative]
+    digits, (low, high) = digits_for(param["estimate"], param["std_error"]), param["ci95"]
+    return [
+        name,
+        param["unit"],
+        number(param["estimate"], digits),
+        number(param["std_error"]),
+        f"{number(low, digits)} to {number(high, digits)}",
+        relative,
+    ]
+
+
+def largest_correlation(result: Mapping[str, Any]) -> str:
+    """The largest correlation between two estimates, and between which."""
+    names, table = list(result["params"]), np.array(result["correlation"], float)
+    table = np.nan_to_num(np.triu(table, 1))
+    i, j = np.unravel_index(np.argmax(np.abs(table)), table.shape)
+    return f"{table[i, j]:+.3f} between {names[i]} and {names[j]}"

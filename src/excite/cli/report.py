@@ -1,0 +1,45 @@
+"""`excite report`: runs as one page to send to a colleague."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from .door import OUT_FILE, json_option, progress_bar, show_json
+
+
+@click.command()
+@click.argument("runs", nargs=-1, required=True, type=OUT_FILE, metavar="RUN...")
+@click.option("--out", type=OUT_FILE, required=True, metavar="FILE.html", help="The page.")
+@click.option("--overwrite", is_flag=True, help="Replace the page if it exists.")
+@json_option
+def report(runs: tuple[Path, ...], out: Path, overwrite: bool, as_json: bool) -> None:
+    """One page of figures, tables and provenance that needs nothing else.
+
+    RUN is a run folder of `excite identify`, `excite benchmark` or `excite study run`, or a record
+    with its sidecar; several are shown side by side.
+    """
+    from ..files import write_bytes
+    from ..report import report_html
+
+    _require_page_path(out, overwrite)
+    with progress_bar("report") as progress:
+        page = report_html(runs, progress).encode()
+    write_bytes(out, page)
+    if as_json:
+        show_json({"file": str(out), "runs": [str(run) for run in runs], "bytes": len(page)})
+    else:
+        click.echo(f"report: {out}, {len(page) / 1e6:.1f} MB")
+
+
+def _require_page_path(path: Path, overwrite: bool) -> None:
+    """Raises ValueError, before anything is drawn, where no page may be written."""
+    if path.suffix.lower() != ".html":
+        raise ValueError(f"{path}: reports end in .html")
+    if not path.parent.is_dir():
+        raise ValueError(f"{path}: the folder {path.parent} does not exist")
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder; choose another name")
+    if path.exists() and not overwrite:
+        raise ValueError(f"{path} exists; choose another name or add --overwrite")

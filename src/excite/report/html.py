@@ -1,0 +1,116 @@
+"""Runs as one page that needs nothing else: to read, to print, to send to a colleague."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+from .. import __version__
+from ..files import read_json
+from .base import PAGE_STYLE
+from .sections.base import Section, text
+from .sections.experiment import Experiment, comparison, experiment_section, read_experiment
+from .sections.record import read_recorded, record_section
+from .sections.study import read_study_run, study_section
+
+_STYLE = Path(__file__).with_name("page.css")
+_KINDS: dict[str, tuple[Callable[..., Any], Callable[[Any, str], Section]]] = {
+    "excite identification": (read_experiment, experiment_section),
+    "excite study": (read_study_run, study_section),
+    "excite benchmark": (read_study_run, study_section),
+}
+_DRAWING = threading.Lock()  # Matplotlib's settings are those of the whole process
+
+
+def report_html(
+    runs: Sequence[Path], progress: Callable[[str, int, int], None] = lambda *_: None
+) -> str:
+    """A report of run folders and records as one HTML document.
+
+    Args:
+        runs: folders of `excite identify`, `excite benchmark` and `excite study run`, and
+            records (.csv, .mat) with their sidecar.
+        progress: called with what is drawn, how many are done, and how many there are.
+
+    Raises:
+        ValueError: for what cannot be read as one of them.
+    """
+    every = [_read(path) for path in runs]  # whatever is damaged is said before anything is drawn
+    sections = []
+    with _DRAWING, matplotlib.rc_context(PAGE_STYLE):
+        for i, (own, section) in enumerate(every):
+            progress(runs[i].name, i, len(runs))
+            sections.append(section(own, f"run{i + 1}"))
+    progress("done", len(runs), len(runs))
+    experiments = [own for own, _ in every if isinstance(own, Experiment)]
+    beside = comparison(experiments) if len(experiments) > 1 else ""
+    return _document(sections, beside)
+
+
+def _read(path: Path) -> tuple[Any, Callable[[Any, str], Section]]:
+    """A run as its section wants it, and the section."""
+    if path.is_file():
+        return read_recorded(path), record_section
+    if not path.exists():
+        raise ValueError(f"{path}: no such folder or record")
+    if not (path / "run.json").is_file():
+        raise ValueError(f"{path} is no run folder: it has no run.json")
+    about = read_json(path / "run.json", "kind")
+    kind = str(about["kind"])
+    if kind not in _KINDS:
+        raise ValueError(f"{path} is a run of another kind: {kind!r}")
+    read, section = _KINDS[kind]
+    return read(path, about), section
+
+
+def _document(sections: Sequence[Section], beside: str) -> str:
+    """The page: of several runs with a list of contents, and what they have in common."""
+    numbered = {f"{i}. {s.title}": s for i, s in enumerate(sections, 1)}
+    title, contents = f"{len(sections)} runs", _contents(list(numbered.items()))
+    if len(sections) == 1:
+        numbered, contents = {"": sections[0]}, _source(sections[0])
+        title = sections[0].title
+    if beside:
+        contents += f"<section>\n<h2>Experiments side by side</h2>\n{beside}</section>\n"
+    body = "".join(
+        f'<section id="run{i}">\n{_head(t, s)}{s.body}</section>\n'
+        for i, (t, s) in enumerate(numbered.items(), 1)
+    )
+    return f"""<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="generator" content="excite {__version__}">
+<title>{text(title)}</title>
+<style>
+{_STYLE.read_text(encoding="utf-8")}</style>
+</head>
+<body>
+<header><h1>{text(title)}</h1></header>
+<main>
+{contents}{body}</main>
+<footer>Made by excite {__version__}.</footer>
+</body>
+</html>
+"""
+
+
+def _head(title: str, section: Section) -> str:
+    return f"<h2>{text(title)}</h2>\n{_source(section)}" if title else ""
+
+
+def _source(section: Section) -> str:
+    return f'<p class="source">{text(section.name)}</p>\n'
+
+
+def _contents(sections: Sequence[tuple[str, Section]]) -> str:
+    links = "".join(
+        f'<li><a href="#run{i}">{text(title)}</a> <small>{text(s.name)}</small></li>\n'
+        for i, (title, s) in enumerate(sections, 1)
+    )
+    return f'<nav aria-label="Contents"><ol>\n{links}</ol></nav>\n'

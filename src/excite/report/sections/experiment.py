@@ -1,0 +1,245 @@
+"""Experiments: what was measured, and what was identified from it."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...description import PlantDescription, names_of
+from ...files import read_columns, read_json
+from ...records import Record
+from ..base import number
+from ..figures import (
+    autocorrelation_figure,
+    correlation_figure,
+    episode_figure,
+    identification_figure,
+)
+from ..tables import largest_correlation, parameter_cells, parameter_header
+from .base import (
+    Section,
+    bullets,
+    command,
+    facts,
+    figure,
+    folded,
+    heading,
+    origin_in_words,
+    paragraph,
+    plant_facts,
+    record_in,
+    signals_table,
+    table,
+    understood,
+)
+
+_MAX_RECORDS = 6  # drawn of one run
+_WHITE = 0.05
+_ADVICE = "'excite identify --out' writes it again"
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """The run folder of an identification, as it was read.
+
+    Attributes:
+        folder: where it lies.
+        plant: what was fitted.
+        result: the content of `estimate.json`.
+        about: the content of `run.json`.
+        records, simulated: what was measured, and the outputs of the estimated plant.
+    """
+
+    folder: Path
+    plant: PlantDescription
+    result: Mapping[str, Any]
+    about: Mapping[str, Any]
+    records: Sequence[Record]
+    simulated: Sequence[np.ndarray]
+
+
+def read_experiment(folder: Path, about: Mapping[str, Any]) -> Experiment:
+    """The experiment in a run folder.
+
+    Raises:
+        ValueError: for a file that is damaged or missing.
+    """
+    with understood(folder / "run.json", _ADVICE):
+        plant = PlantDescription.from_dict(about["plant"])
+    result = read_json(folder / "estimate.json", "params", "fit_percent", "files", advice=_ADVICE)
+    with understood(folder / "estimate.json", _ADVICE):
+        count = len(result["files"])
+    records, simulated = [], []
+    for i in range(1, count + 1):
+        ending = "" if count == 1 else f"_{i}"
+        records.append(record_in(folder / f"record{ending}.csv", plant))
+        names, path = names_of(plant.outputs), folder / f"simulated{ending}.csv"
+        columns = read_columns(path, names, _ADVICE)
+        with understood(path, _ADVICE):
+            values = np.stack([columns[name] for name in names], axis=1)
+            simulated.append(values.reshape(records[-1].outputs.shape))
+    return Experiment(folder, plant, result, about, records, simulated)
+
+
+def experiment_section(experiment: Experiment, name: str) -> Section:
+    """What the report says of an identification; `name` begins the names of its figures."""
+    d, result, records = experiment.plant, experiment.result, experiment.records
+    with understood(experiment.folder / "estimate.json", _ADVICE):
+        parts = [
+            heading("Parameters"),
+            table(parameter_header(), [parameter_cells(n, p) for n, p in result["params"].items()]),
+            _truth(experiment),
+            heading("What the data can see"),
+            bullets(result["verdict"]),
+            heading("Measured"),
+            signals_table(d, records),
+            _figures(experiment, name),
+            heading("Residual"),
+            table(*_residuals(experiment), labels=1),
+            figure(
+                autocorrelation_figure(d, _residual_values(experiment)),
+                f"{name}-white",
+                "Autocorrelation of the residual; 95 % of that of white noise lies between the "
+                "dashed lines.",
+            ),
+            _correlation(result, name),
+            heading("Settings and provenance"),
+            _provenance(experiment),
+        ]
+        title = f"{d.name}: {result['estimator']}, {result['status']}"
+        parts.append(command(experiment.about.get("command"), _likely_command(experiment)))
+    return Section(title, experiment.folder, "".join(parts))
+
+
+def _truth(experiment: Experiment) -> str:
+    """Estimates beside the parameters of a simulated plant; nothing for a real one."""
+    true = experiment.records[0].metadata.get("params")
+    params = experiment.result["params"]
+    others = [record.metadata.get("params") for record in experiment.records]
+    if not isinstance(true, Mapping) or set(true) != set(params) or any(o != true for o in others):
+        return ""
+    rows = []
+    for name, p in params.items():
+        error = 100 * (p["estimate"] / true[name] - 1) if p["estimate"] and true[name] else None
+        low, high = p["ci95"]
+        inside = "–" if low is None else "yes" if low <= true[name] <= high else "no"
+        rows.append([name, p["unit"], number(true[name], 5), f"{number(error)} %", inside])
+    header = ["symbol", "unit", "true", "error", "inside the interval"]
+    return paragraph("The record is simulated; these are its plant's own parameters:") + table(
+        header, rows
+    )
+
+
+def _figures(experiment: Experiment, name: str) -> str:
+    """Signals and fit of every record, as far as they are few."""
+    d, parts = experiment.plant, []
+    pairs = list(zip(experiment.records, experiment.simulated, strict=True))
+    for i, (record, simulated) in enumerate(pairs[:_MAX_RECORDS], 1):
+        file = experiment.result["files"][i - 1]
+        parts += [
+            figure(episode_figure(d, record), f"{name}-in{i}", f"{file}: inputs and outputs."),
+            figure(
+                identification_figure(d, experiment.result, record, simulated),
+                f"{name}-fit{i}",
+                f"{file}: measured against simulated, what is left, and the parameters.",
+            ),
+        ]
+    if len(pairs) > _MAX_RECORDS:
+        parts.append(paragraph(f"{len(pairs) - _MAX_RECORDS} more records are not drawn."))
+    return "".join(parts)
+
+
+def _residual_values(experiment: Experiment) -> list[np.ndarray]:
+    pairs = zip(experiment.records, experiment.simulated, strict=True)
+    return [record.outputs - simulated for record, simulated in pairs]
+
+
+def _residuals(experiment: Experiment) -> tuple[list[str], list[list[str]]]:
+    """Fit and tests by output, and the fit of held-out records."""
+    result, rows = experiment.result, []
+    residuals = np.concatenate(_residual_values(experiment))
+    for i, part in enumerate(experiment.plant.outputs):
+        p = result["whiteness_p_value"][part.name]
+        size = f"{number(float(np.sqrt(np.mean(residuals[:, i] ** 2))))} {part.unit}"
+        white = "–" if p is None else "white" if p >= _WHITE else "not white"
+        fit = f"{number(result['fit_percent'][part.name], 4)} %"
+        rows.append([part.name, fit, size, number(p), white])
+    for held_out in result["validation"]:
+        for output, percent in held_out["fit_percent"].items():
+            label = f"{output}, held out: {held_out['file']}"
+            rows.append([label, f"{number(percent, 4)} %", "–", "–", "–"])
+    return ["output", "fit", "RMS residual", "p (Ljung-Box)", "at 5 %"], rows
+
+
+def _correlation(result: Mapping[str, Any], name: str) -> str:
+    drawn = correlation_figure(result)
+    if drawn is None:
+        return ""
+    caption = (
+        "Where each pair of parameters lies with 95 %, in percent of the estimates. "
+        f"Largest correlation: {largest_correlation(result)}."
+    )
+    return heading("Correlation of the estimates") + figure(drawn, f"{name}-pairs", caption)
+
+
+def _provenance(experiment: Experiment) -> str:
+    result = experiment.result
+    own = facts(
+        [
+            ("estimator", result["estimator"]),
+            ("initial state", result["initial_state"]),
+            ("excite", experiment.about.get("excite")),
+        ]
+    )
+    rows = [
+        [file, *_lengths(record), origin_in_words(record)]
+        for file, record in zip(result["files"], experiment.records, strict=True)
+    ]
+    header = ["record", "samples", "sampling time", "duration", "origin"]
+    return own + table(header, rows, labels=1) + folded("The plant", plant_facts(experiment.plant))
+
+
+def _lengths(record: Record) -> list[str]:
+    duration = record.time[-1] - record.time[0]
+    return [str(len(record.time)), f"{record.dt:.4g} s", f"{duration:.4g} s"]
+
+
+def _likely_command(experiment: Experiment) -> str:
+    """For folders of before the command was kept."""
+    result = experiment.result
+    files = shlex.join(result["files"])
+    return (
+        f"excite identify {files} --plant {result['plant']} --estimator {result['estimator']} "
+        "--out RUN"
+    )
+
+
+def comparison(experiments: Sequence[Experiment]) -> str:
+    """Estimates, with their intervals, and fits of several experiments side by side."""
+    header = [
+        "",
+        "unit",
+        *(f"{i}. {e.folder.absolute().name}" for i, e in enumerate(experiments, 1)),
+    ]
+    names = {n: p["unit"] for e in experiments for n, p in e.result["params"].items()}
+    outputs = list(dict.fromkeys(n for e in experiments for n in e.result["fit_percent"]))
+    rows = [["status", "", *(e.result["status"] for e in experiments)]]
+    rows.append(["estimator", "", *(e.result["estimator"] for e in experiments)])
+    for name, unit in names.items():
+        rows.append([name, unit, *(_interval(name, e.result["params"]) for e in experiments)])
+    for output in outputs:
+        fits = [number(e.result["fit_percent"].get(output), 4) for e in experiments]
+        rows.append([f"fit of {output}", "%", *fits])
+    return table(header, rows)
+
+
+def _interval(name: str, params: Mapping[str, Any]) -> str:
+    if name not in params:
+        return "–"
+    _, _, estimate, _, interval, _ = parameter_cells(name, params[name])
+    return estimate if interval == "–" else f"{estimate} ({interval})"

@@ -1,0 +1,98 @@
+"""A record alone: what was played, what was measured, and how the experiment ended."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ...description import PlantDescription
+from ...files import read_json
+from ...records import RECORD_KIND, Record
+from ..figures import episode_figure
+from .base import (
+    Section,
+    facts,
+    figure,
+    folded,
+    heading,
+    paragraph,
+    plant_facts,
+    record_in,
+    signals_table,
+    understood,
+)
+
+_ABOUT_THE_FILE = ("kind", "plant", "plant_hash", "dt", "provenance", "ended", "params")
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """A record and the plant that its sidecar names."""
+
+    path: Path
+    plant: PlantDescription
+    record: Record
+
+
+def read_recorded(path: Path) -> Recorded:
+    """The record in a file.
+
+    Raises:
+        ValueError: where it cannot be read, or has no sidecar that says what its columns are.
+    """
+    sidecar = path.with_suffix(".json")
+    if path.suffix.lower() not in (".csv", ".mat"):
+        raise ValueError(f"{path} is neither a run folder nor a record (.csv, .mat)")
+    if not sidecar.is_file():
+        raise ValueError(
+            f"{path} has no sidecar {sidecar.name} that names its plant; 'excite identify' with "
+            "--plant and --out makes a run folder of it"
+        )
+    content = read_json(sidecar, "kind", "plant")
+    if content["kind"] != RECORD_KIND:
+        raise ValueError(f"{sidecar} is no sidecar of a record")
+    with understood(sidecar):
+        plant = PlantDescription.from_dict(content["plant"])
+    return Recorded(path, plant, record_in(path, plant))
+
+
+def record_section(recorded: Recorded, name: str) -> Section:
+    """What the report says of a record; `name` begins the names of its figures."""
+    d, record = recorded.plant, recorded.record
+    with understood(recorded.path.with_suffix(".json")):
+        ended = _ended(record.metadata)
+        about = facts(
+            [
+                ("samples", len(record.time)),
+                ("sampling time", f"{record.dt:.4g} s"),
+                ("duration", f"{record.time[-1] - record.time[0]:.4g} s"),
+                ("true parameters", record.metadata.get("params")),
+                *((record.metadata.get("provenance") or {}).items()),
+                *((k, v) for k, v in record.metadata.items() if k not in _ABOUT_THE_FILE),
+            ]
+        )
+    parts = [
+        ended,
+        heading("Measured"),
+        signals_table(d, [record]),
+        figure(episode_figure(d, record), f"{name}-in", f"{recorded.path.name}: inputs, outputs."),
+        heading("Settings and provenance"),
+        about,
+        folded("The plant", plant_facts(d)),
+    ]
+    return Section(f"{d.name}: a record", recorded.path, "".join(parts))
+
+
+def _ended(metadata: Mapping[str, Any]) -> str:
+    """How an experiment on a rig ended; nothing for a simulation."""
+    if "ended" not in metadata:
+        return ""
+    ended = metadata["ended"]
+    if ended is None:
+        return paragraph(
+            "The experiment has not ended, or was killed: its record stops where it is."
+        )
+    details = {k: v for k, v in ended.items() if k != "reason"}
+    return heading("How it ended") + paragraph(ended["reason"]) + facts(details.items())

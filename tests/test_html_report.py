@@ -1,0 +1,534 @@
+"""`excite report`: one page that needs nothing else, with the numbers of the command line."""
+
+import csv
+import html
+import json
+import re
+import shutil
+import subprocess
+import sys
+from collections import Counter
+from functools import cache
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+from excite.cli import main
+from excite.report import (
+    all_cells,
+    differences_cells,
+    footnotes,
+    parameter_cells,
+    report_html,
+    table_header,
+)
+
+RESULTS = Path(__file__).parent.parent / "results"
+STUDIES = sorted(path.name for path in RESULTS.iterdir())
+LIMIT = 3_000_000
+VOID = {"meta", "img", "br", "link", "input", "hr"}
+STUDY = """
+name = "two"
+plant = "aero2"
+episodes = 8
+num_steps = 120
+[methods.random]
+excitation = "random"
+[methods.chirp]
+excitation = "chirp"
+[estimators.arx-rls]
+kind = "arx-rls"
+[estimators.wide]
+kind = "arx-rls-wide"
+"""
+BOTH = "identify chirp.csv prbs.csv --validate prbs.csv --plant aero2 --estimator arx-rls"
+SCRIPT = "<script>alert(1)</script>"
+MATHS = r"$\frac{$"
+
+
+class Page(HTMLParser):
+    """What a browser would make of a page; AssertionError where tags are not balanced."""
+
+    def __init__(self, text: str):
+        super().__init__(convert_charrefs=True)
+        self.tags, self.ids, self.uses = Counter(), Counter(), set()
+        self.loads, self.tables, self.words, self.styles = [], [], [], []
+        self._open = []
+        self.text = text
+        self.feed(text)
+        self.close()
+        assert self._open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags[tag] += 1
+        if tag not in VOID:
+            self._open.append(tag)
+        self.take(tag, dict(attrs))
+
+    def handle_startendtag(self, tag, attrs):
+        self.tags[tag] += 1
+        self.take(tag, dict(attrs))
+
+    def take(self, tag, attrs):
+        assert not [name for name in attrs if name.startswith("on")]
+        if "id" in attrs:
+            self.ids[attrs["id"]] += 1
+        for name in ("src", "href", "xlink:href", "data", "action", "srcset"):
+            target = attrs.get(name, "")
+            if target.startswith("#"):
+                self.uses.add(target[1:])
+            elif target:
+                self.loads.append(target)
+        self.uses |= set(re.findall(r"url\(#([^)]*)\)", " ".join(map(str, attrs.values()))))
+        if tag == "table":
+            self.tables.append([])
+        elif tag == "tr":
+            self.tables[-1].append([])
+        elif tag in ("td", "th"):
+            self.tables[-1][-1].append("")
+
+    def handle_endtag(self, tag):
+        assert self._open.pop() == tag
+
+    def handle_data(self, data):
+        inside = self._open[-1] if self._open else ""
+        (self.styles if inside == "style" else self.words).append(data)
+        if inside in ("td", "th"):
+            self.tables[-1][-1][-1] += data
+
+    def table_with(self, *titles: str) -> list[list[str]]:
+        """Rows of the one table that begins with these column titles, the titles first."""
+        (found,) = [t for t in self.tables if t[0][: len(titles)] == list(titles)]
+        return found
+
+    def section(self, title: str) -> str:
+        """The source from a heading to the next one."""
+        return self.text.split(f">{title}</h3>")[1].split("<h3>")[0]
+
+
+@cache
+def page_of(*runs: Path) -> Page:
+    return Page(report_html(runs))
+
+
+def excite(*words: object) -> int:
+    """The command line, as a program would call it; its exit code."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["excite", *map(str, words)])
+        with pytest.raises(SystemExit) as ending:
+            main()
+    return int(ending.value.code or 0)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with records and runs of every kind; no test writes to it."""
+    folder = tmp_path_factory.mktemp("made")
+    (folder / "two.toml").write_text(STUDY)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        for line in (
+            "simulate aero2 --excitation chirp --steps 200 --out chirp.csv",
+            "simulate aero2 --excitation prbs --steps 200 --noise pitch=0.002 --out prbs.csv",
+            "identify chirp.csv --plant aero2 --out one",
+            f"{BOTH} --out both",
+            "benchmark two.toml --out bench",
+            "run --rig simulated --fast --steps 100 --input chirp.csv --out rig.csv",
+        ):
+            assert excite(*line.split()) == 0
+    return folder
+
+
+@pytest.fixture
+def here(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The current folder: a copy of those."""
+    folder = tmp_path / "here"
+    shutil.copytree(made, folder)
+    monkeypatch.chdir(folder)
+    return folder
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(f.relative_to(folder)): f.read_bytes() for f in folder.rglob("*") if f.is_file()}
+
+
+def read(path: Path) -> dict:
+    return json.loads(path.read_text())
+
+
+# Every page
+
+
+def assert_is_self_contained(page: Page) -> None:
+    assert len(page.text.encode()) < LIMIT
+    assert {t for t in page.loads if not t.startswith("data:image/png;base64,")} == set()
+    assert not {"script", "link", "iframe", "object", "embed", "base", "form"} & set(page.tags)
+    assert not re.search(r"@import|url\((?!#)", page.text)
+    assert [name for name, count in page.ids.items() if count > 1] == []
+    assert page.uses <= set(page.ids)
+    assert page.text.startswith("<!DOCTYPE html>\n<html lang=")
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_a_study_makes_one_small_page_with_the_table_of_the_command_line(name, capsys):
+    page = page_of(RESULTS / name)
+    assert_is_self_contained(page)
+    assert_has_the_table_of_the_command_line(page, RESULTS / name, capsys)
+    assert page.tags["svg"] >= 1
+    assert page.tags["img"] == (RESULTS / name / "episodes.png").is_file()
+
+
+@pytest.mark.parametrize("name", ["one", "both", "bench", "rig.csv", "chirp.csv"])
+def test_an_experiment_makes_one_small_page_that_needs_nothing_else(name, made):
+    page = page_of(made / name)
+    assert_is_self_contained(page)
+    assert page.tags["svg"] >= 1
+    assert page.tags["img"] == 0
+    assert str(made.parent) not in page.text  # where it lies is nobody's business
+
+
+def test_the_page_is_light_dark_and_printable(made):
+    style = "".join(page_of(made / "one").styles)
+    assert "prefers-color-scheme: dark" in style
+    assert "@media print" in style
+    names = set(re.findall(r"(--\w+):", style))
+    assert set(re.findall(r"var\((--\w+)\)", page_of(made / "one").text)) <= names | {"--width"}
+    light, dark = (set(re.findall(r"(--\w+):", rules)) for rules in style.split("@media")[:2])
+    assert light == dark
+
+
+def test_figures_take_their_colours_from_the_page(made):
+    for drawn in re.findall("<svg.*?</svg>", page_of(made / "both").text, re.S):
+        # Only the grid's grey is the same by day and by night.
+        assert set(re.findall("#[0-9a-f]{6}", drawn)) <= {"#b0b0b0"}
+        assert "font-family" not in drawn
+
+
+def test_a_figure_keeps_its_words_as_text():
+    page = page_of(RESULTS / "table1")
+    assert "mean relative error [%]" in page.words
+    assert "mathdefault" not in page.text
+    assert {"0.001", "0.01", "0.1", "10"} <= set(page.words)
+
+
+def test_the_same_runs_make_the_same_page(made):
+    assert report_html([made / "one"]) == report_html([made / "one"])
+
+
+def test_no_jax_is_needed(made):
+    program = (
+        "import sys; from pathlib import Path; from excite.report import report_html\n"
+        "report_html([Path(p) for p in sys.argv[1:]])\n"
+        "sys.exit('jax' in sys.modules or 'equinox' in sys.modules)"
+    )
+    words = [sys.executable, "-c", program, made / "one", made / "bench", made / "rig.csv"]
+    assert subprocess.run(words, check=False).returncode == 0
+
+
+# The numbers are those of the command line
+
+
+def assert_has_the_table_of_the_command_line(page: Page, folder: Path, capsys) -> None:
+    if read(folder / "run.json")["kind"] == "excite study":
+        assert excite("study", "table", folder, "--json") == 0
+        rows = json.loads(capsys.readouterr().out)["rows"]
+    else:
+        rows = read(folder / "table.json")["rows"]
+    settings = read(folder / "study.json")
+    header, *cells = page.table_with("method", "estimator")
+    assert header == table_header(rows)
+    assert cells == all_cells(rows, settings["reference"])
+    for note in footnotes(settings):
+        assert note in page.words
+    assert page.text.count('class="published"') + page.text.count('class="first published"') == len(
+        settings["reference"]
+    )
+
+
+def test_differences_are_those_of_the_table():
+    folder = RESULTS / "table1"
+    header, cells = differences_cells(read(folder / "table.json")["differences"])
+    assert page_of(folder).table_with("method", "minus") == [header, *cells]
+
+
+@pytest.mark.parametrize("name", ["one", "both"])
+def test_parameters_are_those_of_the_command_line(name, made, capsys, monkeypatch):
+    monkeypatch.chdir(made)
+    words = BOTH if name == "both" else "identify chirp.csv --plant aero2"
+    assert excite(*words.split()) == 0
+    shown = capsys.readouterr().out
+    result, page = read(made / name / "estimate.json"), page_of(made / name)
+    _, *cells = page.table_with("symbol", "unit", "estimate")
+    assert cells == [parameter_cells(n, p) for n, p in result["params"].items()]
+    for row in cells:
+        assert re.search(r"\s+".join(map(re.escape, row)), shown)
+    for sentence in result["verdict"]:
+        assert sentence in page.words
+    (output, fit, _, p, white), *held_out = page.table_with("output", "fit")[1:]
+    assert f"{output}: fit {fit}, residual white with p = {p}" in shown
+    assert white == ("white" if result["whiteness_p_value"]["pitch"] >= 0.05 else "not white")
+    assert len(held_out) == len(result["validation"])
+    correlation = re.search("largest correlation: (.*)", shown)
+    assert correlation
+    assert f"Largest correlation: {correlation[1]}." in "".join(page.words)
+
+
+def test_a_simulated_plants_own_parameters_stand_beside_the_estimates(made):
+    result = read(made / "one" / "estimate.json")["params"]
+    _, *rows = page_of(made / "one").table_with("symbol", "unit", "true")
+    for (name, _, true, error, inside), p in zip(rows, result.values(), strict=True):
+        assert float(error.removesuffix(" %")) == pytest.approx(
+            100 * (p["estimate"] / float(true) - 1), rel=0.01, abs=1e-6
+        )
+        assert inside == ("yes" if p["ci95"][0] <= float(true) <= p["ci95"][1] else "no"), name
+
+
+# What a page says
+
+
+def test_every_record_of_an_experiment_is_drawn_with_its_fit(made):
+    for name, count in (("one", 1), ("both", 2)):
+        captions = [w for w in page_of(made / name).words if "measured against simulated" in w]
+        assert len(captions) == count
+
+
+def test_a_page_says_how_to_do_it_again(made):
+    for name, line in (("both", f"excite {BOTH} --out both"),
+                       ("bench", "excite benchmark two.toml --out bench")):  # fmt: skip
+        assert read(made / name / "run.json")["command"] == line
+        assert line in page_of(made / name).words
+    old = page_of(RESULTS / "frontier").section("Do it again")
+    assert "most likely" in old
+    assert "excite study run frontier.toml --out FOLDER" in old
+
+
+def test_a_record_says_how_the_experiment_ended(made):
+    ended = read(made / "rig.csv".replace("csv", "json"))["ended"]
+    words = page_of(made / "rig.csv").words
+    assert "How it ended" in words
+    assert ended["reason"] in words
+    assert "How it ended" not in page_of(made / "chirp.csv").words
+
+
+def test_a_record_that_was_cut_off_says_so(here):
+    sidecar = here / "rig.json"
+    sidecar.write_text(json.dumps({**read(sidecar), "ended": None}))
+    assert "has not ended, or was killed" in report_html([here / "rig.csv"])
+
+
+def test_levels_that_were_reached_are_named(here):
+    sidecar = read(here / "chirp.json")
+    for warning, critical, said in ((None, None, "–"), (8, 9, "below both"),
+                                    (0.1, 9, "warning level reached"),
+                                    (0.05, 0.1, "critical level reached")):  # fmt: skip
+        output = sidecar["plant"]["outputs"][0]
+        output |= {"warning_level": warning, "critical_level": critical}
+        (here / "chirp.json").write_text(json.dumps(sidecar))
+        page = Page(report_html([here / "chirp.csv"]))
+        assert page.table_with("signal")[2][-1] == said
+
+
+def test_one_episode_of_every_method_is_drawn(here):
+    path = here / "bench" / "episodes.json"
+    episodes = read(path)
+    assert list(episodes) == ["random", "chirp"]
+    assert episodes["random"]["inputs"] != episodes["chirp"]["inputs"]
+    assert {len(e["time"]) for e in episodes.values()} == {121}
+    shown = Page(report_html([here / "bench"])).section("One episode each")
+    assert ">random<" in shown
+    assert ">chirp<" in shown
+    assert "arx-rls / true" in shown
+    path.unlink()
+    assert "One episode each" not in report_html([here / "bench"])
+
+
+def test_a_study_says_what_was_set_inferred_and_its_own():
+    settings, page = read(RESULTS / "table1" / "study.json"), page_of(RESULTS / "table1")
+    for sentence in (*settings["inferred"], *settings["ours"]):
+        assert sentence in page.words
+    _, *agents = page.table_with("agent")
+    assert [row[0] for row in agents] == list(settings["agents"])
+    assert "weight 5" in agents[2][3]
+
+
+def test_learning_is_drawn_from_all_seeds_or_as_it_was(tmp_path):
+    assert "RL(all), 10 seeds" in page_of(RESULTS / "table1").words
+    assert "J_p bound [%]" in page_of(RESULTS / "frontier").words
+    old = tmp_path / "old"
+    shutil.copytree(RESULTS / "table1", old, ignore=shutil.ignore_patterns("seeds"))
+    page = Page(report_html([old]))
+    assert "RL(all), 10 seeds" not in page.words
+    assert page.tags["img"] == 2
+
+
+def test_several_runs_stand_side_by_side(made):
+    page = page_of(made / "one", made / "both", made / "bench", made / "one")
+    assert_is_self_contained(page)
+    header, *rows = page.table_with("", "unit")
+    assert header[2:] == ["1. one", "2. both", "3. one"]
+    shown = {row[0]: row[2:] for row in rows}
+    for name, cells in shown.items():
+        assert cells[0] == cells[2], name
+    for column, run in enumerate(("one", "both")):
+        params = read(made / run / "estimate.json")["params"]
+        for name, p in params.items():
+            own = parameter_cells(name, p)
+            assert shown[name][column] == f"{own[2]} ({own[4]})"
+    assert {"run1", "run2", "run3", "run4"} <= page.uses & set(page.ids)
+
+
+def test_a_single_run_needs_no_list_of_contents(made):
+    assert page_of(made / "one").tags["nav"] == 0
+    assert page_of(made / "one").tags["h1"] == 1
+
+
+def test_progress_is_told(made):
+    told = []
+    report_html([made / "chirp.csv", made / "rig.csv"], lambda *now: told.append(now))
+    assert told == [("chirp.csv", 0, 2), ("rig.csv", 1, 2), ("done", 2, 2)]
+
+
+# Nothing in a file is obeyed
+
+
+def renamed(path: Path, *old: str, new: str) -> None:
+    """Another name of some things in a JSON file."""
+    text = path.read_text()
+    for name in old:
+        assert f'"{name}"' in text
+        text = text.replace(f'"{name}"', json.dumps(new))
+    path.write_text(text)
+
+
+@pytest.mark.parametrize("hostile", [SCRIPT, '"><img src=x onerror=alert(1)>', MATHS])
+def test_a_name_that_is_code_is_shown_and_not_obeyed(hostile, here):
+    result = read(here / "one" / "estimate.json")
+    words = ("J_p", "nls", "successful", "kg m²", *result["files"], *result["verdict"])
+    renamed(here / "one" / "estimate.json", *words, new=hostile)
+    renamed(here / "one" / "record.json", "chirp", new=hostile)
+    record = here / "one" / "record.csv"
+    rows = list(csv.reader(record.read_text().splitlines()))
+    with record.open("w", newline="") as file:  # a column that nobody asked for
+        writer = csv.writer(file)
+        writer.writerows([*row, "0" if k else hostile] for k, row in enumerate(rows))
+    for name in ("study.json", "table.json", "episodes.json"):
+        renamed(here / "bench" / name, "chirp", "arx-rls", new=hostile)
+    renamed(here / "bench" / "study.json", "two", new=hostile)
+    page = Page(report_html([here / "one", here / "bench"]))
+    assert_is_self_contained(page)
+    assert page.tags["img"] == 0
+    assert page.table_with("symbol")[1][:2] == [hostile, hostile]
+    assert page.table_with("method", "estimator")[-2][:2] == [hostile, hostile]
+    for title in ("Correlation of the estimates", "Error against bound", "One episode each"):
+        assert hostile in html.unescape(page.section(title))
+
+
+# Bad input: one sentence, exit code 2, nothing written
+
+
+def damage(path: str, text: str = "{") -> object:
+    return lambda: Path(path).write_text(text)
+
+
+def without(path: str, key: str) -> object:
+    def remove() -> None:
+        content = read(Path(path))
+        del content[key]
+        Path(path).write_text(json.dumps(content))
+
+    return remove
+
+
+BAD = {
+    "no such folder": (None, "nowhere", "nowhere: no such folder or record"),
+    "no run folder": (lambda: Path("mine").mkdir(), "mine", "mine is no run folder"),
+    "another file": (damage("a.txt", "text"), "a.txt", "neither a run folder nor a record"),
+    "another kind": (damage("one/run.json", '{"kind": ["x"]}'), "one", "run of another kind"),
+    "run.json": (damage("one/run.json"), "one", "run.json is damaged"),
+    "no plant": (without("one/run.json", "plant"), "one", "run.json is damaged"),
+    "estimate.json": (damage("one/estimate.json"), "one", "estimate.json is damaged"),
+    "estimate without": (without("one/estimate.json", "verdict"), "one", "estimate.json is dam"),
+    "other parameters": (
+        damage("one/estimate.json", '{"params": 3, "fit_percent": {}, "files": [1]}'),
+        "one",
+        "estimate.json is damaged",
+    ),
+    "truncated record": (damage("one/record.csv", "time,voltage,pitch\n0,1"), "one", "truncated"),
+    "no record": (lambda: Path("one/record.csv").unlink(), "one", "no such file"),
+    "simulated.csv": (damage("one/simulated.csv"), "one", "simulated.csv is damaged"),
+    "another length": (
+        damage("one/simulated.csv", "time,pitch\n0,1\n1,1\n"), "one", "simulated.csv is damaged",
+    ),
+    "study.json": (damage("bench/study.json", "[]"), "bench", "study.json is damaged"),
+    "settings": (without("bench/study.json", "spread"), "bench", "study.json is damaged"),
+    "table.json": (damage("bench/table.json"), "bench", "table.json is damaged"),
+    "rows": (damage("bench/table.json", '{"rows": [{}]}'), "bench", "table.json is damaged"),
+    "no rows": (damage("bench/table.json", '{"rows": []}'), "bench", "table.json is damaged"),
+    "unfinished": (lambda: Path("bench/table.json").unlink(), "bench", "not finished"),
+    "episodes": (damage("bench/episodes.json", '{"a": {}}'), "bench", "episodes.json is damaged"),
+    "no sidecar": (lambda: Path("rig.json").unlink(), "rig.csv", "has no sidecar rig.json"),
+    "a foreign sidecar": (
+        damage("rig.json", '{"kind": "mine", "plant": 1}'), "rig.csv", "no sidecar of a record",
+    ),
+    "a sidecar by hand": (
+        damage("rig.json", '{"kind": "excite record", "plant": 1}'), "rig.csv", "rig.json",
+    ),
+    "the second": (damage("bench/table.json"), "one bench", "table.json is damaged"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("prepare", "runs", "sentence"), BAD.values(), ids=list(BAD))
+def test_a_bad_run_is_one_sentence_and_leaves_nothing(prepare, runs, sentence, here, capsys):
+    if prepare:
+        prepare()
+    refused("report", *runs.split(), "--out", "r.html", sentence=sentence, capsys=capsys)
+
+
+@pytest.mark.parametrize(
+    ("out", "sentence"),
+    [
+        ("r.pdf", "reports end in .html"),
+        ("nowhere/r.html", "nowhere does not exist"),
+        ("old.html", "--overwrite"),
+        ("folder.html", "is a folder"),
+    ],
+)
+def test_a_page_that_may_not_be_written_is_one_sentence(out, sentence, here, capsys):
+    (here / "old.html").write_text("mine")
+    (here / "folder.html").mkdir()
+    refused("report", "one", "--out", out, sentence=sentence, capsys=capsys)
+
+
+def refused(*words: str, sentence: str, capsys: pytest.CaptureFixture[str]) -> None:
+    before = contents(Path())
+    capsys.readouterr()
+    assert excite(*words) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("excite: ")
+    assert err.count("\n") == 1
+    assert sentence in err
+    assert contents(Path()) == before
+
+
+def test_the_command_writes_the_page_and_tells(here, capsys):
+    assert excite("report", "one", "rig.csv", "--out", "r.html", "--json") == 0
+    told = json.loads(capsys.readouterr().out)
+    written = (here / "r.html").read_bytes()
+    assert told == {"file": "r.html", "runs": ["one", "rig.csv"], "bytes": len(written)}
+    assert written.decode() == report_html([Path("one"), Path("rig.csv")])
+    assert excite("report", "rig.csv", "--out", "r.html", "--overwrite") == 0
+    assert (here / "r.html").read_text() == report_html([Path("rig.csv")])
+
+
+def test_numbers_that_do_not_exist_are_dashes(here):
+    path = here / "bench" / "table.json"
+    content = read(path)
+    content["rows"][0]["relative_error_percent"]["J_p"] = dict.fromkeys(
+        ("mean", "sd", "median", "rms")
+    )
+    path.write_text(json.dumps(content))
+    page = Page(report_html([here / "bench"]))
+    assert page.table_with("method", "estimator")[1][2] == "– ± –"
+    assert "nan" not in " ".join(page.words).split()
