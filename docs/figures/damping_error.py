@@ -1,4 +1,4 @@
-"""The figure of docs/damping-error.md from the committed results: python docs/figures/damping_error.py"""
+"""The figure of docs/damping-error.md, from the committed results."""
 
 import json
 from pathlib import Path
