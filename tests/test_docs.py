@@ -63,19 +63,6 @@ def test_every_study_loads_and_stands_in_the_index_with_its_result():
         assert (ROOT / "results" / path.stem / "table.json").is_file()
 
 
-def test_the_quick_start_runs(tmp_path: Path):
-    block = next(b for b in re.findall(r"```sh\n(.*?)```", README, re.S) if "excite plants" in b)
-    run = shell(block, tmp_path)
-    assert run.returncode == 0, run.stderr
-    assert "successful" in run.stdout
-    python = re.findall(r"```python\n(.*?)```", README, re.S)[0]
-    run = subprocess.run(
-        [sys.executable, "-c", python], cwd=tmp_path, capture_output=True, text=True, check=False
-    )
-    assert run.returncode == 0, run.stderr
-    assert "J_p" in run.stdout
-
-
 def test_a_policy_runs_on_a_rig_as_documented(tmp_path: Path):
     """With NumPy alone, on a rig that does not move."""
     page = (ROOT / "docs" / "learned-excitation.md").read_text()

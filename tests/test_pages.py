@@ -54,6 +54,15 @@ def test_the_commands_of_a_page_run(page: Path, tmp_path: Path):
     assert run.returncode == 0, run.stdout[-2000:] + run.stderr[-2000:]
     for file in MADE.findall("\n".join(play(page))):
         assert (tmp_path / file).exists(), file
+    if page == README:
+        assert "successful" in run.stdout
+        [python] = re.findall(r"```python\n(.*?)```", page.read_text(), re.S)
+        run = subprocess.run(
+            [sys.executable, "-c", python], cwd=tmp_path,
+            capture_output=True, text=True, timeout=300, check=False,
+        )  # fmt: skip
+        assert run.returncode == 0, run.stderr
+        assert "J_p" in run.stdout
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name)
