@@ -19,7 +19,7 @@ types: .venv/dev
 	$(BIN)/basedpyright --pythonpath $(BIN)/python
 
 docs: .venv/dev ## this documentation as a site, in site/ (open site/index.html)
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 results: .venv/core ## the committed results, afresh (minutes in studies/README.md)
 	for study in baselines nls nls_quantised decay damping damping_encoder damping_noise_free; do \

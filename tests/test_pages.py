@@ -122,7 +122,7 @@ def test_the_site_builds_strictly_and_asks_nothing_of_the_network(tmp_path: Path
     if importlib.util.find_spec("mkdocs") is None:
         pytest.skip("MkDocs is not installed: python -m pip install -e '.[docs]'")
     run = subprocess.run(
-        [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "-d", str(tmp_path)],
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "-d", str(tmp_path)],
         cwd=ROOT, env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
         capture_output=True, text=True, timeout=300, check=False,
     )  # fmt: skip
