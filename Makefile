@@ -3,7 +3,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo test lint types results agents policies clean
+.PHONY: demo test lint types docs results agents policies clean
 
 demo: .venv/core ## the baseline rows of the paper's Table 1, with three estimators, in runs/baselines
 	$(BIN)/excite benchmark studies/baselines.toml --out runs/baselines --overwrite
@@ -18,8 +18,11 @@ lint: .venv/dev
 types: .venv/dev
 	$(BIN)/basedpyright --pythonpath $(BIN)/python
 
+docs: .venv/dev ## this documentation as a site, in site/ (open site/index.html)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
 results: .venv/core ## the committed results, afresh (minutes in studies/README.md)
-	for study in baselines nls nls_quantised decay; do \
+	for study in baselines nls nls_quantised decay damping damping_encoder damping_noise_free; do \
 	  $(BIN)/excite benchmark studies/$$study.toml --out results/$$study --overwrite || exit 1; \
 	done
 
@@ -47,7 +50,7 @@ policies: ## what is shipped in src/excite/policies, from the results of the stu
 	touch $@
 
 .venv/dev: .venv/core
-	$(INSTALL) --editable '.[dev,ppo,dask,tune,fmu,onnx]'
+	$(INSTALL) --editable '.[dev,docs,ppo,dask,tune,fmu,onnx]'
 	touch $@
 
 clean:

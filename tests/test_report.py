@@ -496,16 +496,16 @@ def test_the_autocorrelation_of_white_noise_lies_between_the_dashed_lines():
     walk = [np.cumsum(w, axis=0) for w in white]
     for residuals, least, most in ((white, 0.9, 1.0), (walk, 0.0, 0.0)):
         (axis,) = autocorrelation_figure(AERO2, residuals).axes
-        bars = np.array([bar[1, 1] for bar in axis.collections[0].get_segments()])
+        lines: Any = axis.collections[0]
+        bars = np.array([bar[1, 1] for bar in lines.get_segments()])
         level = max(np.asarray(line.get_ydata(), float)[0] for line in axis.get_lines())
         assert len(bars) == 25
         assert level == pytest.approx(1.96 / math.sqrt(4000))
         assert least <= np.mean(np.abs(bars) < level) <= most
     one = walk[0][:, 0] - walk[0].mean()
     (axis,) = autocorrelation_figure(AERO2, walk[:1]).axes
-    assert axis.collections[0].get_segments()[0][1, 1] == pytest.approx(
-        one[1:] @ one[:-1] / (one @ one)
-    )
+    lines: Any = axis.collections[0]
+    assert lines.get_segments()[0][1, 1] == pytest.approx(one[1:] @ one[:-1] / (one @ one))
 
 
 def test_a_figure_that_cannot_be_written_leaves_nothing(figures, tmp_path):

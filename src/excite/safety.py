@@ -65,7 +65,8 @@ def penalty(outputs: AnyArray, warning: AnyArray, critical: AnyArray) -> AnyArra
 
     Args:
         outputs: true outputs that have a critical level, the last axis.
-        warning, critical: their levels.
+        warning: their warning levels.
+        critical: their critical levels.
     """
     magnitude = abs(outputs)
     is_over = magnitude >= critical

@@ -254,7 +254,8 @@ def run_batch(
         bodies: their leading axis is the run.
         excitation: the player.
         shape: number of sampling instants, and of readings between two.
-        filter, memory: of a safety filter, at its beginning.
+        filter: a safety filter.
+        memory: what the filter remembers at the beginning.
     """
     return jax.vmap(lambda body: _one_run(body, excitation, rules, shape, (filter, memory)))(bodies)
 

@@ -65,8 +65,8 @@ class PPOSettings:
         total_steps: environment steps of the whole training, rounded up to whole rollouts.
         num_envs: plants stepped as one batch.
         n_steps: steps of each plant in a rollout.
-        batch_size, n_epochs, gamma, gae_lambda, clip_range, ent_coef, vf_coef,
-            max_grad_norm: as in Stable-Baselines3.
+        batch_size, n_epochs, gamma, gae_lambda: as in Stable-Baselines3.
+        clip_range, ent_coef, vf_coef, max_grad_norm: as there.
         learning_rate, learning_rate_end: Adam's step, first and last, linear between;
             without an end it is constant.
         noise_sd, noise_sd_end: standard deviation of the exploration noise, in units of

@@ -1,0 +1,212 @@
+"""Every command that a page shows runs or exists; links lead somewhere; the site builds."""
+
+import importlib.util
+import json
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import click
+import pytest
+from pages import PAGES, ROOT, anchors, blocks, links, mentions, name, parsed
+
+README = ROOT / "README.md"
+HERE = Path(sys.executable).parent
+TARGETS = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.M))
+MADE = re.compile(r"--(?:out|onnx|plot)[ =](\S+)")
+
+# One process a page: most of a short command's time is what it imports.
+PLAYER = """
+import shlex, subprocess, sys
+from excite.cli import cli
+for line in sys.stdin.read().splitlines():
+    print("$", line, flush=True)
+    if line.startswith("excite ") and not set(line) & set("|>;&"):
+        code = cli.main(shlex.split(line, comments=True)[1:], standalone_mode=False)
+        assert not code, line
+    else:
+        subprocess.run(["sh", "-ec", line], check=True)
+"""
+
+
+def is_run(commands: list[str]) -> bool:
+    return not all(command.startswith("make ") for command in commands)
+
+
+def play(page: Path) -> list[str]:
+    """The commands of a page that its reader, too, runs in one go."""
+    shown = [block for block in blocks(page) if block.why is None and is_run(block.commands)]
+    return [command for block in shown for command in block.commands]
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if play(page)], ids=name)
+def test_the_commands_of_a_page_run(page: Path, tmp_path: Path):
+    for folder in ("examples", "studies", "results", "docs"):
+        (tmp_path / folder).symlink_to(ROOT / folder)
+    run = subprocess.run(
+        [sys.executable, "-c", PLAYER], input="\n".join(play(page)), cwd=tmp_path,
+        env={**os.environ, "PATH": f"{HERE}{os.pathsep}{os.environ['PATH']}"},
+        capture_output=True, text=True, timeout=300, check=False,
+    )  # fmt: skip
+    assert run.returncode == 0, run.stdout[-2000:] + run.stderr[-2000:]
+    for file in MADE.findall("\n".join(play(page))):
+        assert (tmp_path / file).exists(), file
+    if page == README:
+        assert "successful" in run.stdout
+        [python] = re.findall(r"```python\n(.*?)```", page.read_text(), re.S)
+        run = subprocess.run(
+            [sys.executable, "-c", python], cwd=tmp_path,
+            capture_output=True, text=True, timeout=300, check=False,
+        )  # fmt: skip
+        assert run.returncode == 0, run.stderr
+        assert "J_p" in run.stdout
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_every_command_of_a_page_exists(page: Path):
+    """Options, choices and files, also of what takes too long to be run."""
+    shown = [(command, block.why) for block in blocks(page) for command in block.commands]
+    made: set[str] = set()
+    for command, why in [*shown, *((mention, None) for mention in mentions(page))]:
+        if command.startswith("make "):
+            assert set(command.split("#")[0].split()[1:]) <= TARGETS, command
+        if not command.startswith("excite "):
+            continue
+        values = parsed(command)
+        made |= {
+            file for option in ("--out", "--onnx", "--plot") for file in values.get(option, [])
+        }
+        for word in (word for words in values.values() for word in words):
+            file = re.split(r"[:=]", word)[0]
+            if re.match(r"(studies|examples|results)/", file):
+                known = (ROOT / file).exists() or file in made
+                assert known, f"{name(page)}: {command}: {word} does not exist"
+            elif why is not None and re.fullmatch(r"[^/]+\.(csv|mat)", file):
+                known = file in made or file in why
+                assert known, f"{name(page)}: {command}: nothing on the page makes {file}"
+
+
+def test_a_wrong_option_command_or_choice_is_found():
+    for wrong in (
+        "excite dream",
+        "excite simulate aero2 --loud",
+        "excite identify r.csv --initial-state x",
+    ):
+        with pytest.raises(click.UsageError):
+            parsed(wrong)
+    assert parsed("excite design aero2 --out a.csv  # comment") == {
+        "": ["aero2"],
+        "--out": ["a.csv"],
+    }
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_links_lead_to_files_and_headings(page: Path):
+    for path, anchor in links(page):
+        target = page.parent / path if path else page
+        assert target.exists(), f"{name(page)}: {path}"
+        if anchor:
+            assert anchor in anchors(target), f"{name(page)}: {path}#{anchor}"
+
+
+def test_every_page_stands_in_the_sites_navigation():
+    listed = (ROOT / "mkdocs.yml").read_text()
+    for page in sorted(ROOT.glob("docs/**/*.md")):
+        assert page.relative_to(ROOT / "docs").as_posix() in listed
+
+
+def test_the_site_builds_strictly_and_asks_nothing_of_the_network(tmp_path: Path):
+    if importlib.util.find_spec("mkdocs") is None:
+        pytest.skip("MkDocs is not installed: python -m pip install -e '.[docs]'")
+    run = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "-d", str(tmp_path)],
+        cwd=ROOT, env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
+        capture_output=True, text=True, timeout=300, check=False,
+    )  # fmt: skip
+    assert run.returncode == 0, run.stderr
+    for page in tmp_path.rglob("*.html"):
+        loaded = re.findall(
+            r"<(?:script|link|img|iframe)\b[^>]*(?:src|href)=\"([^\"]*)", page.read_text()
+        )
+        assert not [url for url in loaded if "//" in url], page
+    reference = (tmp_path / "api" / "estimation.html").read_text()
+    assert 'id="excite.estimation.NLS"' in reference  # re-exported names are there
+    assert 'href="results/baselines/table.html"' not in reference
+    assert (tmp_path / "results" / "table1" / "table.html").is_file()
+
+
+def test_every_room_has_its_place_in_the_reference():
+    pages = "".join(page.read_text() for page in sorted(ROOT.glob("docs/api/*.md")))
+    rooms = {path.stem for path in (ROOT / "src" / "excite").iterdir() if path.stem[0] != "_"}
+    shown = {room.split(".")[0] for room in re.findall(r"^::: excite\.([\w.]+)", pages, re.M)}
+    # Seen by its commands, by its page in the browser, or data.
+    assert rooms - shown <= {"cli", "web", "policies"}
+
+
+def test_the_readme_table_holds_the_committed_results():
+    rows = json.loads((ROOT / "results" / "table1" / "table.json").read_text())["rows"]
+    found = {(row["method"], row["estimator"]): row for row in rows}
+    published = tomllib.loads((ROOT / "studies" / "table1.toml").read_text())["reference"]
+    lines = [
+        line.split("|")[1:-1] for line in README.read_text().splitlines() if line.count(" / ") == 6
+    ]
+    assert len(lines) == len(published) == 7
+    for method, *errors, violations in ([cell.strip() for cell in line] for line in lines):
+        key = method.replace("PRBS", "prbs")
+        for parameter, cell in zip(("J_p", "K_pu", "D_p"), errors, strict=True):
+            ours = [
+                found[key, kind]["relative_error_percent"][parameter]["mean"]
+                for kind in ("arx-rls", "nls")
+            ]
+            paper = published[key]["relative_error_percent"][parameter][0]
+            assert [float(x) for x in cell.split("/")] == pytest.approx([paper, *ours], rel=0.03)
+        row = found[key, "arx-rls"]
+        assert (
+            violations
+            == f"{published[key]['violations']}, ours {row['violations']}/{row['evaluations']}"
+        )
+
+
+def test_the_tutorial_on_table_1_holds_the_committed_results():
+    page = (ROOT / "docs" / "tutorials" / "table-1.md").read_text()
+    for study in ("baselines", "table1"):
+        for line in (ROOT / "results" / study / "table.md").read_text().splitlines():
+            if line.startswith("|") and "| arx-rls |" in line:
+                damping = line.split("|")[7].strip()
+                mean = damping.split(" ")[0].split(".")[0]
+                assert damping in page or f"| {mean} ± " in page, line
+
+
+def test_the_page_on_the_damping_error_holds_the_committed_results():
+    page = (ROOT / "docs" / "damping-error.md").read_text().splitlines()
+    header = next(line for line in page if line.startswith("| signal | sensor noise"))
+    starts = [cell.split("=")[1].strip() for cell in header.split("|") if "P_0" in cell]
+    noise = {
+        "none": "damping_noise_free",
+        "0.0002 rad": "damping",
+        "0.00063 rad": "damping_encoder",
+    }
+    method, checked = "", 0
+    for line in page:
+        cells = [cell.strip() for cell in line.split("|")[1:-1]]
+        if len(cells) < 3 or cells[1] not in noise:
+            continue
+        method = cells[0].lower() or method
+        rows = json.loads((ROOT / "results" / noise[cells[1]] / "table.json").read_text())["rows"]
+        found = {row["estimator"]: row for row in rows if row["method"] == method}
+        for start, shown in zip(starts, cells[2:], strict=False):
+            mean = found[f"P0 = {start}"]["relative_error_percent"]["D_p"]["mean"]
+            assert float(shown) == pytest.approx(mean, rel=6e-3)
+            checked += 1
+        bound = found[f"P0 = {starts[0]}"]["cramer_rao_percent"]["D_p"]
+        assert float(cells[-1]) == pytest.approx(bound, rel=0.06, abs=1e-5)
+    assert checked == 9 * len(starts)
+
+
+def test_the_tutorial_shows_the_example_plant_as_it_is():
+    page = (ROOT / "docs" / "tutorials" / "own-plant.md").read_text()
+    [shown] = re.findall(r"```python\n(.*?)```", page, re.S)
+    assert shown in (ROOT / "examples" / "flexible_drive.py").read_text()
