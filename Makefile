@@ -47,7 +47,7 @@ policies: ## what is shipped in src/excite/policies, from the results of the stu
 	touch $@
 
 .venv/dev: .venv/core
-	$(INSTALL) --editable '.[dev,ppo,dask,tune,fmu,onnx]'
+	$(INSTALL) --editable '.[dev,ppo,dask,tune,fmu,onnx,web]'
 	touch $@
 
 clean:

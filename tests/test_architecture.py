@@ -39,7 +39,9 @@ CELLS = [
     {"engine"},
     {"benchmark", "rig", "identification"},
     {"report", "export"},
-    {"cli", "web"},
+    {"live"},
+    {"web"},
+    {"cli"},
     {"__main__"},
 ]
 PLACE = {room: i for i, rooms in enumerate(CELLS) for room in rooms}

@@ -23,6 +23,7 @@ from .information import information
 from .plants import plants
 from .policies import evaluate, policies
 from .run import run
+from .serve import serve
 from .simulate import simulate
 from .study import study
 from .train import train
@@ -40,7 +41,7 @@ def cli(debug: bool) -> None:
 
 for command in (
     plants, policies, simulate, information, identify, design, train, evaluate, run, export,
-    benchmark, study, doctor,
+    benchmark, study, serve, doctor,
 ):  # fmt: skip
     cli.add_command(command)
 
