@@ -65,6 +65,8 @@ def application(settings: Settings, scratch: Path) -> Starlette:
         if not known:
             async with contextlib.aclosing(workers.events("catalogue", {}, True)) as events:
                 known.extend([event async for event in events if event["kind"] == "catalogue"])
+        if not known:
+            raise RefusedError(503, "the workers do not start; the terminal says why")
         return JSONResponse(known[0])
 
     routes = [

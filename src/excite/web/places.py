@@ -111,7 +111,7 @@ async def _content(request: Request) -> bytes:
 async def _last(pool: Pool, target: str, arguments: dict[str, Any], urgent: bool) -> dict[str, Any]:
     """The last event of a call before its end."""
     told: dict[str, Any] = {}
-    async with aclosing(pool.events(target, arguments, urgent)) as events:  # pyright: ignore
+    async with aclosing(pool.events(target, arguments, urgent)) as events:
         async for event in events:
             if event["kind"] == "failed":
                 raise RefusedError(422, event["sentence"])

@@ -10,7 +10,7 @@ import asyncio
 import json
 import math
 import secrets
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Mapping
 from contextlib import aclosing
 from typing import Any
 
@@ -25,7 +25,7 @@ FRAME = 0.04
 _PULSE = 1.0  # seconds after which a silent stream says that it lives
 
 Event = dict[str, Any]
-Events = AsyncIterator[Event]
+Events = AsyncGenerator[Event]
 
 
 def routes(pool: Pool, body: Callable[[Request], Any]) -> list[Route]:
@@ -97,7 +97,7 @@ def _streamed(session: Session, events: Callable[[asyncio.Event], Events]) -> St
     async def lines() -> AsyncIterator[str]:
         try:
             yield _line({"kind": "job", "job": job})
-            async with aclosing(events(stop)) as told:  # pyright: ignore[reportArgumentType]
+            async with aclosing(events(stop)) as told:
                 async for event in told:
                     yield _line(event)
         finally:
@@ -116,7 +116,7 @@ async def _lively(events: Events, stop: asyncio.Event) -> Events:
     following = None
     try:
         while True:
-            following = following or asyncio.ensure_future(anext(events))  # pyright: ignore
+            following = following or asyncio.ensure_future(anext(events))
             await asyncio.wait({stopped, following}, timeout=_PULSE, return_when="FIRST_COMPLETED")
             if stopped.done():
                 yield {"kind": "stopped"}
@@ -133,7 +133,7 @@ async def _lively(events: Events, stop: asyncio.Event) -> Events:
         if following is not None:
             following.cancel()
             await asyncio.gather(following, return_exceptions=True)
-        await events.aclose()  # pyright: ignore[reportAttributeAccessIssue]
+        await events.aclose()
 
 
 async def _identified(
@@ -146,7 +146,7 @@ async def _identified(
         "name": next(iter(source.iterdir())).name,
         "folder": str(place / "run"),
     }
-    async with aclosing(_lively(pool.events("identified", arguments), stop)) as events:  # pyright: ignore
+    async with aclosing(_lively(pool.events("identified", arguments), stop)) as events:
         async for event in events:
             yield {**event, "result": name} if event["kind"] == "identified" else event
 
@@ -156,7 +156,7 @@ async def _played(
 ) -> Events:
     """The samples at their pace, estimates among them, then what the rest comes to."""
     shown = None
-    async with aclosing(_lively(pool.events("episode", {"asked": asked}, True), stop)) as events:  # pyright: ignore
+    async with aclosing(_lively(pool.events("episode", {"asked": asked}, True), stop)) as events:
         async for event in events:
             if event["kind"] == "episode":
                 shown = event
@@ -171,7 +171,7 @@ async def _played(
     waiting = asyncio.Queue[Event]()
 
     async def follow() -> None:
-        async with aclosing(pool.events("followed", arguments)) as events:  # pyright: ignore
+        async with aclosing(pool.events("followed", arguments)) as events:
             async for event in events:
                 if event["kind"] != "started":
                     waiting.put_nowait(event)
@@ -193,9 +193,7 @@ async def _mixed(player: _Player, waiting: asyncio.Queue[Event], stop: asyncio.E
             early.append(waiting.get_nowait())
         if (frame := player.frame()) is not None:
             yield frame
-        while (
-            early and early[0].get("k", player.last if player.is_over else math.inf) <= player.last
-        ):
+        while early and player.allows(early[0]):
             event = early.pop(0)
             yield event
             silent = 0.0
@@ -222,14 +220,13 @@ class _Player:
         return {**known, "kind": "plan", "num_samples": len(self._shown["time"])}
 
     @property
-    def last(self) -> int:
-        """Index of the last sample shown."""
-        return self._sent - 1
-
-    @property
     def is_over(self) -> bool:
         """Whether all samples were shown."""
         return self._sent == len(self._shown["time"])
+
+    def allows(self, event: Event) -> bool:
+        """Whether an event may be shown: not before the sample it was made at, or the last."""
+        return self.is_over or event.get("k", math.inf) <= self._sent - 1
 
     def frame(self) -> Event | None:
         """The samples that are due."""
@@ -239,7 +236,5 @@ class _Player:
         self._sent = max(self._sent, due.stop)
         if due.start >= due.stop:
             return None
-        return {
-            "kind": "samples",
-            **{k: self._shown[k][due] for k in ("time", "inputs", "outputs")},
-        }
+        parts = ("time", "inputs", "outputs")
+        return {"kind": "samples", **{part: self._shown[part][due] for part in parts}}

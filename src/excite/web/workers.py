@@ -13,7 +13,7 @@ import itertools
 import json
 import os
 import sys
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncGenerator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +44,7 @@ class Workers:
 
     async def events(
         self, target: str, arguments: Mapping[str, Any], urgent: bool = False
-    ) -> AsyncIterator[dict[str, Any]]:
+    ) -> AsyncGenerator[dict[str, Any]]:
         """Events of one call, from `started` to `end` or `failed`; closing it ends the work.
 
         Args:
@@ -64,10 +64,13 @@ class Workers:
     async def _lane(self) -> None:
         """One worker, its successors, and what they do one after the other."""
         while True:
-            process = await self._started()
+            process, is_warm = await self._started(), False
             try:
-                await _served(process, _Job(_call("warm_up", {})))
                 while process.returncode is None:
+                    if not is_warm and self._queue.empty():  # otherwise somebody waits already
+                        await _served(process, _Job(_call("warm_up", {})))
+                        is_warm = True
+                        continue
                     _, _, job = await self._queue.get()
                     if not job.stop.is_set():
                         await _served(process, job)
