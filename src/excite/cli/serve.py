@@ -74,10 +74,10 @@ def serve(
         port = listening.getsockname()[1]
         shown = f"[{host}]" if ":" in host else host
         address = f"http://{shown}:{port}/" + (f"#{token}" if token else "")
-        _tell({"address": address, "token": token, "runs": str(runs)}, as_json)
+        told = {"address": address, "token": token, "runs": str(runs)}
         num_workers = workers or min(4, len(os.sched_getaffinity(0)))
-        cache = cache_folder()
-        serve_here(Settings(runs.absolute(), host, token, num_workers, cache), listening)
+        settings = Settings(runs.absolute(), host, token, num_workers, cache_folder())
+        serve_here(settings, listening, lambda: _tell(told, as_json))
     if not as_json:
         click.echo("stopped")
 

@@ -41,19 +41,23 @@ __all__ = ["Settings", "application", "is_loopback", "serve"]
 _STATIC = Path(__file__).with_name("static")
 
 
-def application(settings: Settings, scratch: Path) -> Starlette:
+def application(
+    settings: Settings, scratch: Path, ready: Callable[[], None] = lambda: None
+) -> Starlette:
     """The page and everything it may ask for.
 
     Args:
         scratch: an empty folder for what browsers upload and what is found for them.
+        ready: called when it answers.
     """
     workers, trainings = Workers(settings.num_workers, settings.cache), list[Training]()
     known: list[dict[str, Any]] = []
 
     @contextlib.asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
-        del app
+        app.state.close_workers = workers.close
         await workers.open()
+        ready()
         try:
             yield
         finally:
@@ -119,15 +123,25 @@ def _refused(request: Request, error: RefusedError) -> JSONResponse:
     return JSONResponse({"sentence": error.sentence}, error.status)
 
 
-def serve(settings: Settings, listening: socket.socket) -> None:
-    """Serves until interrupted, on a socket that is bound already."""
+class _Server(uvicorn.Server):
+    """A server whose workers end first, so that no request waits for them."""
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Ends what computes, then what serves."""
+        app: Any = self.config.app
+        await app.state.close_workers()
+        await super().shutdown(sockets)
+
+
+def serve(settings: Settings, listening: socket.socket, ready: Callable[[], None]) -> None:
+    """Serves until interrupted, on a socket that is bound already; calls `ready` at its start."""
     with tempfile.TemporaryDirectory(prefix="excite-bench-", ignore_cleanup_errors=True) as scratch:
         config = uvicorn.Config(
-            application(settings, Path(scratch)),
+            application(settings, Path(scratch), ready),
             log_level="error",
             server_header=False,
             proxy_headers=False,
             timeout_graceful_shutdown=1,
         )
         with contextlib.suppress(KeyboardInterrupt):
-            uvicorn.Server(config).run(sockets=[listening])
+            _Server(config).run(sockets=[listening])

@@ -11,7 +11,7 @@ import time
 from collections.abc import AsyncGenerator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 MAX_UPLOAD = 32 * 2**20
 """Bytes of an uploaded file."""
@@ -55,6 +55,7 @@ class Settings:
     cache: Path | None = None
 
 
+@runtime_checkable
 class Pool(Protocol):
     """Workers; see `workers`."""
 

@@ -31,13 +31,16 @@ class Workers:
         self._num_workers, self._environment = num_workers, _environment(cache)
         self._queue: asyncio.PriorityQueue[tuple[int, int, _Job]] = asyncio.PriorityQueue()
         self._numbers, self._lanes = itertools.count(), list[asyncio.Task]()
+        self._jobs = set[_Job]()
 
     async def open(self) -> None:
         """Starts the processes; they warm up while the page is served."""
         self._lanes = [asyncio.create_task(self._lane()) for _ in range(self._num_workers)]
 
     async def close(self) -> None:
-        """Ends them all."""
+        """Ends them all, and tells everybody who waits for one."""
+        for job in self._jobs:
+            job.events.put_nowait(_failure("the server has ended"))
         for lane in self._lanes:
             lane.cancel()
         await asyncio.gather(*self._lanes, return_exceptions=True)
@@ -52,6 +55,7 @@ class Workers:
         """
         job = _Job(_call(target, arguments))
         self._queue.put_nowait((0 if urgent else 1, next(self._numbers), job))
+        self._jobs.add(job)
         try:
             while True:
                 event = await job.events.get()
@@ -59,6 +63,7 @@ class Workers:
                 if event["kind"] in ("end", "failed"):
                     return
         finally:
+            self._jobs.discard(job)
             job.stop.set()
 
     async def _lane(self) -> None:
