@@ -20,7 +20,7 @@ from starlette.testclient import TestClient
 
 from excite.files import write_json
 from excite.web import Settings, application
-from excite.web.base import MAX_JOBS, MAX_UPLOAD, Session
+from excite.web.base import MAX_JOBS, MAX_UPLOAD, RefusedError, Session
 from excite.web.runs import found
 from excite.web.security import MAX_TRIES
 
@@ -481,9 +481,19 @@ def test_a_browser_cannot_see_or_stop_what_is_anothers(address: str, client, tol
 
 def test_a_browser_has_so_many_things_under_way(tmp_path: Path):
     session = Session(tmp_path)
-    session.stops = dict.fromkeys(range(MAX_JOBS))  # pyright: ignore[reportAttributeAccessIssue]
-    with pytest.raises(Exception, match="stop one"):
-        session.require_room()
+    jobs = [session.begin() for _ in range(MAX_JOBS)]
+    with pytest.raises(RefusedError, match="stop one"):
+        session.begin()
+    session.end(jobs[0])
+    session.begin()
+
+
+def test_a_picture_in_a_foreign_page_makes_no_session(runs: Path, scratch: Path):
+    stranger = guarded(runs, scratch)
+    for place in ("image", "iframe", "empty"):
+        answer = stranger.get("/", headers={"sec-fetch-dest": place})
+        assert answer.status_code == 403
+        assert "set-cookie" not in answer.headers
 
 
 # -------------------------------------------------------------------------------- the token

@@ -73,7 +73,7 @@ class Session:
     Attributes:
         is_known: whether it has shown the token, where there is one.
         folder: its uploads and results.
-        stops: how to stop what is under way, by the name of the job.
+        stops: how to stop what is under way, by its name; None for what is short.
         kept: folders of results and uploads by name, oldest first.
         trainings: trainings it has started, by name.
     """
@@ -104,10 +104,21 @@ class Session:
         """Removes a result or upload."""
         shutil.rmtree(self.kept.pop(name, self.folder / "nothing"), ignore_errors=True)
 
-    def require_room(self) -> None:
-        """Raises RefusedError where too much is under way already."""
+    def begin(self, stop: Any = None) -> str:
+        """The name of one more thing that is under way, until `end`.
+
+        Raises:
+            RefusedError: where too much is under way already.
+        """
         if len(self.stops) >= MAX_JOBS:
             raise RefusedError(429, f"{MAX_JOBS} things are under way in this browser; stop one")
+        name = secrets.token_urlsafe(12)
+        self.stops[name] = stop
+        return name
+
+    def end(self, name: str) -> None:
+        """That thing is over."""
+        self.stops.pop(name, None)
 
 
 class Sessions:

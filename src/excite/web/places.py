@@ -30,8 +30,8 @@ def routes(pool: Pool, run_of: Callable[[Request], Path]) -> list[Route]:
 
     async def upload(request: Request) -> JSONResponse:
         session: Session = request.state.session
-        session.require_room()
         file = _file_name(request.query_params.get("name", ""))
+        job = session.begin()
         name, place = session.new_place()
         try:
             (place / file).write_bytes(await _content(request))
@@ -39,6 +39,8 @@ def routes(pool: Pool, run_of: Callable[[Request], Path]) -> list[Route]:
         except BaseException:
             session.forget(name)
             raise
+        finally:
+            session.end(job)
         return JSONResponse({"upload": name, "file": file, "columns": told["columns"]})
 
     def file(request: Request) -> FileResponse:
@@ -59,7 +61,7 @@ def routes(pool: Pool, run_of: Callable[[Request], Path]) -> list[Route]:
         return await _reported(request.state.session, run_of(request))
 
     async def _reported(session: Session, run: Path) -> Response:
-        session.require_room()
+        job = session.begin()
         name, place = session.new_place()
         try:
             out = str(place / "report.html")
@@ -67,6 +69,7 @@ def routes(pool: Pool, run_of: Callable[[Request], Path]) -> list[Route]:
             content = (place / "report.html").read_bytes()
         finally:
             session.forget(name)
+            session.end(job)
         return Response(
             content,
             media_type="text/html",

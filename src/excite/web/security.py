@@ -24,7 +24,7 @@ from .base import RefusedError, Session, Sessions, Settings
 MAX_TRIES = 10
 """Wrong tokens in a minute, from everywhere together."""
 _LOCAL = ("localhost", "127.0.0.1", "::1")
-_OPEN = ("/", "/static/", "/api/session")
+_OPEN = ("/", "/api/session")
 """What is answered before a token is shown: the page itself, which says nothing."""
 _HEADERS = {
     "content-security-policy": "default-src 'self'; object-src 'none'; base-uri 'none'; "
@@ -64,6 +64,9 @@ class Guard:
             headers = Headers(scope=scope)
             self._check_host(headers, scope)
             _check_origin(headers, scope)
+            if scope["path"].startswith("/static/"):
+                await self._app(scope, receive, answer)
+                return
             session, cookie = self._session(headers, scope)
             self._check_known(session, scope)
             scope.setdefault("state", {})["session"] = session
@@ -107,9 +110,8 @@ class Guard:
         session = self._sessions.get(morsel.value) if morsel else None
         if session is not None:
             return session, None
-        if scope["path"] != "/":
-            if scope["path"].startswith("/static/"):
-                return Session(self._settings.runs), None
+        # Nor does a picture in a foreign page, that is not one, make sessions.
+        if scope["path"] != "/" or headers.get("sec-fetch-dest") not in (None, "document"):
             raise RefusedError(403, "this browser is not known here; open the page again")
         secret, session = self._sessions.new()
         return session, f"{name}={secret}; HttpOnly; SameSite=Strict; Path=/"
@@ -117,8 +119,7 @@ class Guard:
     def _check_known(self, session: Session, scope: Scope) -> None:
         if self._settings.token is None or session.is_known:
             return
-        path = scope["path"]
-        if path not in _OPEN and not path.startswith("/static/"):
+        if scope["path"] not in _OPEN:
             raise RefusedError(
                 401, "the token is needed; it was printed where the page was started"
             )

@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import json
 import math
-import secrets
 from collections.abc import AsyncGenerator, AsyncIterator, Callable, Mapping
 from contextlib import aclosing
 from typing import Any
@@ -48,7 +47,7 @@ def routes(pool: Pool, body: Callable[[Request], Any]) -> list[Route]:
 
     async def stop(request: Request) -> JSONResponse:
         stops = request.state.session.stops
-        if request.path_params["job"] not in stops:
+        if stops.get(request.path_params["job"]) is None:
             raise RefusedError(404, "nothing of this name is under way in this browser")
         stops[request.path_params["job"]].set()
         return JSONResponse({"stopped": True})
@@ -90,9 +89,8 @@ def _identification(asked: Mapping[str, Any]) -> Event:
 
 def _streamed(session: Session, events: Callable[[asyncio.Event], Events]) -> StreamingResponse:
     """A response that goes on until the events end, or the browser stops or leaves."""
-    session.require_room()
-    job, stop = secrets.token_urlsafe(12), asyncio.Event()
-    session.stops[job] = stop
+    stop = asyncio.Event()
+    job = session.begin(stop)
 
     async def lines() -> AsyncIterator[str]:
         try:
@@ -100,8 +98,10 @@ def _streamed(session: Session, events: Callable[[asyncio.Event], Events]) -> St
             async with aclosing(events(stop)) as told:
                 async for event in told:
                     yield _line(event)
+        except RefusedError as refused:
+            yield _line({"kind": "failed", "sentence": refused.sentence})
         finally:
-            session.stops.pop(job, None)
+            session.end(job)
 
     return StreamingResponse(lines(), media_type="application/x-ndjson")
 

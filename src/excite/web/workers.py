@@ -17,8 +17,12 @@ from collections.abc import AsyncGenerator, Mapping
 from pathlib import Path
 from typing import Any
 
+from .base import RefusedError
+
 GRACE = 0.5
 """Seconds in which work stops by itself."""
+MAX_WAITING = 64
+"""Calls in the queue."""
 _LINE = 64 * 2**20  # bytes; a longer event is a defect
 _TIME_LIMIT = 900.0  # seconds a single call may take
 _ONE = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NPROC", "JAX_ENABLE_X64")
@@ -53,6 +57,8 @@ class Workers:
         Args:
             urgent: before all that is not: somebody waits for the first sign of life.
         """
+        if self._queue.qsize() >= MAX_WAITING:
+            raise RefusedError(503, "too much is waiting for the workers; try again later")
         job = _Job(_call(target, arguments))
         self._queue.put_nowait((0 if urgent else 1, next(self._numbers), job))
         self._jobs.add(job)

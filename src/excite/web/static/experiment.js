@@ -93,6 +93,9 @@ function asked() {
   };
 }
 
+const waiting = (live) => (live.found.length ? "Estimating and comparing…"
+  : "Compiling the estimator for this plant and length, which takes a while, once…");
+
 function run() {
   const wanted = asked();
   let live = null, rows = [];
@@ -104,8 +107,11 @@ function run() {
     else if (event.kind === "plan") live = new Live(event);
     else if (event.kind === "samples") {
       live.samples(event);
-      say(form, live.isFull ? "Estimating and comparing…" : `Running: ${shown(live.time.at(-1))} of ${shown(live.end)} s`);
-    } else if (event.kind === "estimate") live.estimate(event);
+      say(form, live.isFull ? waiting(live) : `Running: ${shown(live.time.at(-1))} of ${shown(live.end)} s`);
+    } else if (event.kind === "estimate") {
+      live.estimate(event);
+      if (live.isFull) say(form, waiting(live));
+    }
     else if (event.kind === "result" || event.kind === "other") {
       rows.push(event.row);
       compare(live, rows, wanted.others.length + 1);
