@@ -122,7 +122,7 @@ def running_information(
 
     weighted = sensitivity(response, jnp.zeros(len(theta))) / plant.sensor.sd[None, :, None]
     each = jnp.einsum("koi,koj->kij", weighted, weighted)
-    return each[0] + jnp.cumsum(each[1:], axis=0)
+    return jnp.cumsum(each, axis=0)[1:]
 
 
 def relative_size(plant: AbstractPlant, params: Params) -> Float[Array, " param"]:

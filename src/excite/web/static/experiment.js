@@ -111,8 +111,7 @@ function run() {
     } else if (event.kind === "estimate") {
       live.estimate(event);
       if (live.isFull) say(form, waiting(live));
-    }
-    else if (event.kind === "result" || event.kind === "other") {
+    } else if (event.kind === "result" || event.kind === "other") {
       rows.push(event.row);
       compare(live, rows, wanted.others.length + 1);
       if (event.kind === "result") conclude(event);
