@@ -50,7 +50,7 @@ policies: ## what is shipped in src/excite/policies, from the results of the stu
 	touch $@
 
 .venv/dev: .venv/core
-	$(INSTALL) --editable '.[dev,docs,ppo,dask,tune,fmu,onnx]'
+	$(INSTALL) --editable '.[dev,docs,ppo,dask,tune,fmu,onnx,web]'
 	touch $@
 
 clean:

@@ -40,7 +40,9 @@ CELLS = [
     {"rig", "identification"},
     {"benchmark"},
     {"report", "export"},
-    {"cli", "web"},
+    {"live"},
+    {"web"},
+    {"cli"},
     {"__main__"},
 ]
 PLACE = {room: i for i, rooms in enumerate(CELLS) for room in rooms}

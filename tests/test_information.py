@@ -19,6 +19,7 @@ from excite.information import (
     fisher_information,
     marginal_information,
     relative_size,
+    running_information,
     sensitivity,
 )
 from excite.plant import Aero2, Sensor
@@ -117,6 +118,18 @@ def test_information_of_an_experiment_is_that_of_its_sensitivities(name, initial
     np.testing.assert_allclose(cramer_rao_bound(ours), bound, rtol=1e-5)
     np.testing.assert_allclose(ours, ours.T, rtol=1e-12)
     assert np.linalg.eigvalsh(ours)[0] > 0
+
+
+@names
+def test_running_information_grows_to_that_of_the_whole_experiment(name):
+    plant, inputs = PLANTS[name], inputs_of(name)
+    running = running_information(plant, plant.nominal, inputs)
+    assert running.shape[0] == len(inputs)
+    whole = experiment_information(plant, plant.nominal, inputs)
+    np.testing.assert_allclose(running[-1], whole, rtol=1e-9, atol=1e-9 * np.abs(whole).max())
+    half = len(inputs) // 2
+    first = experiment_information(plant, plant.nominal, inputs[:half])
+    np.testing.assert_allclose(running[half - 1], first, rtol=1e-9, atol=1e-9 * np.abs(first).max())
 
 
 @names

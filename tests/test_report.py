@@ -504,8 +504,8 @@ def test_the_autocorrelation_of_white_noise_lies_between_the_dashed_lines():
         assert least <= np.mean(np.abs(bars) < level) <= most
     one = walk[0][:, 0] - walk[0].mean()
     (axis,) = autocorrelation_figure(AERO2, walk[:1]).axes
-    lines: Any = axis.collections[0]
-    assert lines.get_segments()[0][1, 1] == pytest.approx(one[1:] @ one[:-1] / (one @ one))
+    first: Any = axis.collections[0]
+    assert first.get_segments()[0][1, 1] == pytest.approx(one[1:] @ one[:-1] / (one @ one))
 
 
 def test_a_figure_that_cannot_be_written_leaves_nothing(figures, tmp_path):

@@ -26,7 +26,9 @@ The floor plan, from left to right; a module imports only what stands left of it
     benchmark      methods and agents x estimators on common plants and noise
     report         records to tables, figures and pages
     export         a policy as ONNX, for other tools
+    live           what the bench page asks for, told event by event
     cli            the command line
+    web            the bench page: server, workers, and what a browser may ask for
     policies       policies that are shipped, as data
 
 This file imports nothing, so that `import excite` costs nothing.

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -104,6 +105,24 @@ def experiment_information(
     if initial_state_known:
         return fisher_information(S, plant.sensor.sd)
     return marginal_information(S, plant.sensor.sd, num_params)
+
+
+@eqx.filter_jit
+def running_information(
+    plant: AbstractPlant, params: Params, inputs: Float[Array, "time input"]
+) -> Float[Array, "time param param"]:
+    """What `experiment_information` is after each step, the initial state known.
+
+    The last is that of the whole experiment.
+    """
+    theta, size = jnp.stack([jnp.asarray(p, float) for p in params]), relative_size(plant, params)
+
+    def response(change: Array) -> Array:
+        return simulate(plant, plant.Params(*(theta + size * change)), inputs)
+
+    weighted = sensitivity(response, jnp.zeros(len(theta))) / plant.sensor.sd[None, :, None]
+    each = jnp.einsum("koi,koj->kij", weighted, weighted)
+    return jnp.cumsum(each, axis=0)[1:]
 
 
 def relative_size(plant: AbstractPlant, params: Params) -> Float[Array, " param"]:

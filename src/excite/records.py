@@ -110,7 +110,7 @@ def read_record(
     for name, factor in scales.items():
         if not (np.isfinite(factor) and factor != 0):
             raise ValueError(f"scale {factor:g} of {name!r} is not allowed: finite and not zero")
-    table = _read_table(path)
+    table = columns_in(path)
 
     def read(name: str) -> np.ndarray:
         return _column(table, columns.get(name, name), name, path) * scales.get(name, 1.0)
@@ -170,8 +170,12 @@ def require_playable(record: Record, description: PlantDescription) -> None:
             )
 
 
-def _read_table(path: Path) -> dict[str, np.ndarray | list[str]]:
-    """Columns by name; those of a CSV file still as text."""
+def columns_in(path: Path) -> dict[str, np.ndarray | list[str]]:
+    """Columns of a CSV or MAT file by name, those of a CSV file still as text.
+
+    Raises:
+        ValueError: one sentence for a file that cannot be read.
+    """
     _require_record_ending(path)
     if not path.is_file():
         raise ValueError(f"{path}: no such file")

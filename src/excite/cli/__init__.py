@@ -24,6 +24,7 @@ from .plants import plants
 from .policies import evaluate, policies
 from .report import report
 from .run import run
+from .serve import serve
 from .simulate import simulate
 from .study import study
 from .train import train
@@ -41,7 +42,7 @@ def cli(debug: bool) -> None:
 
 for command in (
     plants, policies, simulate, information, identify, design, train, evaluate, run, export,
-    benchmark, study, report, doctor,
+    benchmark, study, report, serve, doctor,
 ):  # fmt: skip
     cli.add_command(command)
 

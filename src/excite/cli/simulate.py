@@ -184,26 +184,10 @@ def _by_name(parts: Any, values: Any) -> dict[str, float]:
 
 
 def _record(run: Any, job: dict[str, Any], seed: int) -> Any:
-    from .. import __version__
-    from ..records import Record
+    from ..live import simulated_record
 
-    names = [p.name for p in job["plant"].definition.parameters]
-    return Record.of_episode(
-        run.time,
-        run.inputs,
-        run.measured,
-        {
-            "params": dict(zip(names, map(float, job["params"]), strict=True)),
-            "starts_at_initial_state": True,
-            "provenance": {
-                "excite": __version__,
-                "simulated": True,
-                "excitation": job["excitation_name"],
-                "seed": seed,
-                **job["origin"],
-            },
-        },
-    )
+    provenance = {"excitation": job["excitation_name"], "seed": seed, **job["origin"]}
+    return simulated_record(run, job["plant"], job["params"], provenance)
 
 
 def _show(description: Any, summary: dict[str, Any]) -> None:

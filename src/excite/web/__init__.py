@@ -1,0 +1,147 @@
+"""The bench page: choose an excitation, watch the identification happen, keep the result.
+
+This process serves and computes nothing: it loads neither JAX nor a plant, so that the page
+opens at once. `worker` processes call `excite.live` and tell what they find, event by event.
+`base` holds the nouns, `security` guards every request, `streams`, `places`, `runs` and
+`trainings` answer them.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import socket
+import tempfile
+from collections.abc import AsyncIterator, Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.middleware import Middleware
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
+
+from .base import MAX_BODY, RefusedError, Sessions, Settings
+from .places import routes as place_routes
+from .runs import routes as run_routes
+from .runs import run_of
+from .security import Guard, is_loopback
+from .streams import routes as stream_routes
+from .trainings import Training
+from .trainings import routes as training_routes
+from .workers import Workers
+
+__all__ = ["Settings", "application", "is_loopback", "serve"]
+
+_STATIC = Path(__file__).with_name("static")
+
+
+def application(
+    settings: Settings, scratch: Path, ready: Callable[[], None] = lambda: None
+) -> Starlette:
+    """The page and everything it may ask for.
+
+    Args:
+        scratch: an empty folder for what browsers upload and what is found for them.
+        ready: called when it answers.
+    """
+    workers, trainings = Workers(settings.num_workers, settings.cache), list[Training]()
+    known: list[dict[str, Any]] = []
+
+    @contextlib.asynccontextmanager
+    async def lifespan(app: Starlette) -> AsyncIterator[None]:
+        app.state.close_workers = workers.close
+        await workers.open()
+        ready()
+        try:
+            yield
+        finally:
+            await asyncio.gather(*(training.stop() for training in trainings))
+            await workers.close()
+
+    async def catalogue(request: Request) -> JSONResponse:
+        del request
+        if not known:
+            async with contextlib.aclosing(workers.events("catalogue", {}, True)) as events:
+                known.extend([event async for event in events if event["kind"] == "catalogue"])
+        if not known:
+            raise RefusedError(503, "the workers do not start; the terminal says why")
+        return JSONResponse(known[0])
+
+    routes = [
+        Route("/", lambda request: FileResponse(_STATIC / "index.html")),
+        Route("/api/session", _session(settings), methods=["GET", "POST"]),
+        Route("/api/catalogue", catalogue),
+        *stream_routes(workers, _body),
+        *place_routes(workers, partial(run_of, settings.runs)),
+        *run_routes(settings.runs),
+        *training_routes(settings.runs, _body, trainings),
+        Mount("/static", StaticFiles(directory=_STATIC)),
+    ]
+    guard = Middleware(Guard, settings=settings, sessions=Sessions(scratch))
+    handlers: Any = {RefusedError: _refused}
+    return Starlette(
+        routes=routes, middleware=[guard], exception_handlers=handlers, lifespan=lifespan
+    )
+
+
+def _session(settings: Settings) -> Callable[[Request], Any]:
+    """Whether this browser may come in; POST shows the token."""
+
+    async def answer(request: Request) -> JSONResponse:
+        if request.method == "POST":
+            request.state.show_token((await _body(request)).get("token"))
+        is_known = settings.token is None or request.state.session.is_known
+        return JSONResponse({"is_known": is_known})
+
+    return answer
+
+
+async def _body(request: Request) -> dict[str, Any]:
+    """A request's JSON, an object of limited size."""
+    content = bytearray()
+    async for part in request.stream():
+        content += part
+        if len(content) > MAX_BODY:
+            raise RefusedError(413, "the request is too large")
+    try:
+        asked = json.loads(bytes(content))
+    except (ValueError, RecursionError):
+        asked = None
+    if not isinstance(asked, dict):
+        raise RefusedError(400, "the request is no JSON object")
+    return asked
+
+
+def _refused(request: Request, error: RefusedError) -> JSONResponse:
+    del request
+    return JSONResponse({"sentence": error.sentence}, error.status)
+
+
+class _Server(uvicorn.Server):
+    """A server whose workers end first, so that no request waits for them."""
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Ends what computes, then what serves."""
+        app: Any = self.config.app
+        await app.state.close_workers()
+        await super().shutdown(sockets)
+
+
+def serve(settings: Settings, listening: socket.socket, ready: Callable[[], None]) -> None:
+    """Serves until interrupted, on a socket that is bound already; calls `ready` at its start."""
+    with tempfile.TemporaryDirectory(prefix="excite-bench-", ignore_cleanup_errors=True) as scratch:
+        config = uvicorn.Config(
+            application(settings, Path(scratch), ready),
+            log_level="error",
+            server_header=False,
+            proxy_headers=False,
+            timeout_graceful_shutdown=1,
+        )
+        with contextlib.suppress(KeyboardInterrupt):
+            _Server(config).run(sockets=[listening])

@@ -1,0 +1,194 @@
+"""The nouns of the bench page: settings, sessions, refusals, and what a browser may ask for."""
+
+from __future__ import annotations
+
+import math
+import re
+import secrets
+import shutil
+import tempfile
+import time
+from collections.abc import AsyncGenerator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+MAX_UPLOAD = 32 * 2**20
+"""Bytes of an uploaded file."""
+MAX_STEPS = 5000
+"""Samples of a simulated experiment."""
+MAX_BODY = 64 * 2**10
+"""Bytes of a request that is no upload."""
+MAX_JOBS = 4
+"""Things a browser may have under way at once."""
+MAX_SESSIONS = 256
+MAX_KEPT = 8
+"""Results and uploads that are kept for a browser; older ones give way."""
+
+_WORD = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
+
+
+class RefusedError(Exception):
+    """A request that is refused: an HTTP status and one sentence for the user."""
+
+    def __init__(self, status: int, sentence: str) -> None:
+        super().__init__(sentence)
+        self.status, self.sentence = status, sentence
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How the page is served.
+
+    Attributes:
+        runs: the run folder; nothing outside of it is ever shown.
+        host: the address that is bound to.
+        token: what a browser must know; None where everybody on this computer may.
+        num_workers: processes that compute.
+        cache: where they keep compiled programs.
+    """
+
+    runs: Path
+    host: str = "127.0.0.1"
+    token: str | None = None
+    num_workers: int = 2
+    cache: Path | None = None
+
+
+@runtime_checkable
+class Pool(Protocol):
+    """Workers; see `workers`."""
+
+    def events(
+        self, target: str, arguments: Mapping[str, Any], urgent: bool = False
+    ) -> AsyncGenerator[dict[str, Any]]:
+        """Events of a function of `excite.live`; closing it ends the work."""
+        ...
+
+
+@dataclass
+class Session:
+    """One browser: what it may see, and nobody else.
+
+    Attributes:
+        is_known: whether it has shown the token, where there is one.
+        folder: its uploads and results.
+        stops: how to stop what is under way, by its name; None for what is short.
+        kept: folders of results and uploads by name, oldest first.
+        trainings: trainings it has started, by name.
+    """
+
+    folder: Path
+    is_known: bool = False
+    stops: dict[str, Any] = field(default_factory=dict)
+    kept: dict[str, Path] = field(default_factory=dict)
+    trainings: dict[str, Any] = field(default_factory=dict)
+    seen: float = field(default_factory=time.monotonic)
+
+    def new_place(self) -> tuple[str, Path]:
+        """A name that cannot be guessed and an empty folder for it."""
+        while len(self.kept) >= MAX_KEPT:
+            oldest = next(iter(self.kept))
+            shutil.rmtree(self.kept.pop(oldest), ignore_errors=True)
+        name = secrets.token_urlsafe(12)
+        self.kept[name] = Path(tempfile.mkdtemp(dir=self.folder))
+        return name, self.kept[name]
+
+    def place(self, name: str) -> Path:
+        """The folder of a result or upload of this browser."""
+        if name not in self.kept:
+            raise RefusedError(404, "there is no such result in this browser; run it again")
+        return self.kept[name]
+
+    def forget(self, name: str) -> None:
+        """Removes a result or upload."""
+        shutil.rmtree(self.kept.pop(name, self.folder / "nothing"), ignore_errors=True)
+
+    def begin(self, stop: Any = None) -> str:
+        """The name of one more thing that is under way, until `end`.
+
+        Raises:
+            RefusedError: where too much is under way already.
+        """
+        if len(self.stops) >= MAX_JOBS:
+            raise RefusedError(429, f"{MAX_JOBS} things are under way in this browser; stop one")
+        name = secrets.token_urlsafe(12)
+        self.stops[name] = stop
+        return name
+
+    def end(self, name: str) -> None:
+        """That thing is over."""
+        self.stops.pop(name, None)
+
+
+class Sessions:
+    """All browsers, by the secret in their cookie."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._all = folder, dict[str, Session]()
+
+    def get(self, secret: str) -> Session | None:
+        """The session of a secret."""
+        session = self._all.get(secret)
+        if session is not None:
+            session.seen = time.monotonic()
+        return session
+
+    def new(self) -> tuple[str, Session]:
+        """A session and its secret; where there are too many, the idlest gives way."""
+        idle = [s for s in self._all if not (self._all[s].stops or self._all[s].trainings)]
+        if len(self._all) >= MAX_SESSIONS:
+            if not idle:
+                raise RefusedError(503, "too many browsers are working here")
+            gone = min(idle, key=lambda s: self._all[s].seen)
+            shutil.rmtree(self._all.pop(gone).folder, ignore_errors=True)
+        secret = secrets.token_urlsafe(32)
+        self._all[secret] = Session(Path(tempfile.mkdtemp(dir=self._folder)))
+        return secret, self._all[secret]
+
+
+# ------------------------------------------------------------- what a browser may ask for
+
+
+def word(asked: Mapping[str, Any], key: str) -> str:
+    """A name without dots, slashes and colons: never a path, never a file."""
+    value = asked.get(key)
+    if not (isinstance(value, str) and _WORD.fullmatch(value)):
+        raise RefusedError(400, f"{key}: the name of something that is shipped is needed")
+    return value
+
+
+def number(asked: Mapping[str, Any], key: str, lower: float, upper: float) -> float:
+    """A finite number of a range."""
+    value = asked.get(key)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise RefusedError(400, f"{key}: a number is needed")
+    if not lower <= value <= upper:
+        raise RefusedError(400, f"{key} must lie between {lower:g} and {upper:g}: got {value:g}")
+    return float(value)
+
+
+def whole(asked: Mapping[str, Any], key: str, lower: int, upper: int) -> int:
+    """A whole number of a range."""
+    value = number(asked, key, lower, upper)
+    if value != int(value):
+        raise RefusedError(400, f"{key} must be a whole number: got {value:g}")
+    return int(value)
+
+
+def numbers(asked: Mapping[str, Any], key: str) -> dict[str, float]:
+    """Numbers by name; at most 32."""
+    value = asked.get(key, {})
+    if not isinstance(value, dict) or len(value) > 32:
+        raise RefusedError(400, f"{key}: numbers by name are needed")
+    return {str(name): number(value, name, -1e12, 1e12) for name in value}
+
+
+def texts(asked: Mapping[str, Any], key: str) -> dict[str, str]:
+    """Short texts by name; at most 32."""
+    value = asked.get(key, {})
+    if not isinstance(value, dict) or len(value) > 32:
+        raise RefusedError(400, f"{key}: texts by name are needed")
+    if not all(isinstance(text, str) and len(text) <= 200 for text in value.values()):
+        raise RefusedError(400, f"{key}: texts by name are needed")
+    return value

@@ -1,0 +1,122 @@
+"""Uploads and results of one browser, which no other can reach, and reports of runs."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from contextlib import aclosing
+from pathlib import Path
+from typing import Any
+
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse, Response
+from starlette.routing import Route
+
+from .base import MAX_UPLOAD, Pool, RefusedError, Session
+
+_DOWNLOADS = {
+    "record.csv": "text/csv",
+    "record.json": "application/json",
+    "estimate.json": "application/json",
+}
+
+
+def routes(pool: Pool, run_of: Callable[[Request], Path]) -> list[Route]:
+    """What takes files, and gives results back.
+
+    Args:
+        run_of: the run in the run folder that a request names.
+    """
+
+    async def upload(request: Request) -> JSONResponse:
+        session: Session = request.state.session
+        file = _file_name(request.query_params.get("name", ""))
+        job = session.begin()
+        name, place = session.new_place()
+        try:
+            (place / file).write_bytes(await _content(request))
+            told = await _last(pool, "columns", {"folder": str(place), "name": file}, True)
+        except BaseException:
+            session.forget(name)
+            raise
+        finally:
+            session.end(job)
+        return JSONResponse({"upload": name, "file": file, "columns": told["columns"]})
+
+    def file(request: Request) -> FileResponse:
+        place, name = request.state.session.place(request.path_params["name"]), request.path_params
+        path = place / "run" / name["file"]
+        if name["file"] not in _DOWNLOADS or not path.is_file():
+            raise RefusedError(404, "this result has no such file")
+        return FileResponse(path, media_type=_DOWNLOADS[path.name], filename=path.name)
+
+    async def report(request: Request) -> Response:
+        session: Session = request.state.session
+        run = session.place(request.path_params["name"]) / "run"
+        if not run.is_dir():
+            raise RefusedError(404, "there is nothing to report of yet")
+        return await _reported(session, run)
+
+    async def run_report(request: Request) -> Response:
+        return await _reported(request.state.session, run_of(request))
+
+    async def _reported(session: Session, run: Path) -> Response:
+        job = session.begin()
+        name, place = session.new_place()
+        try:
+            out = str(place / "report.html")
+            await _last(pool, "reported", {"folders": [str(run)], "out": out}, False)
+            content = (place / "report.html").read_bytes()
+        finally:
+            session.forget(name)
+            session.end(job)
+        return Response(
+            content,
+            media_type="text/html",
+            # It is a file to be kept; shown here, it could not run or load anything.
+            headers={
+                "content-disposition": 'attachment; filename="report.html"',
+                "content-security-policy": "sandbox; default-src 'none'",
+            },
+        )
+
+    return [
+        Route("/api/uploads", upload, methods=["POST"]),
+        Route("/api/results/{name}/report.html", report),
+        Route("/api/results/{name}/{file}", file),
+        Route("/api/run/report.html", run_report),
+    ]
+
+
+def _file_name(name: str) -> str:
+    """The name of an uploaded file, freed of everything but letters, digits, dots and dashes."""
+    stem, dot, ending = name.rpartition(".")
+    if not dot or ending.lower() not in ("csv", "mat"):
+        raise RefusedError(415, "experiment files end in .csv or .mat")
+    return f"{re.sub(r'[^A-Za-z0-9_-]', '_', stem)[-60:] or 'file'}.{ending.lower()}"
+
+
+async def _content(request: Request) -> bytes:
+    """The body of a request, which is read no further than it is allowed to be long."""
+    sentence = f"the file is larger than {MAX_UPLOAD >> 20} MiB"
+    if int(request.headers.get("content-length") or 0) > MAX_UPLOAD:
+        raise RefusedError(413, sentence)
+    content = bytearray()
+    async for part in request.stream():
+        content += part
+        if len(content) > MAX_UPLOAD:
+            raise RefusedError(413, sentence)
+    if not content:
+        raise RefusedError(400, "the file is empty")
+    return bytes(content)
+
+
+async def _last(pool: Pool, target: str, arguments: dict[str, Any], urgent: bool) -> dict[str, Any]:
+    """The last event of a call before its end."""
+    told: dict[str, Any] = {}
+    async with aclosing(pool.events(target, arguments, urgent)) as events:
+        async for event in events:
+            if event["kind"] == "failed":
+                raise RefusedError(422, event["sentence"])
+            told = told if event["kind"] == "end" else event
+    return told

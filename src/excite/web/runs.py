@@ -1,0 +1,166 @@
+"""The run folder, to be looked at: what it holds is listed, and only what is listed is served.
+
+A name from a browser is looked up among the names found by walking the folder; it is never
+made into a path. Links are not followed.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse
+from starlette.routing import Route
+
+from .base import RefusedError
+
+_TYPES = {
+    ".png": "image/png",
+    ".csv": "text/csv",
+    ".json": "application/json",
+    ".md": "text/plain",
+    ".tex": "text/plain",
+    ".safetensors": "application/octet-stream",
+}
+_DEPTH, _MAX_RUNS, _MAX_TEXT = 4, 500, 4 * 2**20
+
+
+def routes(folder: Path) -> list[Route]:
+    """What shows the run folder."""
+
+    def listed(request: Request) -> JSONResponse:
+        del request
+        return JSONResponse({"runs": [_summary(n, p) for n, p in sorted(found(folder).items())]})
+
+    def shown(request: Request) -> JSONResponse:
+        return JSONResponse(_content(run_of(folder, request)))
+
+    def file(request: Request) -> FileResponse:
+        path = _files(run_of(folder, request)).get(request.query_params.get("file", ""))
+        if path is None:
+            raise RefusedError(404, "this run has no such file")
+        return FileResponse(path, media_type=_TYPES[path.suffix], filename=path.name)
+
+    return [
+        Route("/api/runs", listed),
+        Route("/api/run", shown),
+        Route("/api/run/file", file),
+    ]
+
+
+def found(folder: Path) -> dict[str, Path]:
+    """Every run below the run folder, by its path in it."""
+    runs: dict[str, Path] = {}
+    for place, folders, files in os.walk(folder, followlinks=False):
+        path = Path(place)
+        name = path.relative_to(folder).as_posix()
+        if "run.json" in files and len(runs) < _MAX_RUNS:
+            runs[name] = path
+            folders.clear()
+        folders[:] = [f for f in sorted(folders) if f[0] != "." and not (path / f).is_symlink()]
+        if len(path.relative_to(folder).parts) >= _DEPTH:
+            folders.clear()
+    return runs
+
+
+def run_of(folder: Path, request: Request) -> Path:
+    """The run that a request names."""
+    runs = found(folder)
+    name = request.query_params.get("name", "")
+    if name not in runs:
+        raise RefusedError(404, "the run folder holds no such run")
+    return runs[name]
+
+
+def _files(run: Path) -> dict[str, Path]:
+    """Files of a run that may be looked at, by name; those of finished seeds too."""
+
+    def each() -> Iterator[Path]:
+        yield from run.iterdir()
+        yield from run.glob("seeds/*/*/policy.safetensors")
+
+    return {
+        path.relative_to(run).as_posix(): path
+        for path in sorted(each())
+        if path.suffix in _TYPES and path.is_file() and _is_inside(path, run)
+    }
+
+
+def _is_inside(path: Path, run: Path) -> bool:
+    return not path.is_symlink() and path.resolve().is_relative_to(run.resolve())
+
+
+def _json(path: Path) -> dict[str, Any]:
+    """Content of a JSON file; empty where it is missing, or damaged."""
+    try:
+        if path.stat().st_size > _MAX_TEXT:
+            return {}
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def _summary(name: str, run: Path) -> dict[str, Any]:
+    marker, study = _json(run / "run.json"), _json(run / "study.json")
+    plant = marker.get("plant")
+    return {
+        "name": name,
+        "kind": str(marker.get("kind", "")).removeprefix("excite "),
+        "plant": str(plant.get("name", "")) if isinstance(plant, dict) else "",
+        "title": str(study.get("title") or study.get("name") or ""),
+        "is_finished": any((run / f).is_file() for f in ("table.json", "estimate.json")),
+    }
+
+
+def _content(run: Path) -> dict[str, Any]:
+    """What a run shows: its table as it was written, or its estimate, and its files."""
+    files = _files(run)
+    return {
+        **_summary(run.name, run),
+        **_table(run / "table.md"),
+        "estimate": _json(run / "estimate.json"),
+        "curves": _curves(run),
+        "figures": [name for name in files if name.endswith(".png")],
+        "files": [name for name in files if not name.endswith(".png")],
+    }
+
+
+def _table(path: Path) -> dict[str, Any]:
+    """Header, rows and notes of the first table of a Markdown file."""
+    try:
+        lines = path.read_text(encoding="utf-8")[:_MAX_TEXT].splitlines()
+    except (OSError, UnicodeDecodeError):
+        return {"header": [], "rows": [], "notes": []}
+    first = next((i for i, line in enumerate(lines) if line.startswith("|")), len(lines))
+    end = next((i for i in range(first, len(lines)) if not lines[i].startswith("|")), len(lines))
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[first:end]]
+    notes = [line for line in lines[end:] if line and not line.startswith(("|", "#"))]
+    return {"header": cells[0] if cells else [], "rows": cells[2:], "notes": notes}
+
+
+def _curves(run: Path) -> dict[str, dict[str, list[float]]]:
+    """Learning curves of the finished seeds, by agent and seed."""
+    curves = {}
+    for path in sorted(run.glob("seeds/*/*/curve.csv"))[:64]:
+        if _is_inside(path, run):
+            agent, seed = path.parts[-3:-1]
+            curves[f"{agent} {seed}"] = curve_in(path)
+    return curves
+
+
+def curve_in(path: Path) -> dict[str, list[float]]:
+    """Columns of a learning curve; empty where it cannot be read."""
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            rows = list(csv.DictReader(file))
+        columns = {name: [float(row[name]) for row in rows] for name in (rows[0] if rows else {})}
+    except (OSError, ValueError, TypeError):
+        return {}
+    return {n: values for n, values in columns.items() if all(map(math.isfinite, values))}

@@ -1,0 +1,105 @@
+// Requests to the server, and the little that every part of the page needs.
+
+/** An element: el("td", {class: "best"}, "text", child, ...); texts stay texts. */
+export function el(name, attributes = {}, ...children) {
+  const element = document.createElement(name);
+  for (const [key, value] of Object.entries(attributes)) {
+    if (typeof value === "function") element.addEventListener(key, value);
+    else if (value !== null && value !== false) element.setAttribute(key, value === true ? "" : value);
+  }
+  element.append(...children.filter((child) => child !== null));
+  return element;
+}
+
+/** J_p as a J with a small p below. */
+export function symbol(name) {
+  const [, head, tail] = /^([^_]*)(?:_(.*))?$/.exec(name);
+  return el("span", {}, head, tail ? el("sub", {}, tail) : null);
+}
+
+export const options = (select, entries, chosen) => select.replaceChildren(...entries.map((entry) =>
+  Array.isArray(entry.group)
+    ? el("optgroup", { label: entry.label }, ...entry.group.map((name) => el("option", { value: name, selected: name === chosen }, name)))
+    : el("option", { value: entry, selected: entry === chosen }, entry)));
+
+export function say(form, sentence, isBad = false) {
+  const status = form.querySelector(".status");
+  status.textContent = sentence;
+  status.classList.toggle("bad", isBad);
+}
+
+async function sentenceOf(response) {
+  try { return (await response.json()).sentence ?? "the server did not understand"; }
+  catch { return `the server answered with ${response.status}`; }
+}
+
+async function answered(address, request) {
+  let response;
+  try { response = await fetch(address, request); }
+  catch { throw new Error("the server does not answer; is excite serve still running?"); }
+  if (!response.ok) throw new Error(await sentenceOf(response));
+  return response;
+}
+
+const json = (method, content) => ({
+  method, headers: { "content-type": "application/json" }, body: JSON.stringify(content),
+});
+
+export const get = async (address) => (await answered(address)).json();
+export const post = async (address, content) => (await answered(address, json("POST", content))).json();
+export const remove = async (address) => (await answered(address, { method: "DELETE" })).json();
+export const upload = async (address, file) => (await answered(address, { method: "POST", body: file })).json();
+
+/** Posts, and hands every line of the answer to `onEvent` as it comes. */
+export async function stream(address, content, onEvent) {
+  const reader = (await answered(address, json("POST", content))).body.pipeThrough(new TextDecoderStream()).getReader();
+  for (let rest = ""; ;) {
+    const { done, value } = await reader.read();
+    if (done) return;
+    const lines = (rest + value).split("\n");
+    rest = lines.pop();
+    lines.forEach((line) => onEvent(JSON.parse(line)));
+  }
+}
+
+/** Something long behind the buttons of a form: one at a time, stopped by its stop button. */
+export class Task {
+  constructor(form) {
+    this.form = form;
+    this.start = form.querySelector(".primary");
+    this.halt = form.querySelector(".stop");
+    this.job = null;
+    this.halt.addEventListener("click", () => this.stop());
+  }
+
+  async run(address, content, onEvent) {
+    this.start.disabled = true;
+    this.halt.disabled = false;
+    let ending = "the stream ended too early; run it again";
+    try {
+      await stream(address, content, (event) => {
+        if (event.kind === "job") this.job = event.job;
+        else if (event.kind === "end") ending = null;
+        else if (event.kind === "stopped") { ending = null; say(this.form, "Stopped."); }
+        else if (event.kind === "failed") ending = event.sentence;
+        else onEvent(event);
+      });
+      if (ending) say(this.form, ending, true);
+    } catch (error) {
+      say(this.form, error.message, true);
+    } finally {
+      this.job = null;
+      this.start.disabled = false;
+      this.halt.disabled = true;
+    }
+  }
+
+  async stop() {
+    if (this.job === null) return;
+    this.halt.disabled = true;
+    say(this.form, "Stopping…");
+    try { await remove(`api/jobs/${this.job}`); } catch { /* it ended by itself */ }
+  }
+}
+
+export const download = (address, text) => el("a", { href: address, download: "" }, text);

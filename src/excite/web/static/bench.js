@@ -1,0 +1,62 @@
+// The page as a whole: its parts, the token, what there is to choose from.
+
+import { get, post, say } from "./api.js";
+import * as experiment from "./experiment.js";
+import * as record from "./record.js";
+import * as runs from "./runs.js";
+import * as training from "./training.js";
+
+const parts = { experiment: null, record: null, runs, training };
+const door = document.getElementById("door");
+
+function turn() {
+  const name = location.hash.slice(1) in parts ? location.hash.slice(1) : "experiment";
+  for (const part of Object.keys(parts)) document.getElementById(part).hidden = part !== name;
+  document.querySelectorAll("nav a").forEach((link) => {
+    if (link.hash === `#${name}`) link.setAttribute("aria-current", "page");
+    else link.removeAttribute("aria-current");
+  });
+  parts[name]?.open();
+}
+
+async function enter() {
+  door.hidden = true;
+  addEventListener("hashchange", turn);
+  turn();
+  try {
+    const catalogue = await get("api/catalogue");
+    [experiment, record, training].forEach((part) => part.begin(catalogue));
+  } catch (error) {
+    say(document.getElementById("experiment"), error.message, true);
+  }
+}
+
+async function show(token) {
+  try {
+    await post("api/session", { token });
+    await enter();
+  } catch (error) {
+    knock();
+    say(door, error.message, true);
+  }
+}
+
+function knock() {
+  for (const part of Object.keys(parts)) document.getElementById(part).hidden = true;
+  door.hidden = false;
+  document.getElementById("token").focus();
+}
+
+door.addEventListener("submit", (event) => { event.preventDefault(); show(document.getElementById("token").value); });
+
+try {
+  const { is_known: isKnown } = await get("api/session");
+  const brought = location.hash.slice(1);
+  if (isKnown) await enter();
+  else if (brought && !(brought in parts)) {
+    history.replaceState(null, "", location.pathname); // the token stays out of the history
+    await show(brought);
+  } else knock();
+} catch (error) {
+  say(document.getElementById("experiment"), error.message, true);
+}

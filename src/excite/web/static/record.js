@@ -1,0 +1,121 @@
+// A recorded experiment: drop a file, map its columns, identify.
+
+import { download, el, options, say, symbol, Task, upload } from "./api.js";
+import { Plot, range, shown } from "./plot.js";
+
+const section = document.getElementById("record"), form = section.querySelector("form");
+const at = (id) => document.getElementById(id);
+let catalogue, task, file = null;
+
+export function begin(known) {
+  catalogue = known;
+  task = new Task(form);
+  options(at("record-plant"), Object.keys(catalogue.plants), "aero2");
+  options(at("estimator"), catalogue.estimators, "nls");
+  at("record-plant").addEventListener("change", showMapping);
+  at("file").addEventListener("change", () => take(at("file").files[0]));
+  const drop = section.querySelector(".drop");
+  const over = (is) => (event) => { event.preventDefault(); drop.classList.toggle("over", is); };
+  section.addEventListener("dragover", over(true));
+  section.addEventListener("dragleave", over(false));
+  section.addEventListener("drop", (event) => { over(false)(event); take(event.dataTransfer.files[0]); });
+  form.addEventListener("submit", (event) => { event.preventDefault(); identify(); });
+}
+
+async function take(chosen) {
+  if (!chosen) return;
+  file = null;
+  task.start.disabled = true;
+  at("mapping").hidden = true;
+  say(form, `Reading ${chosen.name}…`);
+  try {
+    file = await upload(`api/uploads?name=${encodeURIComponent(chosen.name)}`, chosen);
+    showMapping();
+    task.start.disabled = false;
+    const counts = Object.values(file.columns);
+    say(form, `${chosen.name}: ${counts.length} columns, ${Math.max(...counts)} samples. Map them, then identify.`);
+  } catch (error) {
+    say(form, error.message, true);
+  }
+}
+
+const plant = () => catalogue.plants[at("record-plant").value];
+const needed = () => ["time", ...plant().inputs.map((p) => p.name), ...plant().outputs.map((p) => p.name)];
+const unitOf = (name) => [...plant().inputs, ...plant().outputs].find((p) => p.name === name)?.unit ?? "s";
+
+function showMapping() {
+  if (file === null) return;
+  const there = Object.keys(file.columns), found = (name) => there.find((c) => c.toLowerCase() === name.toLowerCase());
+  at("mapping").hidden = false;
+  at("mapping").querySelector("div").replaceChildren(...needed().map((name) => {
+    const select = el("select", { id: `column-${name}` });
+    options(select, there, found(name) ?? (name === "time" ? there.find((c) => /^t/i.test(c)) : null));
+    return el("div", { class: "map" },
+      el("div", { class: "field" }, el("label", { for: select.id }, `${name} `, el("span", { class: "unit" }, unitOf(name))), select),
+      el("div", { class: "field" }, el("label", { for: `scale-${name}` }, "factor"),
+        el("input", { id: `scale-${name}`, type: "number", step: "any", placeholder: "none" })));
+  }));
+}
+
+function identify() {
+  const scales = {};
+  for (const name of needed()) if (at(`scale-${name}`).value !== "") scales[name] = +at(`scale-${name}`).value;
+  const wanted = {
+    upload: file.upload,
+    plant: plant().name,
+    columns: Object.fromEntries(needed().map((name) => [name, at(`column-${name}`).value])),
+    scales,
+    estimator: at("estimator").value,
+    initial_state: at("initial").value,
+  };
+  section.querySelectorAll(".view > section").forEach((part) => { part.hidden = true; });
+  say(form, "Waiting for a worker…");
+  const start = Date.now();
+  task.run("api/identifications", wanted, (event) => {
+    if (event.kind === "started" || event.kind === "pulse") say(form, `Identifying, ${Math.round((Date.now() - start) / 1000)} s…`);
+    else if (event.kind === "identified") show(event);
+  });
+}
+
+function show({ identification, plant: fitted, result, time, inputs, outputs, simulated }) {
+  section.querySelectorAll(".view > section").forEach((part) => { part.hidden = false; });
+  say(form, `Done: ${identification.status}.`);
+  table(at("identified"), identification);
+  const fits = Object.entries(identification.fit_percent).map(([name, value]) => `${name}: fit ${shown(value, 4)} %`);
+  at("record-verdict").replaceChildren(...[...fits, ...identification.verdict].map((text) => el("li", {}, text)));
+  section.querySelector(".downloads").replaceChildren(
+    download(`api/results/${result}/report.html`, "Report"),
+    download(`api/results/${result}/record.csv`, "Record"),
+    download(`api/results/${result}/record.json`, "Its sidecar"),
+    download(`api/results/${result}/estimate.json`, "Estimate"));
+  const parent = at("record-signals"), x = [time[0], time.at(-1)];
+  parent.replaceChildren();
+  const title = (part) => el("span", {}, part.name, " ", el("span", { class: "unit" }, part.shown_unit));
+  fitted.inputs.forEach((part, i) => {
+    const y = inputs.map((row) => row[i]);
+    new Plot(parent, title(part), `${part.name} over time`).show({ x, y: range(y, 0), unit: "s", lines: [{ x: time, y, color: "input", step: true, width: 1.3 }] });
+  });
+  fitted.outputs.forEach((part, i) => {
+    const measured = outputs.map((row) => row[i] * part.factor), model = simulated.map((row) => row[i] * part.factor);
+    new Plot(parent, title(part), `${part.name}, measured and simulated, over time`).show({
+      x, y: range([...measured, ...model], 0), unit: "s",
+      lines: [{ x: time, y: measured, color: "output" }, { x: time, y: model, color: "simulated", dash: [5, 4] }],
+    });
+    const left = measured.map((v, k) => v - model[k]);
+    new Plot(parent, el("span", {}, "residual of ", title(part)), `measured minus simulated ${part.name}`).show({
+      x, y: range(left, 0), unit: "s", lines: [{ x: time, y: left, color: "output", width: 1 }],
+    });
+  });
+}
+
+/** The parameters of an identification as a table. */
+export function table(element, { params }) {
+  element.replaceChildren(
+    el("thead", {}, el("tr", {}, ...["", "estimate", "95 % interval", "standard error", "unit"].map((text) => el("th", { scope: "col" }, text)))),
+    el("tbody", {}, ...Object.entries(params).map(([name, p]) => el("tr", {},
+      el("th", { scope: "row" }, symbol(name)),
+      el("td", {}, shown(p.estimate, 6) + (p.held ? " (held)" : "")),
+      el("td", {}, p.held ? "–" : `${shown(p.ci95?.[0], 5)} to ${shown(p.ci95?.[1], 5)}`),
+      el("td", {}, shown(p.std_error)),
+      el("td", {}, p.unit)))));
+}

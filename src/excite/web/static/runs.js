@@ -1,0 +1,54 @@
+// The run folder: what the command line and the trainings of this page have left.
+
+import { download, el, get, say } from "./api.js";
+import { curves } from "./curves.js";
+import { table } from "./record.js";
+
+const section = document.getElementById("runs"), view = document.getElementById("run-view");
+
+export async function open() {
+  try {
+    const { runs } = await get("api/runs");
+    say(section, runs.length ? "" : "The run folder is empty; studies and identifications appear here.");
+    document.getElementById("run-list").replaceChildren(...runs.map((run) => el("li", {},
+      el("button", { type: "button", "aria-pressed": "false", click: (event) => show(run, event.currentTarget) },
+        run.name, el("small", {}, [run.kind, run.plant, run.is_finished ? "" : "not finished"].filter(Boolean).join(", "))))));
+  } catch (error) {
+    say(section, error.message, true);
+  }
+}
+
+async function show(run, button) {
+  section.querySelectorAll("button").forEach((b) => b.setAttribute("aria-pressed", String(b === button)));
+  const name = encodeURIComponent(run.name), address = (file) => `api/run/file?name=${name}&file=${encodeURIComponent(file)}`;
+  try {
+    const content = await get(`api/run?name=${name}`);
+    const card = el("section", { class: "card" }, el("h2", {}, content.title || run.name));
+    if (content.estimate.params) {
+      const estimate = el("table");
+      table(estimate, content.estimate);
+      card.append(el("div", { class: "scroll" }, estimate), el("ul", {}, ...(content.estimate.verdict ?? []).map((text) => el("li", {}, text))));
+    }
+    if (content.rows.length) card.append(rows(content));
+    card.append(...content.notes.map((note) => el("p", { class: "hint" }, note)));
+    card.append(el("p", { class: "row downloads" },
+      download(`api/run/report.html?name=${name}`, "Report"), ...content.files.map((file) => download(address(file), file))));
+    view.replaceChildren(card);
+    if (view.getBoundingClientRect().top > innerHeight / 2) view.scrollIntoView();
+    if (Object.keys(content.curves).length) {
+      const learnt = el("section", { class: "card" }, el("h2", {}, "Learning curves"), el("div", { class: "plots small" }));
+      view.append(learnt);
+      curves(learnt.querySelector(".plots"), Object.values(content.curves));
+    }
+    for (const figure of content.figures) {
+      view.append(el("section", { class: "card" }, el("h2", {}, figure.replace(/\.png$/, "")), el("img", { src: address(figure), alt: `figure ${figure} of ${run.name}`, loading: "lazy" })));
+    }
+  } catch (error) {
+    say(section, error.message, true);
+  }
+}
+
+const rows = ({ header, rows: cells }) => el("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Table of the study" },
+  el("table", {},
+    el("thead", {}, el("tr", {}, ...header.map((text) => el("th", { scope: "col" }, text)))),
+    el("tbody", {}, ...cells.map((row) => el("tr", {}, ...row.map((text, i) => (i ? el("td", {}, text) : el("th", { scope: "row" }, text))))))));

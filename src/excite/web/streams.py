@@ -1,0 +1,240 @@
+"""Experiments and identifications as streams of events, one JSON object a line.
+
+A simulated experiment is computed faster than anybody can look. It is played: its samples
+leave at an even pace, and every estimate not before the sample it was made at.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Mapping
+from contextlib import aclosing
+from typing import Any
+
+from starlette.requests import Request
+from starlette.responses import JSONResponse, StreamingResponse
+from starlette.routing import Route
+
+from .base import MAX_STEPS, Pool, RefusedError, Session, number, numbers, texts, whole, word
+
+FRAME = 0.04
+"""Seconds between two parts of a stream."""
+_PULSE = 1.0  # seconds after which a silent stream says that it lives
+
+Event = dict[str, Any]
+Events = AsyncGenerator[Event]
+
+
+def routes(pool: Pool, body: Callable[[Request], Any]) -> list[Route]:
+    """What starts and stops an experiment or an identification.
+
+    Args:
+        body: reads a request's JSON.
+    """
+
+    async def experiment(request: Request) -> StreamingResponse:
+        session, asked = request.state.session, await body(request)
+        seconds, asked = number(asked, "seconds", 0, 60), _experiment(asked)
+        return _streamed(session, lambda stop: _played(pool, session, asked, seconds, stop))
+
+    async def identification(request: Request) -> StreamingResponse:
+        session, asked = request.state.session, await body(request)
+        source = session.place(str(asked.get("upload")))
+        asked = _identification(asked)
+        return _streamed(session, lambda stop: _identified(pool, session, asked, source, stop))
+
+    async def stop(request: Request) -> JSONResponse:
+        stops = request.state.session.stops
+        if stops.get(request.path_params["job"]) is None:
+            raise RefusedError(404, "nothing of this name is under way in this browser")
+        stops[request.path_params["job"]].set()
+        return JSONResponse({"stopped": True})
+
+    return [
+        Route("/api/experiments", experiment, methods=["POST"]),
+        Route("/api/identifications", identification, methods=["POST"]),
+        Route("/api/jobs/{job}", stop, methods=["DELETE"]),
+    ]
+
+
+def _experiment(asked: Mapping[str, Any]) -> Event:
+    """An experiment as `excite.live` takes it: checked names and numbers, nothing else."""
+    others = asked.get("others")
+    if not isinstance(others, list) or len(others) > 2:
+        raise RefusedError(400, "others: at most two excitations can be compared")
+    return {
+        "plant": word(asked, "plant"),
+        "excitation": word(asked, "excitation"),
+        "amplitude": None if asked.get("amplitude") is None else number(asked, "amplitude", 0, 1e9),
+        "noise": numbers(asked, "noise"),
+        "params": numbers(asked, "params"),
+        "steps": whole(asked, "steps", 50, MAX_STEPS),
+        "seed": whole(asked, "seed", 0, 2**53),
+        "others": [word({"others": name}, "others") for name in others],
+    }
+
+
+def _identification(asked: Mapping[str, Any]) -> Event:
+    """An identification, likewise."""
+    return {
+        "plant": word(asked, "plant"),
+        "estimator": word(asked, "estimator"),
+        "initial_state": word(asked, "initial_state"),
+        "columns": texts(asked, "columns"),
+        "scales": numbers(asked, "scales"),
+    }
+
+
+def _streamed(session: Session, events: Callable[[asyncio.Event], Events]) -> StreamingResponse:
+    """A response that goes on until the events end, or the browser stops or leaves."""
+    stop = asyncio.Event()
+    job = session.begin(stop)
+
+    async def lines() -> AsyncIterator[str]:
+        try:
+            yield _line({"kind": "job", "job": job})
+            async with aclosing(events(stop)) as told:
+                async for event in told:
+                    yield _line(event)
+        except RefusedError as refused:
+            yield _line({"kind": "failed", "sentence": refused.sentence})
+        finally:
+            session.end(job)
+
+    return StreamingResponse(lines(), media_type="application/x-ndjson")
+
+
+def _line(event: Event) -> str:
+    return json.dumps(event, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+async def _lively(events: Events, stop: asyncio.Event) -> Events:
+    """The same events; a pulse where there is none for long; the end where asked to stop."""
+    stopped = asyncio.ensure_future(stop.wait())
+    following = None
+    try:
+        while True:
+            following = following or asyncio.ensure_future(anext(events))
+            await asyncio.wait({stopped, following}, timeout=_PULSE, return_when="FIRST_COMPLETED")
+            if stopped.done():
+                yield {"kind": "stopped"}
+                return
+            if following.done():
+                event, following = following.result(), None
+                yield event
+                if event["kind"] in ("end", "failed"):
+                    return
+            else:
+                yield {"kind": "pulse"}
+    finally:
+        stopped.cancel()
+        if following is not None:
+            following.cancel()
+            await asyncio.gather(following, return_exceptions=True)
+        await events.aclose()
+
+
+async def _identified(
+    pool: Pool, session: Session, asked: Event, source: Any, stop: asyncio.Event
+) -> Events:
+    name, place = session.new_place()
+    arguments = {
+        "asked": asked,
+        "source": str(source),
+        "name": next(iter(source.iterdir())).name,
+        "folder": str(place / "run"),
+    }
+    async with aclosing(_lively(pool.events("identified", arguments), stop)) as events:
+        async for event in events:
+            yield {**event, "result": name} if event["kind"] == "identified" else event
+
+
+async def _played(
+    pool: Pool, session: Session, asked: Event, seconds: float, stop: asyncio.Event
+) -> Events:
+    """The samples at their pace, estimates among them, then what the rest comes to."""
+    shown = None
+    async with aclosing(_lively(pool.events("episode", {"asked": asked}, True), stop)) as events:
+        async for event in events:
+            if event["kind"] == "episode":
+                shown = event
+            elif event["kind"] != "end":
+                yield event
+    if shown is None:
+        return
+    name, place = session.new_place()
+    arguments = {"asked": asked, "folder": str(place / "run")}
+    player = _Player(shown, seconds)
+    yield player.plan()
+    waiting = asyncio.Queue[Event]()
+
+    async def follow() -> None:
+        async with aclosing(pool.events("followed", arguments)) as events:
+            async for event in events:
+                if event["kind"] != "started":
+                    waiting.put_nowait(event)
+
+    following = asyncio.create_task(follow())
+    try:
+        async for event in _mixed(player, waiting, stop):
+            yield {**event, "result": name} if event["kind"] == "result" else event
+    finally:
+        following.cancel()
+        await asyncio.gather(following, return_exceptions=True)
+
+
+async def _mixed(player: _Player, waiting: asyncio.Queue[Event], stop: asyncio.Event) -> Events:
+    """Frames of samples with the estimates made until then; afterwards whatever comes."""
+    early, silent = list[Event](), 0.0
+    while not stop.is_set():
+        while not waiting.empty():
+            early.append(waiting.get_nowait())
+        if (frame := player.frame()) is not None:
+            yield frame
+        while early and player.allows(early[0]):
+            event = early.pop(0)
+            yield event
+            silent = 0.0
+            if event["kind"] in ("end", "failed"):
+                return
+        silent += FRAME
+        if player.is_over and silent > _PULSE:
+            yield {"kind": "pulse"}
+            silent = 0.0
+        await asyncio.sleep(FRAME)
+    yield {"kind": "stopped"}
+
+
+class _Player:
+    """How much of an experiment was shown so far."""
+
+    def __init__(self, shown: Event, seconds: float) -> None:
+        self._shown, self._seconds, self._sent = shown, seconds, 0
+        self._start = asyncio.get_running_loop().time()
+
+    def plan(self) -> Event:
+        """What is known before the first sample."""
+        known = {k: v for k, v in self._shown.items() if k not in ("inputs", "outputs", "time")}
+        return {**known, "kind": "plan", "num_samples": len(self._shown["time"])}
+
+    @property
+    def is_over(self) -> bool:
+        """Whether all samples were shown."""
+        return self._sent == len(self._shown["time"])
+
+    def allows(self, event: Event) -> bool:
+        """Whether an event may be shown: not before the sample it was made at, or the last."""
+        return self.is_over or event.get("k", math.inf) <= self._sent - 1
+
+    def frame(self) -> Event | None:
+        """The samples that are due."""
+        total, elapsed = len(self._shown["time"]), asyncio.get_running_loop().time() - self._start
+        part = 1.0 if self._seconds == 0 else min(1.0, elapsed / self._seconds)
+        due = slice(self._sent, math.ceil(part * total))
+        self._sent = max(self._sent, due.stop)
+        if due.start >= due.stop:
+            return None
+        parts = ("time", "inputs", "outputs")
+        return {"kind": "samples", **{part: self._shown[part][due] for part in parts}}

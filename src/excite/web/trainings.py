@@ -1,0 +1,170 @@
+"""Trainings: `excite train`, started and interrupted as at the command line.
+
+A training goes on when its page is closed, and ends with the server. Interrupted, it keeps
+its checkpoint, and the same command goes on from there.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import re
+import secrets
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from starlette.requests import Request
+from starlette.responses import JSONResponse
+from starlette.routing import Route
+
+from .base import RefusedError, number, whole, word
+
+MAX_TRAININGS = 2
+_PATIENCE = 10.0  # seconds for a training to end when it is interrupted
+_OBJECTIVES = ("D", "A", "E", "relative", "log", "goals", "nls")
+
+
+class Training:
+    """One process of `excite train`, and its learning curve so far."""
+
+    def __init__(self, name: str, folder: Path, words: list[str]) -> None:
+        self.name, self.folder, self.words = name, folder, words
+        self.curve: list[dict[str, Any]] = []
+        self.state, self.sentence = "starting", ""
+        self._process: asyncio.subprocess.Process | None = None
+        self._followed: asyncio.Task | None = None
+
+    async def start(self) -> None:
+        """Starts the process."""
+        self._process = await asyncio.create_subprocess_exec(
+            sys.executable, "-m", "excite", *self.words, "--out", str(self.folder),
+            stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.DEVNULL,
+            stderr=asyncio.subprocess.PIPE, start_new_session=True,
+            preexec_fn=_step_back,
+        )  # fmt: skip
+        self._followed = asyncio.create_task(self._follow(self._process))
+
+    @property
+    def is_running(self) -> bool:
+        """Whether it is not over."""
+        return self.state in ("starting", "training", "stopping")
+
+    async def stop(self) -> None:
+        """Interrupts it, as Ctrl-C does, and ends it where that is not enough."""
+        process = self._process
+        if process is None or not self.is_running:
+            return
+        self.state = "stopping"
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(process.pid, signal.SIGINT)
+        try:
+            await asyncio.wait_for(process.wait(), _PATIENCE)
+        except TimeoutError:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+        if self._followed is not None:
+            await self._followed
+
+    async def _follow(self, process: asyncio.subprocess.Process) -> None:
+        """Collects looks at the policy until the process ends."""
+        told = asyncio.create_task(process.communicate())
+        while not told.done():
+            self._look()
+            await asyncio.wait({told}, timeout=0.5)
+        self._look()
+        last = ((await told)[1] or b"").decode(errors="replace").strip().splitlines()[-1:]
+        if process.returncode == 0:
+            self.state = "finished"
+        elif self.state == "stopping":
+            self.state = "stopped"
+        else:
+            self.state, self.sentence = "failed", (last or ["it ended without a word"])[0]
+
+    def _look(self) -> None:
+        for path in self.folder.glob("seeds/*/0/progress.json"):
+            with contextlib.suppress(OSError, ValueError):
+                row = json.loads(path.read_text(encoding="utf-8"))
+                if isinstance(row, dict) and row not in self.curve[-1:]:
+                    self.curve.append(row)
+                    self.state = "training" if self.state == "starting" else self.state
+
+    def told(self) -> dict[str, Any]:
+        """What the page shows."""
+        return {
+            "name": self.name,
+            "folder": self.folder.name,
+            "state": self.state,
+            "sentence": self.sentence,
+            "curve": self.curve,
+            "command": " ".join(["excite", *self.words, "--out", self.folder.name]),
+        }
+
+
+def routes(folder: Path, body: Callable[[Request], Any], every: list[Training]) -> list[Route]:
+    """What starts, shows and stops trainings.
+
+    Args:
+        every: all trainings of this server, kept up to date.
+    """
+
+    async def start(request: Request) -> JSONResponse:
+        asked = await body(request)
+        if sum(t.is_running for t in every) >= MAX_TRAININGS:
+            raise RefusedError(429, f"{MAX_TRAININGS} trainings are running already; stop one")
+        words, place = _words(asked), _free(folder, word(asked, "name"))
+        training = Training(secrets.token_urlsafe(12), place, words)
+        every.append(training)
+        request.state.session.trainings[training.name] = training
+        await training.start()
+        return JSONResponse(training.told())
+
+    def own(request: Request) -> Training:
+        trainings = request.state.session.trainings
+        if request.path_params["name"] not in trainings:
+            raise RefusedError(404, "this browser has no such training")
+        return trainings[request.path_params["name"]]
+
+    async def stop(request: Request) -> JSONResponse:
+        await own(request).stop()
+        return JSONResponse(own(request).told())
+
+    async def shown(request: Request) -> JSONResponse:
+        trainings = request.state.session.trainings.values()
+        return JSONResponse({"trainings": [training.told() for training in trainings]})
+
+    return [
+        Route("/api/trainings", start, methods=["POST"]),
+        Route("/api/trainings", shown, methods=["GET"]),
+        Route("/api/trainings/{name}", stop, methods=["DELETE"]),
+    ]
+
+
+def _words(asked: dict[str, Any]) -> list[str]:
+    """The command, of checked words and numbers alone."""
+    objective, updates = word(asked, "objective"), whole(asked, "updates", 1, 100_000)
+    if objective not in _OBJECTIVES:
+        raise RefusedError(400, f"objective: one of {', '.join(_OBJECTIVES)} is needed")
+    spread = number(asked, "spread", 0, 0.9)
+    return [
+        "train", word(asked, "plant"), "--objective", objective,
+        "--steps", str(whole(asked, "steps", 10, 5000)), "--spread", f"{spread:g}",
+        "--set", f"num_updates={updates}",
+    ]  # fmt: skip
+
+
+def _free(folder: Path, name: str) -> Path:
+    """A folder for a training: a new one of this name in the run folder."""
+    path = folder / re.sub(r"\W", "_", name)
+    if path.exists() or path.is_symlink():
+        raise RefusedError(409, f"{path.name} is there already; choose another name")
+    return path
+
+
+def _step_back() -> None:
+    """What is being watched comes first."""
+    os.nice(10)

@@ -1,0 +1,71 @@
+"""A process that computes for the page: `python -m excite.web.worker`.
+
+One line of JSON in is a call, every line out an event. It ends with its input, so that no
+worker outlives the server, and looks for a line between two events: that stops the work.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import json
+import os
+import resource
+import select
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+from ..files import json_ready
+
+MAX_MEMORY = 6 * 2**30
+"""Bytes of data: a file that unpacks to more than the computer holds is refused, not loaded."""
+
+
+def main() -> None:
+    """Answers calls until the input ends."""
+    with os.fdopen(os.dup(1), "w", encoding="utf-8") as out:
+        os.dup2(2, 1)  # whatever a library prints is no event
+        live = importlib.import_module("excite.live")
+        resource.setrlimit(resource.RLIMIT_DATA, (MAX_MEMORY, MAX_MEMORY))
+        _write(out, {"kind": "ready"})
+        for line in sys.stdin.buffer:
+            call = json.loads(line)
+            if call != "stop":  # one that came too late is of no concern
+                for event in _events(live, **call):
+                    _write(out, event)
+
+
+def _events(live: Any, target: str, arguments: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """The events of one call, with the last one that says how it ended."""
+    try:
+        with contextlib.closing(getattr(live, target)(**arguments)) as events:
+            for event in events:
+                yield event
+                if select.select([0], [], [], 0)[0]:
+                    break
+        yield {"kind": "end"}
+    except ValueError as error:  # subclasses come from libraries
+        is_users = type(error) is ValueError
+        yield _failure(str(error) if is_users else _named(error))
+    except MemoryError:
+        yield _failure("this needs more memory than a worker may take")
+    except Exception as error:
+        yield _failure(_named(error))
+
+
+def _named(error: Exception) -> str:
+    return f"failed: {type(error).__name__}: {error}"
+
+
+def _failure(sentence: str) -> dict[str, Any]:
+    return {"kind": "failed", "sentence": " ".join(sentence.split())}
+
+
+def _write(out: Any, event: dict[str, Any]) -> None:
+    out.write(json.dumps(json_ready(event), ensure_ascii=False, allow_nan=False) + "\n")
+    out.flush()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,79 @@
+"""A bench page as users start it: `excite serve` in a process of its own."""
+
+import contextlib
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx2 as httpx
+
+EXPERIMENT = {
+    "plant": "aero2",
+    "excitation": "chirp",
+    "amplitude": 7.2,
+    "noise": {},
+    "params": {"J_p": 0.025},
+    "steps": 500,
+    "seed": 3,
+    "others": ["prbs", "aero2"],
+    "seconds": 5,
+}
+MAX_GAP = 0.2
+"""Seconds between two parts of a stream."""
+
+
+@contextlib.contextmanager
+def served(runs: Path, *options: str) -> Iterator[str]:
+    """The address of a page; interrupted afterwards, it has to end cleanly."""
+    words = [sys.executable, "-m", "excite", "serve", "--port", "0", "--json", *options]
+    pipe = subprocess.PIPE
+    with subprocess.Popen([*words, "--runs", str(runs)], stdout=pipe, stderr=pipe) as process:
+        try:
+            told = b""
+            while not told.endswith(b"}\n") and process.stdout:
+                line = process.stdout.readline()
+                assert line, process.stderr and process.stderr.read().decode()
+                told += line
+            yield json.loads(told)["address"].rstrip("/")
+            process.send_signal(signal.SIGINT)
+            out, err = process.communicate(timeout=20)
+            assert (process.returncode, out, err) == (0, b"", b""), err.decode()
+        finally:
+            process.kill()
+
+
+@contextlib.contextmanager
+def browser(address: str) -> Iterator[httpx.Client]:
+    """A client that has opened the page, and tells where its requests come from."""
+    with httpx.Client(base_url=address, headers={"origin": address}, timeout=120) as client:
+        assert client.get("/").status_code == 200
+        yield client
+
+
+class Told(list[dict[str, Any]]):
+    """Events of a stream; `gap` is the longest silence while its samples came, in seconds."""
+
+    gap = 0.0
+
+    def of(self, kind: str) -> list[dict[str, Any]]:
+        """The events of a kind."""
+        return [event for event in self if event["kind"] == kind]
+
+
+def streamed(client: httpx.Client, address: str, asked: dict[str, Any]) -> Told:
+    """All events of a stream."""
+    told, last = Told(), 0.0
+    with client.stream("POST", address, json=asked) as answer:
+        assert answer.status_code == 200, answer.read()
+        for line in answer.iter_lines():
+            event, now = json.loads(line), time.perf_counter()
+            if event["kind"] == "samples":
+                told.gap = max(told.gap, now - last if told.of("samples") else 0.0)
+            last = now
+            told.append(event)
+    return told

@@ -1,0 +1,257 @@
+"""The bench page in a real browser: what people see, press and get."""
+
+import itertools
+import json
+import os
+import re
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from served import MAX_GAP, served
+
+from excite.files import write_json
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+if CHROMIUM is None and os.environ.get("EXCITE_BROWSER_TESTS") != "1":
+    pytest.skip("no chromium on this computer (apt-get install chromium)", allow_module_level=True)
+
+from playwright.sync_api import Browser, Page, expect, sync_playwright  # noqa: E402
+
+ARGUMENTS = [
+    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync",
+]  # fmt: skip
+WAIT = 60_000  # milliseconds; what is compiled first takes long on a busy computer
+WIDTHS = (360, 1440)
+WATCH = """
+addEventListener("DOMContentLoaded", () => {
+  const times = (window.frames_seen = []);
+  const status = document.querySelector("#experiment .status");
+  new MutationObserver(() => {
+    if (status.textContent.startsWith("Running")) times.push(performance.now());
+  }).observe(status, { childList: true });
+});
+"""
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    folder = tmp_path_factory.mktemp("runs")
+    run = folder / "a_study"
+    (run / "seeds" / "agent" / "0").mkdir(parents=True)
+    write_json(run / "run.json", {"kind": "excite study", "plant": {"name": "aero2"}})
+    cells = "| method | a very wide column of a table | b |\n| --- | --- | --- |\n"
+    (run / "table.md").write_text(cells + "| <img src=x onerror=alert(1)> | 1 | 2 |\n")
+    curve = "steps,return,violation_rate,relative_error_J_p\n0,-1,0,1\n10,2,0,0.01\n"
+    (run / "seeds" / "agent" / "0" / "curve.csv").write_text(curve)
+    with served(folder, "--workers", "1") as where:
+        yield where
+
+
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Browser]:
+    assert CHROMIUM, "EXCITE_BROWSER_TESTS=1 asks for a browser, and there is no chromium"
+    with sync_playwright() as playwright:
+        opened = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
+        yield opened
+        opened.close()
+
+
+@pytest.fixture
+def page(chromium: Browser) -> Iterator[Page]:
+    """A browser of its own; whatever its console says is an error."""
+    context = chromium.new_context(viewport={"width": 1440, "height": 1000})
+    opened, said = context.new_page(), list[Any]()
+    opened.on("console", lambda message: said.append(message.text))
+    opened.on("pageerror", lambda error: said.append(str(error)))
+    opened.on("dialog", lambda dialog: said.append(dialog.message))
+    opened.add_init_script(WATCH)
+    yield opened
+    context.close()
+    # A refused request is told to the user; the browser itself notes it, too.
+    assert [text for text in said if "Failed to load resource" not in text] == []
+
+
+def ready(page: Page, address: str, part: str = "experiment") -> Page:
+    page.goto(f"{address}/#{part}")
+    expect(page.locator(f"#{part} .primary")).to_be_enabled(timeout=WAIT)
+    return page
+
+
+def status(page: Page, part: str = "experiment") -> Any:
+    return page.locator(f"#{part} .status")
+
+
+def require_no_sideways_scroll(page: Page) -> None:
+    for width in WIDTHS:
+        page.set_viewport_size({"width": width, "height": 800})
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+
+
+def test_a_run_from_choosing_to_the_report(address: str, page: Page, tmp_path: Path):
+    ready(page, address)
+    page.get_by_label("Seed of the noise").fill("7")
+    page.get_by_role("button", name="Run", exact=True).click()
+    expect(status(page)).to_have_text("Done.", timeout=WAIT)
+    rows = page.locator("#comparison tbody tr")
+    assert [rows.nth(i).locator("th").inner_text() for i in range(3)] == ["chirp", "prbs", "aero2"]
+    assert "±" in page.locator("#estimates figure").first.inner_text()
+    assert "largest" in page.locator("#signals figure").nth(1).inner_text()
+    for name in ("report.html", "record.csv", "estimate.json"):
+        with page.expect_download() as waiting:
+            page.locator(f"#outcome a[href$='{name}']").click()
+        waiting.value.save_as(tmp_path / name)
+    assert "J_p" in (tmp_path / "report.html").read_text()
+    estimate = json.loads((tmp_path / "estimate.json").read_text())["params"]["D_p"]["estimate"]
+    shown = page.locator("#estimates figure").nth(2).inner_text()
+    assert float(re.findall(r"[\d.]+", shown.partition("value")[2])[0]) == pytest.approx(
+        estimate, rel=1e-4
+    )
+    assert (tmp_path / "record.csv").read_text().startswith("time,voltage,pitch\n")
+    require_no_sideways_scroll(page)
+    page.set_viewport_size({"width": 1440, "height": 1000})
+    # Once more, warm: now nothing is to hold the stream up, nor the first paint.
+    page.evaluate("window.frames_seen.length = 0")
+    page.get_by_role("button", name="Run", exact=True).click()
+    expect(status(page)).to_have_text(re.compile("^Running"), timeout=WAIT)
+    expect(status(page)).to_have_text("Done.", timeout=WAIT)
+    times = page.evaluate("window.frames_seen")
+    assert len(times) > 25
+    assert max(b - a for a, b in itertools.pairwise(times)) < 1000 * MAX_GAP
+    page.reload()
+    [paint] = page.evaluate("performance.getEntriesByName('first-paint').map((e) => e.startTime)")
+    assert paint < 1000
+
+
+def test_a_run_is_stopped(address: str, page: Page):
+    ready(page, address)
+    page.get_by_label("Played in").select_option("20")
+    page.get_by_role("button", name="Run", exact=True).click()
+    expect(status(page)).to_have_text(re.compile("^Running"), timeout=WAIT)
+    page.locator("#experiment .stop").click()
+    expect(status(page)).to_have_text("Stopped.", timeout=5000)
+    expect(page.get_by_role("button", name="Run", exact=True)).to_be_enabled()
+
+
+def test_a_value_that_is_not_allowed_is_one_sentence(address: str, page: Page):
+    ready(page, address)
+    page.locator("#params input").first.fill("-1")
+    page.get_by_role("button", name="Run", exact=True).click()
+    expect(status(page)).to_contain_text("is not allowed", timeout=WAIT)
+    expect(status(page)).to_have_class(re.compile("bad"))
+
+
+def test_it_is_used_by_the_keyboard_alone(address: str, page: Page):
+    page.goto(address)
+    expect(page.locator("#experiment .primary")).to_be_enabled(timeout=WAIT)
+    names = []
+    for _ in range(60):
+        page.keyboard.press("Tab")
+        element = "document.activeElement"
+        names.append(page.evaluate(f"{element}.id || {element}.textContent.trim()"))
+        assert page.evaluate(f"{element} === document.body || {element}.matches(':focus-visible')")
+        if names[-1] == "seed":
+            break
+    wanted = ["Skip to the bench", "Experiment", "plant", "excitation", "amplitude", "steps"]
+    assert [n for n in names if n in (*wanted, "seed")] == [*wanted, "seed"]
+    page.keyboard.press("Enter")
+    expect(status(page)).to_have_text(re.compile("^Running"), timeout=WAIT)
+    page.keyboard.press("Tab")
+    page.keyboard.press("Tab")
+    assert page.evaluate("document.activeElement.className") == "stop"
+    page.keyboard.press("Enter")
+    expect(status(page)).to_have_text("Stopped.", timeout=5000)
+
+
+def test_every_field_has_a_label(address: str, page: Page):
+    ready(page, address)
+    bare = "[...document.querySelectorAll('input, select')].filter((e) => !e.labels.length).length"
+    assert page.evaluate(bare) == 0
+
+
+def test_a_file_is_dropped_mapped_and_identified(address: str, page: Page, tmp_path: Path):
+    ready(page, address)
+    page.get_by_label("Played in").select_option("0")
+    page.get_by_role("button", name="Run", exact=True).click()
+    expect(page.locator("#outcome a[href$='record.csv']")).to_be_visible(timeout=WAIT)
+    with page.expect_download() as waiting:
+        page.locator("#outcome a[href$='record.csv']").click()
+    record = tmp_path / "log.csv"
+    waiting.value.save_as(record)
+    script = "<img src=x onerror=alert(1)>"
+    record.write_text(record.read_text().replace("pitch", script, 1))
+    page.get_by_role("link", name="Record", exact=True).first.click()
+    page.locator("#file").set_input_files(record)
+    expect(status(page, "record")).to_contain_text("501 samples", timeout=WAIT)
+    page.locator("#column-pitch").select_option(script)
+    page.get_by_role("button", name="Identify").click()
+    expect(status(page, "record")).to_have_text("Done: successful.", timeout=WAIT)
+    assert page.locator("#identified tbody tr").count() == 3
+    assert page.locator("#record img").count() == 0
+    with page.expect_download() as waiting:
+        page.locator("#record a[href$='report.html']").click()
+    assert waiting.value.suggested_filename == "report.html"
+    require_no_sideways_scroll(page)
+    page.locator("#scale-pitch").fill("1000")
+    page.get_by_role("button", name="Identify").click()
+    expect(status(page, "record")).to_contain_text("another unit", timeout=WAIT)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "sentence"),
+    [
+        ("bad.mat", b"\x80\x04\x95", "not a readable MAT file"),
+        ("notes.txt", b"hello", ".csv or .mat"),
+        ("cut.csv", b"time,pitch\n0,", "truncated"),
+    ],
+)
+def test_a_bad_file_is_one_sentence(
+    name: str, content: bytes, sentence: str, address: str, page: Page
+):
+    page.goto(f"{address}/#record")
+    expect(page.locator("#record-plant option").first).to_be_attached(timeout=WAIT)
+    page.locator("#file").set_input_files({"name": name, "mimeType": "", "buffer": content})
+    expect(status(page, "record")).to_contain_text(sentence, timeout=WAIT)
+    expect(page.get_by_role("button", name="Identify")).to_be_disabled()
+
+
+def test_runs_are_looked_at(address: str, page: Page):
+    page.goto(f"{address}/#runs")
+    page.get_by_role("button", name="a_study").click()
+    expect(page.locator("#run-view td").first).to_have_text("1")
+    assert page.locator("#run-view img").count() == 0  # what looks like a picture is text
+    assert page.locator("#run-view canvas").count() == 3
+    require_no_sideways_scroll(page)
+
+
+def test_a_training_is_started_and_stopped(address: str, page: Page):
+    ready(page, address, "training")
+    page.get_by_label("Updates").fill("50000")
+    page.locator("#training-steps").fill("50")
+    page.get_by_role("button", name="Start").click()
+    card = page.locator("#trainings section")
+    expect(card.get_by_role("status")).to_contain_text("starting", timeout=WAIT)
+    expect(card.locator("code")).to_contain_text("excite train aero2 --objective D")
+    card.get_by_role("button", name="Stop").click()
+    expect(card.get_by_role("status")).to_contain_text("stopped", timeout=WAIT)
+    require_no_sideways_scroll(page)
+
+
+def test_a_token_lets_the_browser_in_and_leaves_the_address(chromium: Browser, tmp_path: Path):
+    with served(tmp_path, "--token", "a-good-token", "--workers", "1") as where:
+        root = where.partition("#")[0].rstrip("/")
+        stranger = chromium.new_page()
+        stranger.goto(root)
+        expect(stranger.locator("#door")).to_be_visible()
+        stranger.get_by_label("Token").fill("a-bad-token")
+        stranger.keyboard.press("Enter")
+        expect(stranger.locator("#door .status")).to_have_text("this is not the token")
+        stranger.close()
+        known = chromium.new_page()
+        known.goto(where)
+        expect(known.locator("#experiment")).to_be_visible()
+        assert known.url == f"{root}/"
+        known.close()

@@ -1,0 +1,573 @@
+"""The server of the bench page: its numbers, its limits, and who may ask for what."""
+
+import asyncio
+import csv
+import json
+import os
+import pickle
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx2 as httpx
+import pytest
+from served import EXPERIMENT, MAX_GAP, Told, browser, served, streamed
+from starlette.testclient import TestClient
+
+from excite.files import write_json
+from excite.web import Settings, application
+from excite.web.base import MAX_JOBS, MAX_UPLOAD, RefusedError, Session
+from excite.web.runs import found
+from excite.web.security import MAX_TRIES
+
+HERE = "http://127.0.0.1:8000"
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run folder with one run, a secret beside it, and links to the secret."""
+    folder = tmp_path_factory.mktemp("bench")
+    (folder / "secret.json").write_text('{"secret": 1}')
+    run = folder / "runs" / "some" / "study"
+    run.mkdir(parents=True)
+    write_json(run / "run.json", {"kind": "excite study", "plant": {"name": "aero2"}})
+    (run / "table.md").write_text("| method | <b>x</b> |\n| --- | --- |\n| chirp | 1 |\n\nnote\n")
+    (run / "program.py").write_text("raise SystemExit\n")
+    (run / "link.json").symlink_to(folder / "secret.json")
+    (folder / "runs" / "elsewhere").symlink_to(folder, target_is_directory=True)
+    return folder / "runs"
+
+
+@pytest.fixture(scope="module")
+def address(runs: Path) -> Iterator[str]:
+    with served(runs, "--workers", "2") as where:
+        yield where
+
+
+@pytest.fixture
+def client(address: str) -> Iterator[httpx.Client]:
+    with browser(address) as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def told(address: str) -> Told:
+    """One experiment; the first of a server also waits for what is compiled."""
+    with browser(address) as opened:
+        streamed(opened, "/api/experiments", {**EXPERIMENT, "seconds": 0})
+        events = streamed(opened, "/api/experiments", EXPERIMENT)
+        result = events.of("result")[0]["result"]
+        for name in ("record.csv", "record.json"):
+            events.append({"kind": name, "text": opened.get(f"/api/results/{result}/{name}").text})
+    return events
+
+
+def excite(*words: str, folder: Path) -> dict[str, Any]:
+    """What a command prints as JSON."""
+    command = [sys.executable, "-m", "excite", *words, "--json"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
+    return json.loads(done.stdout)
+
+
+# -------------------------------------------------------------------------------- numbers
+
+
+def test_numbers_are_those_of_the_command_line(told: Told, tmp_path: Path):
+    chosen = ["--params", "J_p=0.025"]
+    words = ["simulate", "aero2", "--excitation", "chirp", "--set", "amplitude=7.2", *chosen]
+    simulated = excite(*words, "--seed", "3", "--out", "record.csv", folder=tmp_path)
+    assert told.of("record.csv")[0]["text"] == (tmp_path / "record.csv").read_text()
+    assert told.of("record.json")[0]["text"] == (tmp_path / "record.json").read_text()
+    result = told.of("result")[0]
+    identified = excite("identify", "record.csv", "--plant", "aero2", folder=tmp_path)
+    assert result["identification"] == identified
+    bound = excite("information", "aero2", "record.csv", *chosen, folder=tmp_path)
+    assert result["row"]["max_abs_output"] == pytest.approx(simulated["max_abs_output"])
+    assert result["row"]["is_violation"] == simulated["is_violation"]
+    assert result["row"]["log_det_information"] == pytest.approx(bound["log_det_information"])
+    for name, p in result["row"]["params"].items():
+        assert p["cramer_rao_bound"] == pytest.approx(bound["params"][name]["cramer_rao_bound"])
+        assert p["estimate"] == identified["params"][name]["estimate"]
+
+
+def test_samples_on_the_way_are_those_of_the_record(told: Told):
+    rows = list(csv.DictReader(told.of("record.csv")[0]["text"].splitlines()))
+    for key, column in (("time", "time"), ("outputs", "pitch"), ("inputs", "voltage")):
+        parts = [value for event in told.of("samples") for value in event[key]]
+        values = [part[0] if isinstance(part, list) else part for part in parts]
+        assert values == [float(row[column]) for row in rows][: len(values)]
+        assert len(values) == 500 + (key != "inputs")
+
+
+def test_the_running_estimate_ends_where_the_identification_does(told: Told):
+    estimates, result = told.of("estimate"), told.of("result")[0]
+    assert [e["k"] for e in estimates] == sorted(e["k"] for e in estimates)
+    for name, p in result["identification"]["params"].items():
+        assert estimates[-1]["estimate"][name] == pytest.approx(p["estimate"], rel=1e-9)
+        least = 1.959964 * result["row"]["params"][name]["cramer_rao_bound"]
+        assert estimates[-1]["bound"][name] == pytest.approx(least)
+        bounds = [e["bound"][name] for e in estimates]
+        assert bounds == sorted(bounds, reverse=True)
+        assert estimates[-1]["half"][name] < estimates[0]["half"][name] / 10
+
+
+def test_an_estimate_is_not_told_before_its_sample(told: Told):
+    seen = 0
+    for event in told:
+        seen += len(event["time"]) if event["kind"] == "samples" else 0
+        assert event["kind"] != "estimate" or event["k"] < seen
+
+
+def test_two_others_are_compared_on_the_same_plant(told: Told):
+    others = [event["row"] for event in told.of("other")]
+    assert [row["excitation"] for row in others] == ["prbs", "aero2"]
+    assert all(row["params"]["J_p"]["true"] == 0.025 for row in others)
+
+
+def test_a_stream_has_no_gaps(told: Told):
+    assert told.gap < MAX_GAP
+
+
+def test_an_uploaded_file_is_identified_as_at_the_command_line(client, told: Told):
+    text = told.of("record.csv")[0]["text"].replace("pitch", "theta")
+    uploaded = client.post("/api/uploads?name=my log.csv", content=text).json()
+    assert uploaded["columns"] == {"time": 501, "voltage": 501, "theta": 501}
+    asked = {"upload": uploaded["upload"], "plant": "aero2", "estimator": "nls"}
+    asked |= {"columns": {"pitch": "theta"}, "scales": {}, "initial_state": "known"}
+    [event] = streamed(client, "/api/identifications", asked).of("identified")
+    own = told.of("result")[0]["identification"]
+    assert event["identification"]["params"] == own["params"]
+    assert event["identification"]["files"] == ["my_log.csv"]
+    report = client.get(f"/api/results/{event['result']}/report.html")
+    assert "attachment" in report.headers["content-disposition"]
+    assert "J_p" in report.text
+
+
+def test_ten_clients_at_once(address: str, told: Told):
+    """Every one of them gets a stream without gaps, and its result."""
+    del told  # the server is warm
+
+    async def one(opened: httpx.AsyncClient, seed: int) -> tuple[float, float, set[str]]:
+        gap, start, last, first, kinds = 0.0, time.perf_counter(), 0.0, 0.0, set[str]()
+        asked = {**EXPERIMENT, "seed": seed, "others": []}
+        async with opened.stream("POST", "/api/experiments", json=asked) as answer:
+            async for line in answer.aiter_lines():
+                now, kind = time.perf_counter(), json.loads(line)["kind"]
+                if kind == "samples":
+                    gap, first = max(gap, now - last if first else 0), first or now - start
+                last, kinds = now, kinds | {kind}
+        return gap, first, kinds
+
+    async def all_of_them() -> list[tuple[float, float, set[str]]]:
+        clients = [
+            httpx.AsyncClient(base_url=address, headers={"origin": address}, timeout=120)
+            for _ in range(10)
+        ]
+        try:
+            await asyncio.gather(*(c.get("/") for c in clients))
+            return await asyncio.gather(*(one(c, seed) for seed, c in enumerate(clients)))
+        finally:
+            await asyncio.gather(*(c.aclose() for c in clients))
+
+    seen = asyncio.run(all_of_them())
+    assert all(kinds >= {"samples", "estimate", "result", "end"} for _, _, kinds in seen)
+    assert max(gap for gap, _, _ in seen) < MAX_GAP
+
+
+# --------------------------------------------------------------------------------- stopping
+
+
+def processes_of(address: str) -> set[int]:
+    """Workers of the server that listens at this address."""
+    port = int(address.rpartition(":")[2])
+    found = set()
+    for place in Path("/proc").glob("[0-9]*"):
+        try:
+            words = (place / "cmdline").read_bytes().split(b"\0")
+            parent = int((place / "stat").read_text().rpartition(")")[2].split()[1])
+        except OSError:
+            continue
+        if b"excite.web.worker" in words and listens(parent, port):
+            found.add(int(place.name))
+    return found
+
+
+def listens(process: int, port: int) -> bool:
+    """Whether a process has the socket of a port."""
+    inodes = {
+        line.split()[9]
+        for line in Path("/proc/net/tcp").read_text().splitlines()[1:]
+        if line.split()[1].endswith(f":{port:04X}") and line.split()[3] == "0A"
+    }
+    try:
+        links = {os.readlink(link) for link in Path(f"/proc/{process}/fd").iterdir()}
+    except OSError:
+        return False
+    return any(f"socket:[{inode}]" in links for inode in inodes)
+
+
+def test_what_is_stopped_ends_and_its_worker_is_free(address: str, client, told: Told):
+    del told
+    before = processes_of(address)
+    assert len(before) == 2
+    long = {**EXPERIMENT, "plant": "cart_pole", "params": {}, "steps": 3000, "others": []}
+    long |= {"amplitude": 1.0, "seconds": 60}
+    kinds, job, start = [], "", 0.0
+    with client.stream("POST", "/api/experiments", json=long) as answer:
+        for line in answer.iter_lines():
+            event = json.loads(line)
+            kinds.append(event["kind"])
+            job = event.get("job", job)
+            if event["kind"] == "started":  # a plant and a length that are not compiled yet
+                start = time.monotonic()
+                assert client.delete(f"/api/jobs/{job}").status_code == 200
+    assert kinds[-1] == "stopped"
+    assert time.monotonic() - start < 3
+    deadline = time.monotonic() + 10
+    while before <= processes_of(address) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not before <= processes_of(address), "its worker goes on"
+    again = client.post("/api/uploads?name=a.csv", content="time,x\n0,1\n1,2\n")
+    assert again.status_code == 200
+
+
+def test_a_browser_that_leaves_takes_its_work_along(address: str, told: Told):
+    del told
+    with browser(address) as other:
+        for _ in range(MAX_JOBS + 1):  # more than it may have under way
+            with other.stream("POST", "/api/experiments", json=EXPERIMENT) as answer:
+                assert answer.status_code == 200
+                assert json.loads(next(answer.iter_lines()))["kind"] == "job"
+            time.sleep(0.2)
+
+
+# ------------------------------------------------------------------------------ bad files
+
+
+BAD_FILES = {
+    "pickle.mat": (pickle.dumps({"time": os.system}), "not a readable MAT file"),
+    "noise.mat": (bytes(range(256)) * 40, "not a readable MAT file"),
+    "empty.csv": (b"", "empty"),
+    "binary.csv": (b"\xff\xfe\x00" * 30, "cannot be read as CSV text"),
+    "cut.csv": (b"time,pitch\n0,1\n1,", "does not end with a line break"),
+    "ragged.csv": (b"time,pitch\n0,1\n1,2,3\n", "is the file truncated?"),
+    "program.py": (b"raise SystemExit\n", ".csv or .mat"),
+    "policy.safetensors": (b"{}", ".csv or .mat"),
+    "archive.csv.gz": (b"\x1f\x8b", ".csv or .mat"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_FILES)
+def test_a_bad_file_is_one_sentence_and_nothing_is_run(name: str, client, told: Told):
+    del told
+    content, sentence = BAD_FILES[name]
+    answer = client.post(f"/api/uploads?name={name}", content=content)
+    assert answer.status_code in (400, 415, 422)
+    assert sentence in answer.json()["sentence"]
+    assert "/tmp" not in answer.text
+
+
+def test_a_script_in_a_column_stays_text(client, told: Told):
+    del told
+    script = "<script>alert(1)</script>"
+    text = f"time,{script},pitch\n0,1,2\n1,2,3\n"
+    answer = client.post(f"/api/uploads?name=../../{script}.csv", content=text)
+    assert answer.headers["content-type"] == "application/json"
+    assert answer.headers["x-content-type-options"] == "nosniff"
+    assert script in answer.json()["columns"]
+    assert "<" not in answer.json()["file"]
+    assert "/" not in answer.json()["file"]
+
+
+# ------------------------------------------- who may ask for what, on a server without workers
+
+
+@pytest.fixture
+def scratch(tmp_path: Path) -> Path:
+    return tmp_path
+
+
+def guarded(runs: Path, scratch: Path, **settings: Any) -> TestClient:
+    app = application(Settings(runs, num_workers=0, **settings), scratch)
+    return TestClient(app, base_url=HERE, headers={"origin": HERE})
+
+
+@pytest.fixture
+def page(runs: Path, scratch: Path) -> TestClient:
+    opened = guarded(runs, scratch)
+    assert opened.get("/").status_code == 200
+    return opened
+
+
+def test_the_page_comes_with_its_headers_and_a_secret(page: TestClient):
+    answer = page.get("/", headers={"cookie": ""})
+    assert "default-src 'self'" in answer.headers["content-security-policy"]
+    assert answer.headers["x-content-type-options"] == "nosniff"
+    cookie = answer.headers["set-cookie"]
+    assert cookie.startswith("excite_8000=")
+    assert "HttpOnly; SameSite=Strict" in cookie
+    text = answer.text + page.get("/static/bench.js").text
+    assert "http://" not in text.replace("http://www.w3.org", "")
+    assert "https://" not in text
+
+
+@pytest.mark.parametrize(
+    "host", ["evil.example", "evil.example:8000", "127.0.0.1:8001", "127.0.0.1", "", "[", "a:b:c"]
+)
+def test_another_host_is_refused(host: str, page: TestClient):
+    for path in ("/", "/api/runs", "/static/bench.js"):
+        assert page.get(path, headers={"host": host}).status_code == 421
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"origin": "http://evil.example"},
+        {"origin": "null"},
+        {"origin": ""},
+        {"origin": "http://127.0.0.1:8001"},
+        {"origin": "https://127.0.0.1:8000"},
+        {"sec-fetch-site": "cross-site"},
+        {"sec-fetch-site": "same-site"},
+    ],
+)
+def test_a_request_from_elsewhere_changes_nothing(headers: dict[str, str], page: TestClient):
+    for method, path in (
+        ("POST", "/api/experiments"),
+        ("POST", "/api/uploads?name=a.csv"),
+        ("POST", "/api/trainings"),
+        ("POST", "/api/session"),
+        ("DELETE", "/api/jobs/x"),
+        ("DELETE", "/api/trainings/x"),
+    ):
+        assert page.request(method, path, headers=headers, json={}).status_code == 403
+    if "sec-fetch-site" in headers:
+        assert page.get("/api/runs", headers=headers).status_code == 403
+
+
+def test_without_its_secret_a_browser_sees_nothing(runs: Path, scratch: Path):
+    stranger = guarded(runs, scratch)
+    for cookie in ("", "excite_8000=guess", "excite_8000=", ";;=;", "excite_9000=x"):
+        answer = stranger.get("/api/runs", headers={"cookie": cookie})
+        assert answer.status_code == 403
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "..", "../", "../secret.json", "..%2fsecret.json", "%2e%2e/secret.json", "/etc", "some",
+        "some/../some/study", "some/study/..", "elsewhere", "elsewhere/runs/some/study", ".",
+        "some\\study", "some/study\x00", "", "//some/study",
+    ],
+)  # fmt: skip
+def test_nothing_outside_the_run_folder_is_served(name: str, page: TestClient, runs: Path):
+    for path in ("/api/run", "/api/run/file", "/api/run/report.html"):
+        answer = page.get(path, params={"name": name, "file": "run.json"})
+        assert answer.status_code == 404
+    for raw in (f"/static/{name}", f"/static/../{name}", f"/api/results/{name}/record.csv"):
+        answer = page.get(httpx.URL(HERE).copy_with(raw_path=raw.encode().replace(b"\0", b"%00")))
+        assert "secret" not in answer.text
+        # A client may have taken the dots for its own: what is left is the page itself.
+        assert answer.status_code == 404 or answer.text.startswith("<!doctype html>")
+    assert (runs.parent / "secret.json").read_text() == '{"secret": 1}'
+
+
+@pytest.mark.parametrize(
+    "file", ["../../../secret.json", "link.json", "program.py", "/etc/passwd", "", "run.json/.."]
+)
+def test_only_listed_files_of_a_run_are_served(file: str, page: TestClient):
+    asked = {"name": "some/study", "file": file}
+    assert page.get("/api/run/file", params=asked).status_code == 404
+
+
+def test_the_run_folder_is_listed_as_it_is(page: TestClient, runs: Path):
+    assert list(found(runs)) == ["some/study"]
+    [run] = page.get("/api/runs").json()["runs"]
+    assert (run["name"], run["kind"], run["plant"]) == ("some/study", "study", "aero2")
+    content = page.get("/api/run", params={"name": "some/study"}).json()
+    assert content["header"] == ["method", "<b>x</b>"]
+    assert content["rows"] == [["chirp", "1"]]
+    assert content["notes"] == ["note"]
+    assert content["files"] == ["run.json", "table.md"]
+    served_file = page.get("/api/run/file", params={"name": "some/study", "file": "table.md"})
+    assert served_file.headers["content-disposition"].startswith("attachment")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"plant": "examples/flexible_drive.py:FlexibleDrive"},
+        {"plant": "flexible_drive.py:FlexibleDrive"},
+        {"plant": 3},
+        {"excitation": "signal.csv"},
+        {"excitation": "../policy.safetensors"},
+        {"others": ["/tmp/policy.safetensors"]},
+        {"others": ["chirp", "prbs", "random"]},
+        {"others": "prbs"},
+        {"steps": 10**9},
+        {"steps": 2.5},
+        {"steps": True},
+        {"amplitude": "7"},
+        {"seconds": -1},
+        {"params": [1]},
+        {"params": {"J_p": "0.1"}},
+        {"noise": {str(i): 1 for i in range(40)}},
+        {"seed": -1},
+    ],
+)
+def test_a_request_is_names_and_numbers_and_nothing_else(change: dict, page: TestClient):
+    answer = page.post("/api/experiments", json={**EXPERIMENT, **change})
+    assert answer.status_code == 400
+    assert answer.json()["sentence"]
+
+
+@pytest.mark.parametrize("content", [b"", b"[1]", b"{", b"\xff", b"[" * 10000, b"NaN"])
+def test_a_malformed_request_is_refused(content: bytes, page: TestClient):
+    assert page.post("/api/experiments", content=content).status_code == 400
+
+
+def test_what_is_too_large_is_refused_before_it_is_read(page: TestClient, scratch: Path):
+    assert page.post("/api/experiments", content=b" " * 100_000).status_code == 413
+    big = str(MAX_UPLOAD + 1)
+    answer = page.post("/api/uploads?name=a.csv", content=b"x", headers={"content-length": big})
+    assert answer.status_code == 413
+
+    def endless() -> Iterator[bytes]:
+        for _ in range(MAX_UPLOAD // 2**20 + 2):
+            yield b"0" * 2**20
+
+    assert page.post("/api/uploads?name=a.csv", content=endless()).status_code == 413
+    assert not list(scratch.glob("*/*/*"))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"plant": "mine.py:Mine"}, {"name": "../out"}, {"name": "/tmp/out"}, {"name": "a b"},
+        {"objective": "D;rm"}, {"objective": "--set"}, {"updates": 0}, {"spread": 2},
+        {"steps": "60"}, {"name": "-x"},
+    ],
+)  # fmt: skip
+def test_a_training_takes_names_and_numbers_alone(change: dict, page: TestClient, runs: Path):
+    asked = {"plant": "aero2", "name": "mine", "objective": "D", "updates": 1, "steps": 60}
+    answer = page.post("/api/trainings", json={**asked, "spread": 0.3, **change})
+    assert answer.status_code == 400
+    assert sorted(p.name for p in runs.iterdir()) == ["elsewhere", "some"]
+
+
+def test_a_training_never_goes_where_something_is(page: TestClient):
+    asked = {"plant": "aero2", "name": "some", "objective": "D", "updates": 1, "steps": 60}
+    assert page.post("/api/trainings", json={**asked, "spread": 0.3}).status_code == 409
+
+
+def test_a_browser_cannot_see_or_stop_what_is_anothers(address: str, client, told: Told):
+    result = told.of("result")[0]["result"]
+    with browser(address) as other:
+        for file in ("record.csv", "report.html", "estimate.json"):
+            assert other.get(f"/api/results/{result}/{file}").status_code == 404
+        short = {**EXPERIMENT, "others": [], "seconds": 1}
+        with client.stream("POST", "/api/experiments", json=short) as answer:
+            lines = answer.iter_lines()
+            job = json.loads(next(lines))["job"]
+            assert other.delete(f"/api/jobs/{job}").status_code == 404
+            kinds = [json.loads(line)["kind"] for line in lines]
+        assert kinds[-1] == "end"
+        assert other.get("/api/trainings").json() == {"trainings": []}
+
+
+def test_a_browser_has_so_many_things_under_way(tmp_path: Path):
+    session = Session(tmp_path)
+    jobs = [session.begin() for _ in range(MAX_JOBS)]
+    with pytest.raises(RefusedError, match="stop one"):
+        session.begin()
+    session.end(jobs[0])
+    session.begin()
+
+
+def test_a_picture_in_a_foreign_page_makes_no_session(runs: Path, scratch: Path):
+    stranger = guarded(runs, scratch)
+    for place in ("image", "iframe", "empty"):
+        answer = stranger.get("/", headers={"sec-fetch-dest": place})
+        assert answer.status_code == 403
+        assert "set-cookie" not in answer.headers
+
+
+# -------------------------------------------------------------------------------- the token
+
+
+def test_a_token_is_needed_where_there_is_one(runs: Path, scratch: Path):
+    client = guarded(runs, scratch, token="right-token")
+    assert client.get("/").status_code == 200  # the page itself says nothing
+    assert client.get("/api/session").json() == {"is_known": False}
+    for path in ("/api/runs", "/api/catalogue", "/api/run?name=some/study", "/api/trainings"):
+        assert client.get(path).status_code == 401
+    assert client.post("/api/experiments", json=EXPERIMENT).status_code == 401
+    assert client.post("/api/session", json={"token": "right-token"}).json()["is_known"]
+    assert client.get("/api/runs").status_code == 200
+
+
+def test_a_token_cannot_be_guessed(runs: Path, scratch: Path):
+    client = guarded(runs, scratch, token="right-token")
+    client.get("/")
+    for guess in ["", "right-toke", None, 7, ["right-token"], "x" * 60, *"abcdefg"][:MAX_TRIES]:
+        assert client.post("/api/session", json={"token": guess}).status_code == 401
+    answer = client.post("/api/session", json={"token": "right-token"})
+    assert answer.status_code == 429, "the right one, too, has to wait then"
+    assert client.get("/api/runs").status_code == 401
+
+
+def test_every_address_of_this_computer_is_answered_where_all_are_bound(runs, scratch):
+    client = guarded(runs, scratch, host="0.0.0.0", token="right-token")
+    own = socket.gethostname().lower()
+    for host, status in (("10.0.0.7:8000", 200), (f"{own}:8000", 200), ("evil.example:8000", 421)):
+        assert client.get("/", headers={"host": host}).status_code == status
+
+
+# ----------------------------------------------------------------------- the command line
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["--runs", "nowhere"], "no such folder"),
+        (["--host", "no.such.host.invalid"], "is no address"),
+        (["--host", "192.0.2.1"], "cannot listen"),
+        (["--token", "short"], "eight characters"),
+        (["--port", "70000"], "70000"),
+        (["--port", "TAKEN"], "--port 0 takes a free port"),
+    ],
+)
+def test_a_mistake_is_one_sentence(words: list[str], sentence: str, tmp_path: Path):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        words = [w.replace("TAKEN", str(taken.getsockname()[1])) for w in words]
+        runs = [] if "--runs" in words else ["--runs", str(tmp_path)]
+        command = [sys.executable, "-m", "excite", "serve", *words, *runs]
+        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 2
+    assert sentence in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert done.stdout == ""
+
+
+def test_without_the_extra_one_sentence_says_what_to_install(tmp_path: Path):
+    program = "import sys; sys.modules['starlette'] = None; from excite.cli import main; main()"
+    command = [sys.executable, "-c", program, "serve", "--runs", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "pip install -e '.[web]'" in done.stderr
+
+
+def test_other_computers_need_a_token_that_is_printed(tmp_path: Path):
+    words = [sys.executable, "-m", "excite", "serve", "--host", "0.0.0.0", "--port", "0", "--json"]
+    with subprocess.Popen([*words, "--runs", str(tmp_path)], stdout=subprocess.PIPE) as process:
+        try:
+            lines = iter(process.stdout.readline, b"}\n") if process.stdout else iter([])
+            told = json.loads(b"".join([*lines, b"}"]))
+        finally:
+            process.kill()
+    assert len(told["token"]) > 20
+    assert told["address"].endswith("#" + told["token"])
