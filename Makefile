@@ -27,7 +27,7 @@ results: .venv/core ## the committed results, afresh (minutes in studies/README.
 	done
 
 agents: .venv/dev ## the trained agents of the studies, afresh (hours; goes on where it was interrupted)
-	for study in table1 paper frontier emps dc_motor cart_pole half amplitude nls_reward spread reward; do \
+	for study in table1 paper frontier emps dc_motor cart_pole aero2_lag half amplitude nls_reward spread reward; do \
 	  $(BIN)/excite study run studies/$$study.toml --out runs/$$study || exit 1; \
 	done
 
@@ -41,6 +41,7 @@ policies: ## what is shipped in src/excite/policies, from the results of the stu
 	cp results/table1/seeds/RL_D_p/6/policy.safetensors src/excite/policies/aero2-ppo-D_p.safetensors
 	cp results/emps/seeds/gradient_D/0/policy.safetensors src/excite/policies/emps.safetensors
 	cp results/dc_motor/seeds/gradient_D/0/policy.safetensors src/excite/policies/dc_motor.safetensors
+	cp results/aero2_lag/seeds/gradient_D/0/policy.safetensors src/excite/policies/aero2_lag.safetensors
 	cp results/cart_pole/seeds/gradient_D/0/policy.safetensors src/excite/policies/cart_pole.safetensors
 
 .venv/core: pyproject.toml constraints.txt
