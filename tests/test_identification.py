@@ -116,13 +116,13 @@ def test_the_start_changes_no_estimate(result, chirp):
 
 
 def test_a_known_parameter_is_held_and_the_others_gain(chirp, result):
-    held = identify(PLANT, [chirp], NLS(hold=("K_pu",)), start={"K_pu": 0.012})
+    held = identify(PLANT, [chirp], NLS(known=("K_pu",)), start={"K_pu": 0.012})
     assert held.status == "successful"
     assert held.held == ("K_pu",)
     assert held.params["K_pu"] == pytest.approx(0.012, rel=1e-12)
     assert np.isnan(held.std_error["K_pu"])
     right = {"K_pu": result.params["K_pu"]}
-    known = identify(PLANT, [chirp], NLS(hold=("K_pu",)), start=right)
+    known = identify(PLANT, [chirp], NLS(known=("K_pu",)), start=right)
     for name in ("J_p", "D_p"):
         assert abs(known.params[name] - result.params[name]) < 0.05 * result.std_error[name]
         assert known.std_error[name] <= result.std_error[name] * 1.001
@@ -138,8 +138,12 @@ def test_a_lag_may_be_known_or_estimated():
         np.arange(301) * 0.1, np.asarray(signal), noisy, {"starts_at_initial_state": True}
     )
     free = identify(plant, [record], initial_state="known")
-    known = identify(plant, [record], NLS(hold=("tau",)), start={"tau": 0.2}, initial_state="known")
-    wrong = identify(plant, [record], NLS(hold=("tau",)), start={"tau": 0.1}, initial_state="known")
+    known = identify(
+        plant, [record], NLS(known=("tau",)), start={"tau": 0.2}, initial_state="known"
+    )
+    wrong = identify(
+        plant, [record], NLS(known=("tau",)), start={"tau": 0.1}, initial_state="known"
+    )
     assert abs(free.params["tau"] - 0.2) < 4 * free.std_error["tau"]
     assert abs(known.params["J_p"] - 0.025) < 4 * known.std_error["J_p"]
     assert known.structure["pitch"] > 0.01
@@ -152,7 +156,7 @@ def test_a_lag_may_be_known_or_estimated():
 )
 def test_what_cannot_be_held_is_refused(chirp, hold, complaint):
     with pytest.raises(ValueError, match=complaint):
-        identify(PLANT, [chirp], NLS(hold=hold))
+        identify(PLANT, [chirp], NLS(known=hold))
 
 
 # Initial states

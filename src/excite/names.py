@@ -231,7 +231,7 @@ def estimator_named(name: str, options: Mapping[str, Any] | None = None) -> Abst
 
 def _build(default: Any, name: str, options: Mapping[str, Any]) -> Any:
     """`default` with other options, their names and types checked."""
-    hidden = ("name", "horizons", "inputs", "signal", "hold")
+    hidden = ("name", "horizons", "inputs", "signal", "known")
     fields = {f.name: f for f in dataclasses.fields(default) if f.name not in hidden}
     for option, value in options.items():
         if option not in fields:

@@ -103,7 +103,7 @@ def identify(
             raise ValueError(f"{method.name} estimates all at once and takes no --{name}")
     held = merged(options["hold"])
     if held:
-        method = dataclasses.replace(method, hold=tuple(held))
+        method = dataclasses.replace(method, known=tuple(held))
     mapping = merged(options["column"]), merged(options["scale"])
     records = [read_record(file, chosen.description, *mapping) for file in files]
     held_out = [read_record(file, chosen.description, *mapping) for file in options["validation"]]

@@ -42,13 +42,13 @@ class NLS(AbstractEstimator):
         tolerance: of the last search, in search coordinates and relative to the residual;
             the first searches stop at 0.1.
         max_steps: of each search.
-        hold: names of parameters that are known: they stay where the search starts.
+        known: names of parameters that are held where the search starts.
     """
 
     horizons: tuple[float, ...] = eqx.field(static=True, default=(0.08, 0.16, 0.32, 0.6, 1.0))
     tolerance: float = eqx.field(static=True, default=1e-5)
     max_steps: int = eqx.field(static=True, default=200)
-    hold: tuple[str, ...] = eqx.field(static=True, default=())
+    known: tuple[str, ...] = eqx.field(static=True, default=())
     name: str = eqx.field(static=True, default="nls", kw_only=True)
 
     @eqx.filter_jit
@@ -70,13 +70,13 @@ class NLS(AbstractEstimator):
     def held(self, plant: AbstractPlant) -> tuple[bool, ...]:
         """Which parameters of a plant are held; ValueError for a name it does not have."""
         names = names_of(plant.definition.parameters)
-        for name in self.hold:
+        for name in self.known:
             if name not in names:
                 raise ValueError(
                     f"plant {plant.definition.name!r} has no parameter {name!r} to hold; it has "
                     f"{', '.join(names)}"
                 )
-        return tuple(name in self.hold for name in names)
+        return tuple(name in self.known for name in names)
 
     @eqx.filter_jit
     def sensitivity(
