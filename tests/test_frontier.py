@@ -104,9 +104,13 @@ def test_a_tuned_loop_is_what_its_options_say(tmp_path):
     run = run_episode(plant, plant.nominal, loop, 40, jax.random.key(0))
     inputs = read_record(tmp_path / "loop.csv", plant.description).inputs[:-1]
     np.testing.assert_allclose(inputs, run.inputs, rtol=1e-9)
-    episodes = evaluate(plant, loop, 40, 0.3, jax.random.split(jax.random.key(1), 1000))
+    # What is said of the file is said of the file: no loop is closed when it is played.
+    played = Replay(jnp.asarray(inputs))
+    episodes = evaluate(plant, played, 40, 0.3, jax.random.split(jax.random.key(1), 1000))
     log_det = np.linalg.slogdet(np.asarray(episodes.information))[1].mean()
     assert said["log_det_information"] == pytest.approx(log_det, rel=1e-6)
+    assert said["violations"] == int(np.sum(episodes.is_violation))
+    assert said["as_excitation"]["evaluations"] == 1000
 
 
 def test_efficiency_compares_with_the_clairvoyant_signals_on_their_plants(folder):

@@ -49,7 +49,7 @@ def test_the_commands_of_a_page_run(page: Path, tmp_path: Path):
     run = subprocess.run(
         [sys.executable, "-c", PLAYER], input="\n".join(play(page)), cwd=tmp_path,
         env={**os.environ, "PATH": f"{HERE}{os.pathsep}{os.environ['PATH']}"},
-        capture_output=True, text=True, timeout=300, check=False,
+        capture_output=True, text=True, timeout=1200, check=False,
     )  # fmt: skip
     assert run.returncode == 0, run.stdout[-2000:] + run.stderr[-2000:]
     for file in MADE.findall("\n".join(play(page))):
@@ -59,7 +59,7 @@ def test_the_commands_of_a_page_run(page: Path, tmp_path: Path):
         [python] = re.findall(r"```python\n(.*?)```", page.read_text(), re.S)
         run = subprocess.run(
             [sys.executable, "-c", python], cwd=tmp_path,
-            capture_output=True, text=True, timeout=300, check=False,
+            capture_output=True, text=True, timeout=1200, check=False,
         )  # fmt: skip
         assert run.returncode == 0, run.stderr
         assert "J_p" in run.stdout
@@ -124,7 +124,7 @@ def test_the_site_builds_strictly_and_asks_nothing_of_the_network(tmp_path: Path
     run = subprocess.run(
         [sys.executable, "-m", "mkdocs", "build", "--strict", "-d", str(tmp_path)],
         cwd=ROOT, env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
-        capture_output=True, text=True, timeout=300, check=False,
+        capture_output=True, text=True, timeout=1200, check=False,
     )  # fmt: skip
     assert run.returncode == 0, run.stderr
     for page in tmp_path.rglob("*.html"):
