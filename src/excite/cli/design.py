@@ -64,7 +64,6 @@ def design(
 ) -> None:  # fmt: skip
     """Design an open-loop input for PLANT, within its limits and safe for uncertain parameters."""
     import dataclasses
-    import json
 
     import jax
     import numpy as np
@@ -72,7 +71,7 @@ def design(
     from ..design import signal_env
     from ..evaluation import evaluate
     from ..excitation import Replay
-    from ..information import require_noise
+    from ..information import d_optimality, require_noise
     from ..names import plant_named, with_sensor
     from ..records import require_record_path, write_record
     from ..report import episode_figure, save
@@ -92,7 +91,7 @@ def design(
     keys = jax.random.split(jax.random.key(options["seed"] + 1), count)
     # The file is played as it stands, whatever closed a loop or drew numbers to make it.
     judged = evaluate(chosen, Replay(inputs), options["steps"], float(env.spread), keys)
-    information = np.linalg.slogdet(np.asarray(judged.information))[1]
+    information = jax.vmap(d_optimality)(judged.information)
     description = chosen.description
     record = _record(chosen, inputs, found)
     if plot is not None:
@@ -116,12 +115,18 @@ def design(
             + ("the nominal plant" if is_nominal else f"{count} fresh plants")
         )
         if tuned is not None:
-            settings = ",".join(f"{k}={json.dumps(v)}" for k, v in tuned.options.items())
-            click.echo(
-                f"as an excitation, drawn or closed anew each time: --excitation "
-                f"{tuned.excitation} --set {settings}; {tuned.violations} violations on "
-                f"{tuned.episodes} fresh plants"
-            )
+            click.echo(_as_excitation(tuned))
+
+
+def _as_excitation(tuned: Any) -> str:
+    """How a tuned signal is drawn, or its loop closed, anew, and what that is worth."""
+    import json
+
+    settings = ",".join(f"{k}={json.dumps(v)}" for k, v in tuned.options.items())
+    return (
+        f"as an excitation, drawn or closed anew each time: --excitation {tuned.excitation} "
+        f"--set {settings}; {tuned.violations} violations on {tuned.episodes} fresh plants"
+    )
 
 
 def _record(plant: Any, inputs: Any, found: dict[str, Any]) -> Any:

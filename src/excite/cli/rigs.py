@@ -224,8 +224,7 @@ def _maker(
         raise ValueError("--filter needs JAX, which is not installed")
     from ..rig.prediction import FilteredPlayer, SafetyFilter
 
-    slew = float("inf") if options["slew"] is None else options["slew"]
-    filter = SafetyFilter.of(plant, options["spread"], slew)
+    filter = SafetyFilter.of(plant, options["spread"], options["slew"])
     return lambda: FilteredPlayer(bare(), filter)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -44,7 +45,7 @@ def _options(command: Any) -> Any:
         click.option("--out", type=OUT_FILE, metavar="FILE.csv", help="The record."),
         click.option("--overwrite", is_flag=True, help="Replace the record if it exists."),
         click.option("--steps", type=WholeNumber(2), metavar="T", help="Samples; default all."),
-        click.option("--slew", type=float, metavar="RATE",
+        click.option("--slew", type=float, default=math.inf, metavar="RATE",
                      help="Largest change of an input in a second, in its unit; default any."),
         click.option("--filter", "filtered", is_flag=True,
                      help="Predictive safety filter: changes an input where a plant of the prior "
@@ -89,8 +90,7 @@ def run(out: Path | None, overwrite: bool, dry_run: bool, as_json: bool, **optio
         require_record_path(out, overwrite)
     has_jax = _has_jax()
     job = job_from(options, has_jax)
-    slew = options["slew"]
-    rules = Supervision.of(job.rig.description, float("inf") if slew is None else slew)
+    rules = Supervision.of(job.rig.description, options["slew"])
     if dry_run or out is None:
         return _show_dry_run(job, rules, as_json)
     job.check_latency()

@@ -65,10 +65,8 @@ def input_dependence(
         own = _lagged(centred[:, None], past)
         memory = np.linalg.lstsq(own[past:], centred[past:], rcond=None)[0]
         white = (centred - own @ memory)[past + lags :]
-        filtered = record - sum(
-            (memory[i] * _lagged(record, i + 1)[:, -record.shape[1] :] for i in range(past)),
-            start=np.zeros_like(record),
-        )
+        before = _lagged(record, past).reshape(len(record), past, record.shape[1])
+        filtered = record - np.einsum("spi,p->si", before, memory)
         regressors = _lagged(filtered, lags)[past + lags :]
         left, sizes, _ = np.linalg.svd(regressors - regressors.mean(axis=0), full_matrices=False)
         seen = left[:, sizes > 1e-6 * max(sizes[0], 1e-300)]

@@ -292,7 +292,11 @@ def _fitted(description: PlantDescription, record: Record, residual: np.ndarray)
 
 def _whiteness(residuals: list[np.ndarray], scale: float) -> float:
     """p-value of white residuals; not a number where only rounding is left of them."""
-    return ljung_box(*(r for r in residuals if np.abs(r).max() > 1e-8 * scale))
+    return ljung_box(*(r for r in residuals if _is_more_than_rounding(r, scale)))
+
+
+def _is_more_than_rounding(residual: np.ndarray, scale: float) -> bool:
+    return bool(np.abs(residual).max() > 1e-8 * scale)
 
 
 def _dependence(
@@ -300,7 +304,7 @@ def _dependence(
 ) -> float:
     """p-value of an output's residual not following the input; see `_whiteness`."""
     pairs = [(r[:, output], record.inputs) for r, record in zip(residual, records, strict=True)]
-    pairs = [(r, inputs) for r, inputs in pairs if np.abs(r).max() > 1e-8 * scale]
+    pairs = [(r, inputs) for r, inputs in pairs if _is_more_than_rounding(r, scale)]
     return input_dependence([r for r, _ in pairs], [inputs for _, inputs in pairs])
 
 

@@ -213,9 +213,9 @@ class PolicyPlayer(AbstractPlayer):
         observation = observe(np, self._layout, self._window, k)
         with np.errstate(over="ignore", invalid="ignore"):
             action = network(np, self._policy.weights, observation).astype(float)
-        # Clipping leaves alone what is no number: the supervisor ends the experiment for it.
-        infinite = np.where(np.isfinite(action), action, np.nan)
-        return scaled_action(np, self._layout, np.clip(infinite, -1.0, 1.0))
+        # Not zero, as in training: for what is no number the supervisor ends the experiment.
+        action = np.where(np.isfinite(action), np.clip(action, -1.0, 1.0), np.nan)
+        return scaled_action(np, self._layout, action)
 
     def applied(self, input: np.ndarray) -> None:
         """The window remembers what was applied."""

@@ -350,11 +350,17 @@ def evaluate_on_rig(
         filtering: a safety filter and its memory, where there is one; see `run_batch`.
     """
     runs = run_batch(many, excitation, rules, (num_steps, readings_per_sample(plant)), *filtering)
-    time = jnp.arange(num_steps + 1) * plant.dt
+    return _scored(plant, many.params, runs), runs
+
+
+@eqx.filter_jit
+def _scored(plant: AbstractPlant, params: Params, runs: Runs) -> Episodes:
+    """Every run as an experiment; its safety is that of all readings, not of samples alone."""
 
     def score(params: Params, run: Runs) -> Episodes:
+        time = jnp.arange(len(run.measured)) * plant.dt
         return scored(plant, params, Trajectory(time, run.inputs, run.measured, run.measured))
 
-    episodes = jax.jit(jax.vmap(score))(many.params, runs)
+    episodes = jax.vmap(score)(params, runs)
     safety = runs.is_violation, runs.max_abs_output
-    return eqx.tree_at(lambda e: (e.is_violation, e.max_abs_output), episodes, safety), runs
+    return eqx.tree_at(lambda e: (e.is_violation, e.max_abs_output), episodes, safety)
