@@ -236,6 +236,16 @@ def test_a_multisine_is_flat_in_its_band_and_zero_outside(low, high, num_steps):
     assert np.abs(values).max() == pytest.approx(3.0)
 
 
+def test_phases_change_a_multisine_and_not_its_spectrum():
+    usual, drawn, again, other = (of_aero2(Multisine(phases=n)) for n in (0, 1, 1, 2))
+    np.testing.assert_array_equal(drawn, again)
+    shapes = [np.abs(np.fft.rfft(own)) for own in (usual, drawn, other)]
+    for own in shapes[1:]:
+        np.testing.assert_allclose(own / own.max(), shapes[0] / shapes[0].max(), atol=1e-9)
+    for one, two in ((usual, drawn), (drawn, other)):
+        assert abs(one @ two) < 0.5 * np.sqrt((one @ one) * (two @ two))
+
+
 @pytest.mark.parametrize(("low", "high"), [(0.1, 2.0), (0.05, 4.0), (1.0, 2.0)])
 def test_schroeder_phases_lower_the_crest_factor(low, high):
     values = of_aero2(Multisine(1.0, low, high), 500)

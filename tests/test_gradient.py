@@ -14,7 +14,14 @@ from jaxtyping import Array
 from excite.description import Input, Output, Parameter, PlantDescription, State
 from excite.env import Env
 from excite.information import a_optimality, d_optimality, e_optimality, experiment_information
-from excite.objective import AbstractObjective, EstimationError, InformationGain, prior_sd_of
+from excite.objective import (
+    AbstractObjective,
+    EstimationError,
+    InformationGain,
+    OutputError,
+    WeightedSum,
+    prior_sd_of,
+)
 from excite.plant import AbstractPlant, Aero2
 from excite.policy import Layout, Weights, forward, observe
 from excite.simulation import simulate
@@ -63,6 +70,29 @@ OBJECTIVES = {
     "A": InformationGain(ALL, prior_sd_of(0.3), criterion="A", dense=False),
     "E of two": InformationGain((True, True, False), prior_sd_of(0.3), criterion="E", dense=False),
 }
+OBJECTIVES["D and errors"] = WeightedSum(
+    (OBJECTIVES["D dense"], EstimationError(ALL, [0.01, 0.004, 1.0], "log", 2.0))
+)
+
+
+def test_a_sum_is_worth_the_sum_of_its_terms():
+    goals = [0.01, 0.004, 1.0]
+    terms = (
+        InformationGain(ALL, prior_sd_of(0.3), weight=0.5),
+        InformationGain(ALL, prior_sd_of(0.3), criterion="A", dense=False),
+        OutputError(ALL, goals, "goals", 3.0),
+    )
+
+    def of(objective: AbstractObjective) -> tuple[Array, Array]:
+        env = env_of(objective)
+        batch = experiments(env, Network(weights_of(env), env.layout), KEYS, 0.9)
+        return batch.worth, env.objective.of_batch(batch.outcome)
+
+    alone, together = [of(term) for term in terms], of(WeightedSum(terms))
+    for i in range(2):
+        np.testing.assert_allclose(together[i], sum(own[i] for own in alone), rtol=1e-9)
+    # Goals are of the mean over the plants, which the mean of their worths is not.
+    assert abs(together[1] - jnp.mean(together[0])) > 1e-3
 
 
 @pytest.mark.parametrize("name", OBJECTIVES)

@@ -18,6 +18,7 @@ from excite.names import (
     plant_named,
     with_sensor,
 )
+from excite.objective import InformationGain, OutputError, WeightedSum
 from excite.plant import AbstractPlant, Aero2, CartPole, DCMotor
 from excite.policy import Layout, Policy
 from excite.study import Study, read_study
@@ -299,6 +300,22 @@ BAD_STUDIES: dict[str, tuple[str, tuple[str, ...]]] = {
         MINIMAL.replace("aero2", "dc_motor") + "[agents.a]\n[decision]\ngoals = { R = 1 }\n",
         ("agents.a: decision: the reward 'information' has no 'goals'",),
     ),
+    "a reward beside terms": (
+        MINIMAL + "[agents.a]\n[agents.a.decision]\nreward = 'log'\nterms = [{ weight = 2.0 }]\n",
+        ("agents.a: decision: with terms, 'reward' belongs to one of them",),
+    ),
+    "an unknown key in a term": (
+        MINIMAL + "[agents.a]\n[decision]\nterms = [{ wight = 2.0 }]\n", ("wight", "weight"),
+    ),
+    "goals of a term of information": (
+        MINIMAL + "[agents.a]\n[decision]\n"
+        "terms = [{ reward = 'information', goals = { J_p = 1 } }]\n",
+        ("agents.a: decision: the reward 'information' has no 'goals'",),
+    ),
+    "negative phases": (
+        MINIMAL.replace('excitation = "chirp"', 'excitation = "multisine"\nphases = -1'),
+        ("phases is 0 or the seed of random ones: got -1",),
+    ),
     "a target twice": (
         MINIMAL + '[agents.a]\ntargets = ["J_p", "J_p"]\n', ("targets must differ", "J_p, J_p"),
     ),
@@ -520,6 +537,7 @@ def test_each_input_may_have_an_amplitude_of_its_own():
 PLANT_FILE = """
 import jax.numpy as jnp
 from excite.description import Constant, Input, Output, Parameter, PlantDescription, State
+from excite.objective import InformationGain, OutputError, WeightedSum
 from excite.plant import AbstractPlant
 
 
@@ -675,13 +693,38 @@ def test_option_names_are_those_of_the_excitations():
     values = {
         "amplitude": 1.0, "hold": 2, "clock": 2, "register": 5, "start_frequency": 0.2,
         "stop_frequency": 1.0, "frequency": 0.5, "logarithmic": True,
-        "pump": 0.25,
+        "pump": 0.25, "phases": 3,
     }  # fmt: skip
     for name, kind in EXCITATIONS.items():
         options = {f.name: values[f.name] for f in dataclasses.fields(kind)}
         built = excitation_named(name, options, Aero2())
         for option, value in options.items():
             assert float(getattr(built, option)) == value
+
+
+def test_terms_are_added_and_replace_what_agents_share(tmp_path):
+    text = """
+[decision]
+reward = "information"
+[agents.a]
+[agents.b.decision]
+terms = [{ reward = "information", weight = 0.5 }, { reward = "goals", estimator = "nls" }]
+"""
+    study = study_of(MINIMAL + text, tmp_path)
+
+    def objective(name):
+        env = study.agent(name).env(study.build_plant(), study.spread, study.num_steps)
+        return env.objective
+
+    assert isinstance(objective("a"), InformationGain)
+    both = objective("b")
+    assert isinstance(both, WeightedSum)
+    first, second = both.terms
+    assert isinstance(first, InformationGain)
+    assert isinstance(second, OutputError)
+    assert (float(first.weight), second.form) == (0.5, "goals")
+    assert "terms" not in study.agent("a").settings(study.build_plant())["decision"]
+    assert len(study.agent("b").settings(study.build_plant())["decision"]["terms"]) == 2
 
 
 def test_an_agent_has_a_range_and_plants_of_its_own(tmp_path):

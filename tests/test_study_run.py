@@ -449,13 +449,20 @@ TRAIN = (
 
 
 @pytest.mark.parametrize(
-    "choice", [(), ("--objective", "log", "--goal", "J_p=0.01", "--target", "J_p", "--clock", 0.5)]
-)
-def test_one_command_trains_a_policy_by_gradient(choice, tmp_path):
+    ("name", "choice"),
+    [
+        ("gradient(D)", ()),
+        ("gradient(log)",
+         ("--objective", "log", "--goal", "J_p=0.01", "--target", "J_p", "--clock", 0.5)),
+        ("gradient(D, log)",
+         ("--objective", "D", "--objective", "log=2", "--goal", "J_p=0.01", "--target", "J_p",
+          "--clock", 0.5)),
+    ],
+)  # fmt: skip
+def test_one_command_trains_a_policy_by_gradient(name, choice, tmp_path):
     done = excite(*TRAIN, *choice, "--out", tmp_path / "mine", "--json")
     assert done.returncode == 0, done.stderr
     rows = json.loads(done.stdout)["rows"]
-    name = "gradient(log)" if choice else "gradient(D)"
     assert [(r["method"], r["estimator"]) for r in rows] == [
         (m, e) for m in ("chirp", name) for e in ("nls", "arx-rls")
     ]
@@ -469,7 +476,10 @@ def test_one_command_trains_a_policy_by_gradient(choice, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--objective", "X"), "'X' is not one of 'D', 'A', 'E', 'relative', 'log'"),
+        (("--objective", "X"), "unknown objective 'X' (there is D, A, E, relative, log"),
+        (("--objective", "D", "--objective", "log=x"), "the weight of 'log' must be a number"),
+        (("--objective", "D", "--objective", "log=-1"), "weight must be greater than 0"),
+        (("--objective", "D", "--objective", "D=2"), "objectives must differ from each other"),
         (("--target", "J_q"), "no parameter 'J_q'"),
         (("--goal", "J_p=-1", "--objective", "log"), "goals.J_p"),
         (("--goal", "J_p=1"), "the reward 'information' has no 'goals'"),

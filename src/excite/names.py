@@ -266,6 +266,8 @@ def _check_excitation(excitation: Any, plant: AbstractPlant) -> None:
     for option in ("hold", "clock"):
         if getattr(excitation, option, 1) < 1:
             raise ValueError(f"{option} is a number of samples, at least 1")
+    if (phases := getattr(excitation, "phases", 0)) < 0:
+        raise ValueError(f"phases is 0 or the seed of random ones: got {phases}")
     pump, register = getattr(excitation, "pump", 0.5), getattr(excitation, "register", 0)
     if not 0 < float(pump) < 1:
         raise ValueError(f"pump must lie between 0 and 1: got {float(pump):g}")

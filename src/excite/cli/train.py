@@ -22,16 +22,34 @@ _OBJECTIVES = {
 }
 
 
+class Objective(click.ParamType):
+    """One of the objectives, and its weight where others are added."""
+
+    name = "NAME[=WEIGHT]"
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> tuple[str, float | None]:
+        """The two of them."""
+        from ..names import unknown
+
+        name, has_weight, weight = value.partition("=")
+        if name not in _OBJECTIVES:
+            self.fail(str(unknown("objective", name, _OBJECTIVES)), param, ctx)
+        try:
+            return name, float(weight) if has_weight else None
+        except ValueError:
+            self.fail(f"the weight of {name!r} must be a number, got {weight!r}", param, ctx)
+
+
 def _options(command: Any) -> Any:
     """What is trained, on what, and for what."""
     for option in reversed(
         [
             click.option("--method", type=click.Choice(["gradient", "ppo"]), default="gradient",
                          show_default=True, help="Gradient of the simulated experiment, or PPO."),
-            click.option("--objective", type=click.Choice(list(_OBJECTIVES)), default="D",
-                         show_default=True,
-                         help="Criterion of the Fisher information, or errors of the ARX "
-                         "estimator."),
+            click.option("--objective", "objectives", type=Objective(), multiple=True,
+                         help="Criterion of the Fisher information (D, A, E), or errors of the ARX "
+                         "estimator (relative, log, goals) or of nonlinear least squares (nls); "
+                         "repeated, a sum with these weights. Default D."),
             click.option("--target", "targets", multiple=True, metavar="NAME",
                          help="Parameter that counts; default the plant's targets."),
             click.option("--goal", "goals", type=NUMBERS, multiple=True,
@@ -79,15 +97,35 @@ def train(plant: str, out: Path, as_json: bool, **options: Any) -> None:  # fmt:
     run_study_here(chosen, out, as_json)
 
 
+def _rewards(
+    objectives: list[tuple[str, float | None]], goals: dict[str, float]
+) -> dict[str, dict[str, Any]]:
+    """What every objective means in a study; goals belong to those that know errors."""
+    names = [name for name, _ in objectives]
+    if len(set(names)) < len(names):
+        raise ValueError(f"objectives must differ from each other, got {', '.join(names)}")
+    with_goals = [name for name in names if name not in ("D", "A", "E")] or names
+    return {
+        name: {
+            **_OBJECTIVES[name],
+            **({"goals": goals} if goals and name in with_goals else {}),
+            **({} if weight is None else {"weight": weight}),
+        }
+        for name, weight in objectives
+    }
+
+
 def _study(plant: str, out: Path, options: dict[str, Any]) -> dict[str, Any]:
     """The study that these options mean."""
     from ..names import plant_named
     from ..plant import AbstractARXPlant
 
-    name = f"{options['method']}({options['objective']})"
+    rewards = _rewards(options["objectives"] or [("D", None)], merged(options["goals"]))
+    name = f"{options['method']}({', '.join(rewards)})"
     decision = {
-        **_OBJECTIVES[options["objective"]],
-        "goals": merged(options["goals"]),
+        **(
+            next(iter(rewards.values())) if len(rewards) == 1 else {"terms": list(rewards.values())}
+        ),
         "output_scale": merged(options["output_scale"]),
         "window": options["window"],
         "clocks": list(options["clocks"]),

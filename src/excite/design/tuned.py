@@ -1,4 +1,4 @@
-"""Classical signals at their best: amplitude, band, clock, hold, loop, tuned by search.
+"""Classical signals at their best: amplitude, band, clock, hold, phases, loop, by search.
 
 A comparison with a classical signal says little unless the signal was given its chance.
 The search (Optuna's tree-structured Parzen estimator) asks for the mean criterion over
@@ -128,7 +128,7 @@ def _usual(plant: AbstractPlant, num_steps: int) -> dict[str, Any]:
     low, high = (min(max(f, 1 / (num_steps * d.dt)), nyquist) for f in d.band)
     return {
         **amplitudes, "amplitude": 0.5, "gain": 1.0, "damping": 1.0, "hold": 1, "clock": 1,
-        "register": 0,
+        "register": 0, "phases": 0,
         "start_frequency": low, "stop_frequency": high, "frequency": (low * high) ** 0.5,
         "logarithmic": False, "pump": 0.3,
     }  # fmt: skip
@@ -174,11 +174,12 @@ def _band(trial: Any, plant: AbstractPlant, num_steps: int) -> dict[str, Any]:
     return {name: _frequency(trial, plant, name, num_steps) for name in names}
 
 
-def _sorted_band(trial: Any, plant: AbstractPlant, num_steps: int) -> dict[str, Any]:
-    """A multisine's band must hold a harmonic: two of them at least."""
+def _multisine(trial: Any, plant: AbstractPlant, num_steps: int) -> dict[str, Any]:
+    """Its band must hold a harmonic: two of them at least."""
     low, high = sorted(_band(trial, plant, num_steps).values())
     high = min(max(high, 2 * low), 0.5 / float(plant.dt))
-    return {"start_frequency": low, "stop_frequency": high}
+    phases = trial.suggest_categorical("phases", range(8))
+    return {"start_frequency": low, "stop_frequency": high, "phases": phases}
 
 
 _HOLDS = (1, 2, 3, 5, 8, 12, 20, 35, 60)
@@ -193,7 +194,7 @@ _OPTIONS: Mapping[str, Callable[[Any, AbstractPlant, int], dict[str, Any]]] = {
         **_band(trial, plant, num_steps),
         "logarithmic": trial.suggest_categorical("logarithmic", (False, True)),
     },
-    "multisine": _sorted_band,
+    "multisine": _multisine,
     "square": lambda trial, plant, num_steps: {
         "frequency": _frequency(trial, plant, "frequency", num_steps)
     },

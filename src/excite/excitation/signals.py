@@ -137,18 +137,20 @@ class Chirp(AbstractShape):
 
 
 class Multisine(AbstractShape):
-    """Sum of all harmonics of the experiment's length in a band, with Schroeder phases.
+    """Sum of all harmonics of the experiment's length in a band.
 
-    Its phases, -pi j (j - 1) / J for the j-th of J harmonics, keep the crest factor low
-    (M. R. Schroeder, IEEE Trans. Information Theory 16, 1970). The sum is scaled to its
+    Schroeder's phases, -pi j (j - 1) / J for the j-th of J harmonics, keep the crest factor
+    low (M. R. Schroeder, IEEE Trans. Information Theory 16, 1970). The sum is scaled to its
     peak. Several inputs take turns with the harmonics, so that they are orthogonal.
 
     Attributes:
         start_frequency, stop_frequency: band [Hz], default the plant's.
+        phases: 0 for Schroeder's; any other number is the seed of random ones.
     """
 
     start_frequency: Float[Array, ""] | None = eqx.field(converter=optional_array, default=None)
     stop_frequency: Float[Array, ""] | None = eqx.field(converter=optional_array, default=None)
+    phases: int = eqx.field(static=True, default=0)
 
     def shape(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> Sequence:
         """The same sum for every key; zero where the band holds no harmonic."""
@@ -162,6 +164,9 @@ class Multisine(AbstractShape):
         chosen = in_band[:, None] & (turn[:, None] == jnp.arange(num_inputs)[None])
         j = jnp.cumsum(chosen, axis=0)
         phase = -jnp.pi * j * (j - 1) / jnp.maximum(j[-1:], 1)
+        if self.phases:
+            drawn = jax.random.uniform(jax.random.key(self.phases), phase.shape, float)
+            phase = 2 * jnp.pi * drawn
         unit = jnp.fft.irfft(jnp.where(chosen, jnp.exp(1j * phase), 0.0), num_steps, axis=0)
         peak = jnp.max(jnp.abs(unit), axis=0, keepdims=True)
         return unit / jnp.where(peak > 0, peak, 1.0)

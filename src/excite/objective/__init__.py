@@ -1,8 +1,8 @@
 """What an experiment is worth: the reward of the decision process.
 
-Three objectives: the error of the ARX estimate at the end (the paper's), the information
-gained at every step, which any plant has, and the error of the output-error estimate at
-the end. Their memory does not grow with time.
+The error of the ARX estimate at the end (the paper's), the information gained at every
+step, which any plant has, the error of the output-error estimate at the end, and weighted
+sums of them. Their memory does not grow with time.
 """
 
 from .base import MAX_ERROR as MAX_ERROR
@@ -15,3 +15,4 @@ from .base import target_mask as target_mask
 from .errors import EstimationError as EstimationError
 from .errors import OutputError as OutputError
 from .gain import InformationGain as InformationGain
+from .sum import WeightedSum as WeightedSum

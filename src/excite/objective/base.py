@@ -73,17 +73,16 @@ class AbstractObjective(eqx.Module):
     ) -> Float[Array, " param"]:
         """Relative error of each parameter as far as the objective knows it, to watch."""
 
-    def of_batch(
-        self, worths: Float[Array, " plant"], errors: Float[Array, "plant param"]
-    ) -> Float[Array, ""]:
-        """What experiments on many plants are worth together: the mean.
+    def outcome(
+        self, plant: AbstractPlant, memory: Any, params: Params, worth: Float[Array, ""]
+    ) -> Any:
+        """What `of_batch` needs to know of one experiment: its rewards summed, `worth`."""
+        del plant, memory, params
+        return worth
 
-        Args:
-            worths: of each, rewards summed.
-            errors: relative errors at the end of each.
-        """
-        del errors
-        return jnp.mean(worths)
+    def of_batch(self, outcomes: Any) -> Float[Array, ""]:
+        """What experiments on many plants are worth together, of their outcomes: the mean."""
+        return jnp.mean(outcomes)
 
 
 def toward_goals(
@@ -133,12 +132,16 @@ class AbstractError(AbstractObjective):
         of_plants = terms @ np.array(self.targets, float)
         return -self.weight * jnp.mean(of_plants)
 
-    def of_batch(
-        self, worths: Float[Array, " plant"], errors: Float[Array, "plant param"]
-    ) -> Float[Array, ""]:
-        """Of the errors alone, which are all that is rewarded."""
-        del worths
-        return self.of_errors(errors)
+    def outcome(
+        self, plant: AbstractPlant, memory: Any, params: Params, worth: Float[Array, ""]
+    ) -> Float[Array, " param"]:
+        """The errors alone, which are all that is rewarded."""
+        del worth
+        return self.relative_errors(plant, memory, params)
+
+    def of_batch(self, outcomes: Float[Array, "plant param"]) -> Float[Array, ""]:
+        """Of the errors on all plants, whose means may have goals."""
+        return self.of_errors(outcomes)
 
 
 def bounded(errors: Float[Array, " param"]) -> Float[Array, " param"]:

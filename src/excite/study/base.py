@@ -24,6 +24,7 @@ from ..objective import (
     EstimationError,
     InformationGain,
     OutputError,
+    WeightedSum,
     prior_sd_of,
     target_mask,
 )
@@ -67,20 +68,12 @@ METHODS = {"ppo": PPOSettings, "gradient": GradientSettings}
 """Trainers, and their hyper-parameters."""
 
 
-class DecisionSettings(Settings):
-    """The decision process an agent is trained on; the paper's, but for what is set.
+class RewardSettings(Settings):
+    """What an agent is rewarded for.
 
     Attributes:
-        window: samples observed.
-        clocks: frequencies [Hz] whose sine and cosine are observed too.
-        output_scale: y_max by output, in its unit, where it differs from the output's scale.
-        input_amplitude: by input, in its unit, how far from the middle of its limits the
-            policy may go, where that is less than the limits allow.
-        spread: of the plants it is trained on, where it differs from the study's.
-        constants: of these plants, drawn between two ends, [0.12, 0.21], for every one.
         reward: of the experiment: `relative` errors (Eq. 4), `log` of them, the worst over
-            its goal (`goals`), or
-            `information`; by default the plant's.
+            its goal (`goals`), or `information`; by default the plant's.
         dense: whether information is rewarded at every step, by default for PPO alone.
         weight: factor of that reward.
         criterion, max_sensitivity: of the information, see `InformationGain`.
@@ -89,15 +82,8 @@ class DecisionSettings(Settings):
             first order in the noise, for any plant.
         start_covariance: instead of that estimator's; a smaller one lets its bias, which is
             a smooth function of the inputs, outweigh the sensor's noise.
-        normalise_penalty: whether the safety penalty is divided by the number of steps.
     """
 
-    window: Annotated[Count, Field(le=10_000)] = 80
-    clocks: list[Positive] = []
-    output_scale: dict[str, Positive] = {}
-    input_amplitude: dict[str, Positive] = {}
-    spread: Annotated[float, Field(ge=0, lt=1, strict=True, allow_inf_nan=False)] | None = None
-    constants: dict[str, tuple[float, float]] = {}
     reward: Literal["relative", "log", "goals", "information"] | None = None
     dense: Annotated[bool, Field(strict=True)] | None = None
     weight: Positive = 1.0
@@ -106,6 +92,30 @@ class DecisionSettings(Settings):
     goals: dict[str, Positive] = {}
     estimator: str = "arx-rls"
     start_covariance: Positive | None = None
+
+
+class DecisionSettings(RewardSettings):
+    """The decision process an agent is trained on; the paper's, but for what is set.
+
+    Attributes:
+        terms: several rewards instead of one, which are added.
+        window: samples observed.
+        clocks: frequencies [Hz] whose sine and cosine are observed too.
+        output_scale: y_max by output, in its unit, where it differs from the output's scale.
+        input_amplitude: by input, in its unit, how far from the middle of its limits the
+            policy may go, where that is less than the limits allow.
+        spread: of the plants it is trained on, where it differs from the study's.
+        constants: of these plants, drawn between two ends, [0.12, 0.21], for every one.
+        normalise_penalty: whether the safety penalty is divided by the number of steps.
+    """
+
+    terms: list[RewardSettings] = []
+    window: Annotated[Count, Field(le=10_000)] = 80
+    clocks: list[Positive] = []
+    output_scale: dict[str, Positive] = {}
+    input_amplitude: dict[str, Positive] = {}
+    spread: Annotated[float, Field(ge=0, lt=1, strict=True, allow_inf_nan=False)] | None = None
+    constants: dict[str, tuple[float, float]] = {}
     normalise_penalty: Annotated[bool, Field(strict=True)] = False
 
 
@@ -155,7 +165,12 @@ class Agent:
         Raises:
             ValueError: for a setting that does not exist or is not allowed.
         """
-        process = checked(DecisionSettings, {**decision, **own.decision}, "decision")
+        rewards = ({"terms"} if "reward" in own.decision else set()) | (
+            set(RewardSettings.model_fields) if "terms" in own.decision else set()
+        )
+        shared = {name: value for name, value in decision.items() if name not in rewards}
+        process = checked(DecisionSettings, {**shared, **own.decision}, "decision")
+        _require_one_reward(process)
         if process.reward == "information":  # another agent may use what all have in common
             _require_used(own.decision if "reward" in own.decision else process.model_fields_set)
         targets = own.targets or []
@@ -205,36 +220,42 @@ class Agent:
         )
 
     def _objective(self, plant: AbstractPlant, spread: float) -> AbstractObjective:
-        decision, has_mapping = self.decision, isinstance(plant, AbstractARXPlant)
+        terms = [self._term(reward, plant, spread) for reward in self.decision.terms]
+        return WeightedSum(terms) if terms else self._term(self.decision, plant, spread)
+
+    def _term(
+        self, chosen: RewardSettings, plant: AbstractPlant, spread: float
+    ) -> AbstractObjective:
+        has_mapping = isinstance(plant, AbstractARXPlant)
         targets = target_mask(plant.definition, self.targets)
-        if decision.reward == "information" or (decision.reward is None and not has_mapping):
-            if decision.reward is None:
-                _require_used(decision.model_fields_set)
+        if chosen.reward == "information" or (chosen.reward is None and not has_mapping):
+            if chosen is not self.decision or chosen.reward is None:
+                _require_used(chosen.model_fields_set)
             return InformationGain(
                 targets,
                 prior_sd_of(spread),
-                decision.weight,
-                criterion=decision.criterion,
-                max_sensitivity=decision.max_sensitivity,
+                chosen.weight,
+                criterion=chosen.criterion,
+                max_sensitivity=chosen.max_sensitivity,
                 # A gradient needs no reward on the way.
-                dense=self.method == "ppo" if decision.dense is None else decision.dense,
+                dense=self.method == "ppo" if chosen.dense is None else chosen.dense,
             )
-        own = self.estimators.get(decision.estimator, EstimatorSettings(kind=decision.estimator))
+        own = self.estimators.get(chosen.estimator, EstimatorSettings(kind=chosen.estimator))
         estimator = estimator_named(own.kind, own.options)
-        target_mask(plant.definition, list(decision.goals) or None)  # checks the names
-        goals = [decision.goals.get(p.name, 1.0) for p in plant.definition.parameters]
-        common = targets, goals, decision.reward or "relative", decision.weight
+        target_mask(plant.definition, list(chosen.goals) or None)  # checks the names
+        goals = [chosen.goals.get(p.name, 1.0) for p in plant.definition.parameters]
+        common = targets, goals, chosen.reward or "relative", chosen.weight
         if isinstance(estimator, NLS):
-            bound = {"max_sensitivity": decision.max_sensitivity}
+            bound = {"max_sensitivity": chosen.max_sensitivity}
             return OutputError(*common, prior_sd=prior_sd_of(spread), **bound)
         if not (has_mapping and isinstance(estimator, ARX)):
             raise ValueError(
-                f"the reward {decision.reward!r} from the estimator {decision.estimator!r} needs "
+                f"the reward {chosen.reward!r} from the estimator {chosen.estimator!r} needs "
                 "an ARX estimator, and a plant with a mapping from ARX coefficients; the "
                 "estimator 'nls' and the reward 'information' need neither"
             )
-        if decision.start_covariance is not None:
-            estimator = dataclasses.replace(estimator, start_covariance=decision.start_covariance)
+        if chosen.start_covariance is not None:
+            estimator = dataclasses.replace(estimator, start_covariance=chosen.start_covariance)
         return EstimationError(*common, estimator=estimator)
 
     def total_steps(self, num_steps: int) -> int:
@@ -250,7 +271,7 @@ class Agent:
         # What settings did not have from the first stands here only where it is used, so
         # that seeds trained before it are still known.
         later = {"clocks", "criterion", "max_sensitivity", "input_amplitude", "spread", "dense"}
-        later |= {"constants"}
+        later |= {"constants", "terms"}
         return {
             "method": self.method,
             "targets": [name for name, chosen in zip(names, mask, strict=True) if chosen],
@@ -271,6 +292,13 @@ def _ends(plant: AbstractPlant, ranges: Mapping[str, tuple[float, float]]) -> An
             raise ValueError(f"the range of the constant {name!r} must grow: got {low:g}, {high:g}")
     ends = ({name: ends[i] for name, ends in ranges.items()} for i in (0, 1))
     return tuple(plant.changed(**own).constants for own in ends)
+
+
+def _require_one_reward(process: DecisionSettings) -> None:
+    """Raises ValueError for a reward beside terms, each of which states its own."""
+    beside = sorted(set(RewardSettings.model_fields) & process.model_fields_set)
+    if process.terms and beside:
+        raise ValueError(f"decision: with terms, {beside[0]!r} belongs to one of them")
 
 
 def _require_used(names: Iterable[str]) -> None:
@@ -303,7 +331,7 @@ def checked(kind: type[_T], values: Mapping[str, Any], where: str) -> _T:
         content = json.dumps(dict(values), default=str)
         return pydantic.TypeAdapter(kind).validate_json(content, strict=True)
     except pydantic.ValidationError as error:
-        raise ValueError(f"{where}: {sentence(error)}") from None
+        raise ValueError(f"{where}: {sentence(error, {'terms': RewardSettings})}") from None
 
 
 _ALLOWED = {

@@ -101,7 +101,7 @@ class Batch(eqx.Module):
 
     Attributes:
         worth: of each, by the objective.
-        errors: relative errors of the parameters at the end, as the objective knows them.
+        outcome: of each, what the objective needs to know of it beside others.
         excess: of each, the mean square of how far outputs lie beyond the margin; one is
             the critical level.
         nearness: of each, the largest output over its critical level; infinite for an
@@ -109,7 +109,7 @@ class Batch(eqx.Module):
     """
 
     worth: Float[Array, "*plant"]
-    errors: Float[Array, "*plant param"]
+    outcome: Any
     excess: Float[Array, "*plant"]
     nearness: Float[Array, "*plant"]
 
@@ -141,9 +141,10 @@ def experiments(
             advance, start, None, length=env.layout.num_steps
         )
         final = env.objective.final(env.plant, state.memory, state.params)
-        errors = env.objective.relative_errors(env.plant, state.memory, state.params)
+        worth = jnp.sum(gains) + final
+        outcome = env.objective.outcome(env.plant, state.memory, state.params, worth)
         nearness = jnp.where(state.is_finite, jnp.max(sizes), jnp.inf)
-        return Batch(jnp.sum(gains) + final, errors, jnp.mean(excess), nearness)
+        return Batch(worth, outcome, jnp.mean(excess), nearness)
 
     return jax.vmap(experiment)(keys)
 
@@ -175,7 +176,7 @@ def update(
 
     def loss(player: Any) -> tuple[Array, Batch]:
         batch = experiments(env, player, keys, settings.margin)
-        worth = env.objective.of_batch(batch.worth, batch.errors)
+        worth = env.objective.of_batch(batch.outcome)
         return now.penalty_weight * jnp.mean(batch.excess) - worth, batch
 
     (cost, batch), gradient = eqx.filter_value_and_grad(loss, has_aux=True)(now.player)
@@ -329,7 +330,7 @@ def _judged(env: Env, player: Network, keys: Key[Array, " plant"]) -> dict[str, 
     """The objective alone, without the stepwise penalty of the decision process."""
     batch = experiments(env, player, keys, 0.9)
     return {
-        "worth": float(env.objective.of_batch(batch.worth, batch.errors)),
+        "worth": float(env.objective.of_batch(batch.outcome)),
         "nearness": float(jnp.max(batch.nearness)),
         "not_computable": float(jnp.mean(jnp.isinf(batch.nearness))),
     }
