@@ -3,7 +3,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo test lint types docs results agents policies clean
+.PHONY: demo test lint types docs results agents policies evaluations clean
 
 demo: .venv/core ## the baseline rows of the paper's Table 1, with three estimators, in runs/baselines
 	$(BIN)/excite benchmark studies/baselines.toml --out runs/baselines --overwrite
@@ -43,6 +43,13 @@ policies: ## what is shipped in src/excite/policies, from the results of the stu
 	cp results/dc_motor/seeds/gradient_D/0/policy.safetensors src/excite/policies/dc_motor.safetensors
 	cp results/aero2_lag/seeds/gradient_D/0/policy.safetensors src/excite/policies/aero2_lag.safetensors
 	cp results/cart_pole/seeds/gradient_D/0/policy.safetensors src/excite/policies/cart_pole.safetensors
+
+evaluations: .venv/core ## every shipped policy on plants it has never met, in results/policies
+	mkdir -p results/policies
+	for policy in $(notdir $(basename $(wildcard src/excite/policies/*.safetensors))); do \
+	  $(BIN)/excite evaluate $$policy --episodes 10000 --seed 7 --json > runs/$$policy.json || exit 1; \
+	  mv runs/$$policy.json results/policies/ || exit 1; \
+	done
 
 .venv/core: pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed")'

@@ -174,7 +174,10 @@ def test_a_policy_file_is_scored_with_the_row_of_a_study(folder):
     policy = next((folder / "run" / "seeds").rglob("policy.safetensors"))
     done = excite("evaluate", policy, "--episodes", 5, "--seed", 3, "--json")
     assert done.returncode == 0, done.stderr
-    rows = json.loads(done.stdout)["rows"]
+    said = json.loads(done.stdout)
+    rows = said["rows"]
+    assert said["policy_hash"] == read_policy(policy).hash
+    assert (said["study"]["episodes"], said["study"]["seed"]) == (5, 3)
     assert [row["estimator"] for row in rows] == ["arx-rls", "nls"]
     assert rows[0]["evaluations"] == 5
     assert rows[0]["log_det_information"] == rows[1]["log_det_information"]

@@ -21,6 +21,9 @@ from typing import Any
 FORMAT = 1
 """Version of the canonical JSON below; it enters every hash."""
 
+HALF_95 = 1.959964
+"""Half of a 95 % interval in standard deviations, wherever one is shown."""
+
 
 def _require(condition: bool, sentence: str) -> None:
     if not condition:

@@ -20,7 +20,7 @@ except ImportError:
     TensorProto = helper = numpy_helper = onnx
 
 from . import __version__
-from .files import json_text, write_bytes
+from .files import json_text, require_new_file, write_bytes
 from .policy import FORMAT, Policy, tensors_from_bytes
 
 ONNX_ENDING = ".onnx"
@@ -65,8 +65,7 @@ def require_onnx_path(path: Path, overwrite: bool) -> None:
     """Raises ValueError where no ONNX file may be written."""
     if path.suffix.lower() != ONNX_ENDING:
         raise ValueError(f"{path}: an ONNX file ends in {ONNX_ENDING}")
-    if path.exists() and not overwrite:
-        raise ValueError(f"{path} exists; choose another name or add --overwrite")
+    require_new_file(path, overwrite)
 
 
 def write_onnx(policy: Policy, path: Path, overwrite: bool = False) -> None:

@@ -137,6 +137,16 @@ def write_bytes(path: Path, content: bytes) -> None:
         Path(name).unlink(missing_ok=True)
 
 
+def require_new_file(path: Path, overwrite: bool) -> None:
+    """Raises ValueError, before anything is computed, where no such file may be written."""
+    if not path.parent.is_dir():
+        raise ValueError(f"{path}: the folder {path.parent} does not exist")
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder; choose another name")
+    if path.exists() and not overwrite:
+        raise ValueError(f"{path} exists; choose another name or add --overwrite")
+
+
 def require_free_run_folder(path: Path, overwrite: bool) -> None:
     """Raises ValueError where a run folder at `path` would hide or lose something."""
     for parent in path.absolute().parents:

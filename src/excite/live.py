@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from . import __version__
-from .description import PlantDescription, display_unit
+from .description import HALF_95, PlantDescription, display_unit
 from .estimation import NLS, Experiments, Status, stack_experiments
 from .excitation import AbstractExcitation, PolicyExcitation
 from .files import json_ready, write_bytes
@@ -52,7 +52,6 @@ Event = dict[str, Any]
 NUM_ESTIMATES = 20
 _FIRST = 40  # samples before the first estimate, the shortest horizon of the estimator
 _MAX_POINTS = 2000  # more cannot be told apart on a screen
-_HALF = 1.959964  # of a 95 % interval, in standard errors
 
 
 # ------------------------------------------------------------------------- what there is
@@ -235,9 +234,9 @@ def _estimates(own: Experiment, run: Trajectory, information: Any) -> Iterator[E
     counts = np.linspace(min(_FIRST, own.num_steps + 1), own.num_steps + 1, NUM_ESTIMATES)
     for count in np.unique(counts.astype(int)):
         estimate = NLS()(plant, _first(data, int(count)), plant.nominal, free)
-        half = _HALF * np.sqrt(np.diag(np.asarray(estimate.covariance)))
+        half = HALF_95 * np.sqrt(np.diag(np.asarray(estimate.covariance)))
         is_good = int(estimate.status) == Status.SUCCESSFUL
-        bound = _HALF * np.asarray(cramer_rao_bound(information[count - 2]) * size)
+        bound = HALF_95 * np.asarray(cramer_rao_bound(information[count - 2]) * size)
         parts = plant.definition.parameters
         yield {
             "kind": "estimate",
@@ -272,7 +271,7 @@ def _outcome(
     params = {}
     for p, true, least in zip(d.parameters, map(float, own.params), bound, strict=True):
         found = None if result is None or p.name in result.held else result.params[p.name]
-        half = None if found is None or result is None else _HALF * result.std_error[p.name]
+        half = None if found is None or result is None else HALF_95 * result.std_error[p.name]
         per = abs(true) or p.scale
         params[p.name] = {
             "estimate": found,

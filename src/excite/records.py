@@ -26,7 +26,7 @@ except ImportError:
     matlab = None
 
 from .description import Input, Output, PlantDescription, names_of
-from .files import csv_text, write_bytes, write_json
+from .files import csv_text, require_new_file, write_bytes, write_json
 
 RECORD_KIND = "excite record"
 _UNEVEN = 0.05  # of the sampling time: more than printing it with few digits explains
@@ -190,15 +190,10 @@ def _require_record_ending(path: Path) -> None:
 def require_record_path(path: Path, overwrite: bool) -> None:
     """Raises ValueError, before anything is computed, where no record may be written."""
     _require_record_ending(path)
-    if not path.parent.is_dir():
-        raise ValueError(f"{path}: the folder {path.parent} does not exist")
-    if path.is_dir():
-        raise ValueError(f"{path} is a folder; choose another name")
     sidecar = path.with_suffix(".json")
     if sidecar.is_file() and not _read_sidecar(path):
         raise ValueError(f"{sidecar} is no sidecar of a record and would be lost; rename one")
-    if path.exists() and not overwrite:
-        raise ValueError(f"{path} exists; choose another name or add --overwrite")
+    require_new_file(path, overwrite)
 
 
 def _read_csv(path: Path) -> dict[str, np.ndarray | list[str]]:

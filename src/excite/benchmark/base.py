@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from .. import files
-from ..description import PlantDescription, display_unit, names_of
+from ..description import HALF_95, PlantDescription, display_unit, names_of
 from ..estimation import AbstractEstimator, Status, stack_experiments
 from ..evaluation import Episodes, evaluate
 from ..excitation import AbstractExcitation
@@ -238,7 +238,7 @@ def table_row(
         "relative_error_percent": by_name(_error(100 * np.abs(e)) for e in error.T),
         "cramer_rao_percent": by_name(100 * outcome.bound.mean(axis=0)),
         "rms_over_cramer_rao": by_name(_rms(error) / _rms(outcome.bound[good])),
-        "coverage95_percent": by_name(100 * _fraction(np.abs(error) < 1.959964 * std_error)),
+        "coverage95_percent": by_name(100 * _fraction(np.abs(error) < HALF_95 * std_error)),
         "beyond_6_std_errors": int(np.any(np.abs(error) > 6 * std_error, axis=1).sum()),
     }
 
@@ -293,7 +293,7 @@ def wilson(successes: int, count: int) -> tuple[float, float]:
     E. B. Wilson, "Probable inference, the law of succession, and statistical inference",
     J. American Statistical Association 22, 1927.
     """
-    z, rate = 1.959964, successes / count
+    z, rate = HALF_95, successes / count
     centre = rate + z**2 / (2 * count)
     half = z * math.sqrt(rate * (1 - rate) / count + z**2 / (4 * count**2))
     scale = 1 + z**2 / count

@@ -20,10 +20,12 @@ def report(runs: tuple[Path, ...], out: Path, overwrite: bool, as_json: bool) ->
     RUN is a run folder of `excite identify`, `excite benchmark` or `excite study run`, or a record
     with its sidecar; several are shown side by side.
     """
-    from ..files import write_bytes
+    from ..files import require_new_file, write_bytes
     from ..report import report_html
 
-    _require_page_path(out, overwrite)
+    if out.suffix.lower() != ".html":
+        raise ValueError(f"{out}: reports end in .html")
+    require_new_file(out, overwrite)
     with progress_bar("report") as progress:
         page = report_html(runs, progress).encode()
     write_bytes(out, page)
@@ -31,15 +33,3 @@ def report(runs: tuple[Path, ...], out: Path, overwrite: bool, as_json: bool) ->
         show_json({"file": str(out), "runs": [str(run) for run in runs], "bytes": len(page)})
     else:
         click.echo(f"report: {out}, {len(page) / 1e6:.1f} MB")
-
-
-def _require_page_path(path: Path, overwrite: bool) -> None:
-    """Raises ValueError, before anything is drawn, where no page may be written."""
-    if path.suffix.lower() != ".html":
-        raise ValueError(f"{path}: reports end in .html")
-    if not path.parent.is_dir():
-        raise ValueError(f"{path}: the folder {path.parent} does not exist")
-    if path.is_dir():
-        raise ValueError(f"{path} is a folder; choose another name")
-    if path.exists() and not overwrite:
-        raise ValueError(f"{path} exists; choose another name or add --overwrite")

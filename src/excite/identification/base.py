@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .. import __version__
-from ..description import PlantDescription, names_of
+from ..description import HALF_95, PlantDescription, names_of
 from ..estimation.diagnosis import correlation, fit_percent
 from ..files import csv_text, new_run_folder, write_json
 from ..records import Record, write_record
@@ -73,7 +73,7 @@ class Identification:
 
     def ci95(self, name: str) -> tuple[float, float]:
         """95 % interval of a parameter; symmetric, estimate ± 1.96 standard errors."""
-        half = 1.959964 * self.std_error[name]
+        half = HALF_95 * self.std_error[name]
         return self.params[name] - half, self.params[name] + half
 
     def fit(self) -> dict[str, float]:

@@ -11,7 +11,7 @@ import matplotlib.figure
 import numpy as np
 from jaxtyping import Float
 
-from ..description import PlantDescription, display_unit
+from ..description import HALF_95, PlantDescription, display_unit
 from ..records import Record
 from .base import (
     BLUE,
@@ -63,7 +63,7 @@ def _draw_intervals(axis: Any, params: Mapping[str, Mapping[str, Any]]) -> None:
         if error is None or not math.isfinite(error):
             axis.text(0, i, f"{name} held", color=GREY, va="center", ha="center")
             continue
-        half = 100 * 1.96 * error / (abs(value) or math.nan)
+        half = 100 * HALF_95 * error / (abs(value) or math.nan)
         axis.errorbar(0, i, xerr=half, color=BLUE, fmt="o", capsize=4, ms=4)
         text = f"{number(value, digits_for(value, error))} {p['unit']}"
         axis.annotate(text, (0, i), (0, 7), textcoords="offset points", ha="center", fontsize=8)
@@ -86,7 +86,7 @@ def autocorrelation_figure(
         axis.vlines(lags, 0, values, color=ORANGE, lw=2)
         axis.axhline(0, color="black", lw=0.6)
         for sign in (1, -1):
-            axis.axhline(sign * 1.96 / math.sqrt(count), color=GREY, ls="--", lw=1)
+            axis.axhline(sign * HALF_95 / math.sqrt(count), color=GREY, ls="--", lw=1)
         axis.set(title=part.name, xlabel="lag [samples]")
     axes[0, 0].set(ylabel="autocorrelation")
     return figure

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..description import names_of
+from ..description import HALF_95, names_of
 from ..estimation import NLS, Estimate, Experiments, Status
 from ..plant import AbstractPlant
 from .base import Sample
@@ -61,7 +61,7 @@ class Tracker:
 
     def _keep(self, estimate: Estimate) -> None:
         if int(estimate.status) == Status.SUCCESSFUL:
-            half = 1.96 * np.sqrt(np.diag(np.asarray(estimate.covariance)))
+            half = HALF_95 * np.sqrt(np.diag(np.asarray(estimate.covariance)))
             names = names_of(self._plant.definition.parameters)
             values = zip(map(float, estimate.params), map(float, half), strict=True)
             self._latest = dict(zip(names, values, strict=True))
