@@ -1,5 +1,6 @@
 """Rigs and the real-time loop: the order of an experiment, and every way in which it ends."""
 
+import contextlib
 import dataclasses
 import errno
 import json
@@ -9,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -801,26 +803,33 @@ def test_a_record_is_never_a_folder(tmp_path):
 # ------------------------------------------------------------------------------ kill -9
 
 
-def test_a_killed_process_leaves_a_record_that_identifies(tmp_path):
-    plant, num_needed = IDEAL, 45
+@contextlib.contextmanager
+def experiment_under_way(folder: Path, num_needed: int) -> Iterator[subprocess.Popen[str]]:
+    """`excite run` in real time, some samples in r.csv after its start."""
     time_, inputs = 0.1 * np.arange(300), 4 * np.sin(2 * math.pi * 0.35 * 0.1 * np.arange(300))
-    (tmp_path / "u.csv").write_text(csv_text({"time": time_, "voltage": inputs}))
+    (folder / "u.csv").write_text(csv_text({"time": time_, "voltage": inputs}))
     words = ["run", "--plant", "aero2", "--input", "u.csv", "--out", "r.csv", "--spread", "0.1"]
-    path = tmp_path / "r.csv"
     source = str(Path(excite.__file__).parent.parent)
     with subprocess.Popen(
-        [sys.executable, "-m", "excite", *words], cwd=tmp_path, text=True,
-        env={**os.environ, "PYTHONPATH": source, "EXCITE_CACHE": str(tmp_path / "cache")},
+        [sys.executable, "-m", "excite", *words], cwd=folder, text=True,
+        env={**os.environ, "PYTHONPATH": source, "EXCITE_CACHE": str(folder / "cache")},
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
     ) as process:  # fmt: skip
         try:
-            until = time.monotonic() + 120
+            until, path = time.monotonic() + 120, folder / "r.csv"
             while not path.exists() or path.read_text().count("\n") <= num_needed:
                 assert process.poll() is None, process.communicate()[0]
                 assert time.monotonic() < until
                 time.sleep(0.02)
+            yield process
         finally:
             process.kill()
+
+
+def test_a_killed_process_leaves_a_record_that_identifies(tmp_path):
+    plant, num_needed, path = IDEAL, 45, tmp_path / "r.csv"
+    with experiment_under_way(tmp_path, num_needed):
+        pass  # which kills it
     assert json.loads(path.with_suffix(".json").read_text())["ended"] is None
     record = read_record(path, plant.description)
     assert len(record.time) >= num_needed
@@ -829,3 +838,18 @@ def test_a_killed_process_leaves_a_record_that_identifies(tmp_path):
     assert result.status == "successful"
     for name, nominal in plant.nominal._asdict().items():
         assert abs(result.params[name] / float(nominal) - 1) < 0.5
+
+
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)]
+)
+def test_a_signal_ends_it_with_its_own_code_and_a_whole_record(number, code, tmp_path):
+    with experiment_under_way(tmp_path, 5) as process:
+        process.send_signal(number)
+        out, _ = process.communicate(timeout=60)
+    assert process.returncode == code
+    assert "Traceback" not in out
+    assert signal.Signals(number).name in out
+    ended = json.loads((tmp_path / "r.json").read_text())["ended"]
+    assert signal.Signals(number).name in ended["reason"]
+    assert len(read_record(tmp_path / "r.csv", IDEAL.description).time) >= ended["num_samples"] > 3

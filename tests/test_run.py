@@ -13,7 +13,8 @@ import pytest
 import excite
 from excite.cli import main
 from excite.files import csv_text
-from excite.plant import Aero2Detailed
+from excite.identification import identify
+from excite.plant import Aero2, Aero2Detailed
 from excite.records import read_record
 
 command = importlib.import_module("excite.cli.run")  # its name is the command's, too
@@ -105,6 +106,23 @@ def test_an_experiment_that_completes_is_one_json_object_and_a_record(call):
     assert record.metadata["ended"] == {
         key: value for key, value in told.items() if key not in ("file", "live_estimate")
     }
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_what_ran_on_the_rig_identifies_its_hidden_parameters(seed, call):
+    """The path of an engineer, with the rig's own policy and plant, then with the paper's."""
+    code, out, _ = call("--rig", "simulated", "--seed", seed, *FAST, "--json")
+    told = json.loads(out)
+    assert (code, told["trip"]) == (0, "none")
+    assert told["rig"]["true_max_abs_output"][0] < AERO.outputs[0].critical_level
+    record = read_record("r.csv", AERO)
+    found = identify(Aero2Detailed(), [record])
+    for name, true in told["rig"]["true_params"].items():
+        assert abs(found.params[name] / true - 1) < 0.002
+        assert abs(found.params[name] - true) < 2.6 * found.std_error[name]  # 99 %
+    wrong = identify(Aero2(), [read_record("r.csv", Aero2.definition)])
+    assert wrong.structure["pitch"] < 0.01
+    assert "structure" in wrong.verdict[0]
 
 
 def test_a_trip_is_a_failed_run_that_is_recorded_and_explained(call):
