@@ -27,7 +27,8 @@ results: .venv/core ## the committed results, afresh (minutes in studies/README.
 	done
 
 agents: .venv/dev ## the trained agents of the studies, afresh (hours; goes on where it was interrupted)
-	for study in table1 paper frontier emps dc_motor cart_pole aero2_lag half amplitude nls_reward spread reward; do \
+	for study in table1 paper frontier emps dc_motor cart_pole aero2_lag half amplitude nls_reward spread reward \
+	    two_minutes sim_to_real; do \
 	  $(BIN)/excite study run studies/$$study.toml --out runs/$$study || exit 1; \
 	done
 
@@ -43,13 +44,17 @@ policies: ## what is shipped in src/excite/policies, from the results of the stu
 	cp results/dc_motor/seeds/gradient_D/0/policy.safetensors src/excite/policies/dc_motor.safetensors
 	cp results/aero2_lag/seeds/gradient_D/0/policy.safetensors src/excite/policies/aero2_lag.safetensors
 	cp results/cart_pole/seeds/gradient_D/0/policy.safetensors src/excite/policies/cart_pole.safetensors
+	cp results/sim_to_real/seeds/gradient_robust/0/policy.safetensors src/excite/policies/aero2_detailed.safetensors
 
-evaluations: .venv/core ## every shipped policy on plants it has never met, in results/policies
+evaluations: .venv/core ## the shipped policies on plants they have never met, in results/policies
 	mkdir -p results/policies
 	for policy in $(notdir $(basename $(wildcard src/excite/policies/*.safetensors))); do \
-	  $(BIN)/excite evaluate $$policy --episodes 10000 --seed 7 --json > runs/$$policy.json || exit 1; \
-	  mv runs/$$policy.json results/policies/ || exit 1; \
+	  $(BIN)/excite evaluate $$policy --episodes 1000 --seed 7 --json > results/policies/$$policy.json || exit 1; \
 	done
+	for policy in aero2 aero2-goals aero2-damping; do \
+	  $(BIN)/excite evaluate $$policy --episodes 10000 --seed 7 --json > results/policies/$$policy.json || exit 1; \
+	done
+	$(BIN)/excite evaluate aero2_detailed --rig --filter --episodes 10000 --seed 7 --json > results/policies/aero2_detailed_rig.json
 
 .venv/core: pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed")'

@@ -312,6 +312,8 @@ def mismatch(policy: Policy, plant: PlantDescription) -> str | None:
         )
     if own.hash == plant.hash:
         return None
+    if own.name != plant.name:
+        return f"the policy was trained on {own.name!r}, not on {plant.name!r}"
     return f"the policy was trained on another {own.name!r} (hash {own.hash[:8]}) than this one"
 
 
