@@ -39,7 +39,7 @@ policies: ## what is shipped in src/excite/policies, from the results of the stu
 	cp results/table1/seeds/RL_all/2/policy.safetensors src/excite/policies/aero2-ppo-all.safetensors
 	cp results/table1/seeds/RL_J_p/7/policy.safetensors src/excite/policies/aero2-ppo-J_p.safetensors
 	cp results/table1/seeds/RL_K_pu/1/policy.safetensors src/excite/policies/aero2-ppo-K_pu.safetensors
-	cp results/table1/seeds/RL_D_p/6/policy.safetensors src/excite/policies/aero2-ppo-D_p.safetensors
+	cp results/table1/seeds/RL_D_p/5/policy.safetensors src/excite/policies/aero2-ppo-D_p.safetensors
 	cp results/emps/seeds/gradient_D/0/policy.safetensors src/excite/policies/emps.safetensors
 	cp results/dc_motor/seeds/gradient_D/0/policy.safetensors src/excite/policies/dc_motor.safetensors
 	cp results/aero2_lag/seeds/gradient_D/0/policy.safetensors src/excite/policies/aero2_lag.safetensors

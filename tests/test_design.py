@@ -89,13 +89,46 @@ def test_the_best_input_of_an_amplifier_is_its_limit():
 
 
 @pytest.mark.parametrize("name", [*EXCITATIONS, LOOP + "square"])
-def test_tuning_finds_options_that_are_allowed_and_safe(name):
+def test_tuning_finds_options_that_are_allowed_and_the_same_again(name):
     env = signal_env(Aero2(), STEPS, 0.3)
     tuned = tuned_signal(env, name, trials=4)
     assert tuned.trials == 4
     assert np.isfinite(tuned.value)
     again = tuned_signal(env, name, trials=4)
     assert dict(again.options) == dict(tuned.options)
+
+
+class Bomb(AbstractPlant):
+    """Grows without bound whatever its input is."""
+
+    definition = PlantDescription(
+        name="bomb",
+        states=(State("y", "V"),),
+        inputs=(Input("u", "V", -2.0, 2.0),),
+        outputs=(Output("y", "V", 9.0, noise_sd=0.1, warning_level=5.0, critical_level=9.0),),
+        parameters=(Parameter("g", "", 3.0),),
+        dt=0.1, substeps=4, band=(0.1, 1.0),
+    )  # fmt: skip
+
+    def derivative(self, state, input, params):
+        return params.g * (1.0 + state**2) + input
+
+    def output(self, state, params):
+        return state
+
+
+def test_a_tuning_that_finds_nothing_of_use_says_so():
+    with pytest.raises(ValueError, match="no setting of 'chirp' was found that is of use"):
+        tuned_signal(signal_env(Bomb(), 20, 0.3), "chirp", trials=2)
+
+
+def test_another_seed_is_another_search():
+    env = signal_env(Amplifier(), 12, 0.3)
+    first, second = (
+        clairvoyant_signals(env, KEYS[:1], 1, dataclasses.replace(QUICK, num_updates=2), seed=seed)
+        for seed in (0, 1)
+    )
+    assert not np.allclose(first.inputs, second.inputs)
 
 
 def test_tuning_beats_the_default_chirp():

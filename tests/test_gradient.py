@@ -13,18 +13,21 @@ from jaxtyping import Array
 
 from excite.description import Input, Output, Parameter, PlantDescription, State
 from excite.env import Env
+from excite.estimation import NLS, stack_experiments
+from excite.excitation import Chirp
 from excite.information import a_optimality, d_optimality, e_optimality, experiment_information
 from excite.objective import (
     AbstractObjective,
     EstimationError,
     InformationGain,
     OutputError,
+    Sample,
     WeightedSum,
     prior_sd_of,
 )
 from excite.plant import AbstractPlant, Aero2
 from excite.policy import Layout, Weights, forward, observe
-from excite.simulation import simulate
+from excite.simulation import simulate, step
 from excite.training.base import Checkpoint
 from excite.training.gradient import GradientSettings, Network, experiments, train, train_all
 
@@ -73,6 +76,57 @@ OBJECTIVES = {
 OBJECTIVES["D and errors"] = WeightedSum(
     (OBJECTIVES["D dense"], EstimationError(ALL, [0.01, 0.004, 1.0], "log", 2.0))
 )
+
+
+def test_an_unknown_criterion_or_form_is_refused():
+    with pytest.raises(ValueError, match="criterion must be D, A or E: got 'd'"):
+        InformationGain(ALL, 0.1, criterion="d")
+    with pytest.raises(ValueError, match="form must be relative, log or goals: got 'logs'"):
+        EstimationError(ALL, form="logs")
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_error_of_the_output_error_estimate_is_that_of_nls(seed):
+    """To first order in the noise, here a hundredth of a degree."""
+    plant = Aero2()
+    objective, params = OutputError(ALL, prior_sd=prior_sd_of(0.3)), plant.nominal
+    inputs = Chirp().sequence(plant, 300, KEYS[0])
+    outputs = simulate(plant, params, inputs)
+    noise = plant.sensor.sd[None] * jax.random.normal(jax.random.key(seed), outputs.shape)
+    measured, state = outputs + noise, plant.initial_state
+    memory = objective.init(plant, measured[0])
+    advance = eqx.filter_jit(objective.update)
+    for k, input in enumerate(inputs):
+        sample = Sample(params, state, input, measured[k + 1])
+        memory, _ = advance(plant, memory, sample, jnp.asarray(k))
+        state = step(plant, state, input, params)
+    found = NLS()(plant, stack_experiments(plant, [inputs], [measured], True))
+    theirs = np.abs(np.stack(found.params) / np.stack(params) - 1)
+    ours = objective.relative_errors(plant, memory, params)
+    np.testing.assert_allclose(ours, theirs, rtol=0.02, atol=1e-8)
+
+
+def test_sensitivities_are_held_to_their_limit_and_below_it_left_alone():
+    plant = Aero2()
+    inputs = Chirp(20.0).sequence(plant, 60, KEYS[0])
+
+    def largest(limit: float) -> float:
+        objective = InformationGain(ALL, prior_sd_of(0.3), max_sensitivity=limit)
+        memory, state = objective.init(plant, jnp.zeros(1)), plant.initial_state
+        advance, sizes = eqx.filter_jit(objective.update), []
+        for k, input in enumerate(inputs):
+            before = memory.sensitivity
+            sample = Sample(plant.nominal, state, input, jnp.zeros(1))
+            memory, _ = advance(plant, memory, sample, jnp.asarray(k))
+            sizes.append(np.abs(memory.sensitivity[0]).max())
+            state = step(plant, state, input, plant.nominal)
+            assert memory.sensitivity.shape == before.shape
+        return float(np.max(sizes) / plant.definition.outputs[0].critical_level)
+
+    free = largest(30.0)
+    assert 0.05 < free < 30.0
+    assert largest(free / 4) == pytest.approx(free / 4, rel=1e-6)
+    assert largest(2 * free) == free
 
 
 def test_a_sum_is_worth_the_sum_of_its_terms():

@@ -300,6 +300,23 @@ BAD_STUDIES: dict[str, tuple[str, tuple[str, ...]]] = {
         MINIMAL.replace("aero2", "dc_motor") + "[agents.a]\n[decision]\ngoals = { R = 1 }\n",
         ("agents.a: decision: the reward 'information' has no 'goals'",),
     ),
+    "a criterion of errors": (
+        MINIMAL + '[agents.a.decision]\nreward = "relative"\ncriterion = "A"\n',
+        ("decision: the reward 'errors of an ARX estimator' has no 'criterion'",),
+    ),
+    "a criterion of errors, unsaid": (
+        MINIMAL + '[agents.a.decision]\ncriterion = "A"\n',
+        ("decision: the reward 'errors of an ARX estimator' has no 'criterion'",),
+    ),
+    "a start covariance of nls": (
+        MINIMAL + '[agents.a.decision]\nreward = "log"\nestimator = "nls"\nstart_covariance = 5\n',
+        ("decision: the reward 'errors of nls' has no 'start_covariance'",),
+    ),
+    "a term that is not that of its reward": (
+        MINIMAL + '[agents.a.decision]\nterms = [{ reward = "log", max_sensitivity = 3 }]\n',
+        ("decision: the reward 'errors of an ARX estimator' has no 'max_sensitivity'",),
+    ),
+    "no terms": (MINIMAL + "[agents.a.decision]\nterms = []\n", ("terms", "at least 1")),
     "a reward beside terms": (
         MINIMAL + "[agents.a]\n[agents.a.decision]\nreward = 'log'\nterms = [{ weight = 2.0 }]\n",
         ("agents.a: decision: with terms, 'reward' belongs to one of them",),
@@ -537,7 +554,6 @@ def test_each_input_may_have_an_amplitude_of_its_own():
 PLANT_FILE = """
 import jax.numpy as jnp
 from excite.description import Constant, Input, Output, Parameter, PlantDescription, State
-from excite.objective import InformationGain, OutputError, WeightedSum
 from excite.plant import AbstractPlant
 
 

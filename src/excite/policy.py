@@ -314,7 +314,10 @@ def mismatch(policy: Policy, plant: PlantDescription) -> str | None:
         return None
     if own.name != plant.name:
         return f"the policy was trained on {own.name!r}, not on {plant.name!r}"
-    return f"the policy was trained on another {own.name!r} (hash {own.hash[:8]}) than this one"
+    return (
+        f"the policy was trained on another {own.name!r} (hash {own.hash[:8]}) than this one, "
+        "with other constants, nominal values or noise"
+    )
 
 
 def _require_same(

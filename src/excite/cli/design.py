@@ -54,7 +54,9 @@ from .door import (
 @click.option(
     "--seed", type=WholeNumber(0, 2**63 - 2), default=0, show_default=True, help="Of the search."
 )
-@click.option("--starts", type=WholeNumber(1), default=4, show_default=True, help="Of the search.")
+@click.option(
+    "--starts", type=WholeNumber(1), help="Of a search by gradient, side by side; default 4."
+)
 @click.option("--updates", type=WholeNumber(1), help="Steps of the search, or trials of a tuning.")
 @plot_option
 @json_option
@@ -159,15 +161,18 @@ def _designed(env: Any, options: dict[str, Any], report: Any) -> tuple[Any, dict
     kind, seed, updates = options["kind"], options["seed"], options["updates"]
     found = {"design": kind, "criterion": options["criterion"], "seed": seed}
     if kind not in ("robust", "clairvoyant"):
+        if options["starts"] is not None:
+            raise ValueError("--starts is of designs by gradient; a tuning has --updates trials")
         return _tuned(env, options, found, report)
+    starts = options["starts"] or 4
     settings = ROBUST if kind == "robust" else CLAIRVOYANT
     if updates is not None:
         settings = dataclasses.replace(settings, num_updates=updates)
     if kind == "robust":
-        made = robust_signal(env, seed, options["starts"], settings, report)
+        made = robust_signal(env, seed, starts, settings, report)
     else:
         key = jax.random.split(jax.random.key(seed), 1)
-        made = clairvoyant_signals(env, key, options["starts"], settings, report)
+        made = clairvoyant_signals(env, key, starts, settings, report, seed=seed)
     inputs, by_start = jnp.asarray(made.inputs[0]), made.worth_by_start[0]
     return inputs, {**found, "worth_by_start": by_start.tolist()}, None
 

@@ -88,9 +88,11 @@ def evaluate(policy: str, as_json: bool, **options: Any) -> None:
 
 def _path(policy: str) -> Path:
     from ..names import unknown
-    from ..policy import policy_path, shipped_policies
+    from ..policy import POLICY_ENDING, policy_path, shipped_policies
 
     path = policy_path(policy)
+    if path is None and Path(policy).exists():
+        raise ValueError(f"{policy}: policy files end in {POLICY_ENDING}")
     if path is None:
         raise unknown("policy", policy, [*shipped_policies(), "path/to/policy.safetensors"])
     return path

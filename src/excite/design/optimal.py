@@ -80,14 +80,16 @@ def clairvoyant_signals(
     num_starts: int,
     settings: GradientSettings = CLAIRVOYANT,
     report: Report = lambda *_: None,
+    *,
+    seed: int = 0,
 ) -> Design:
-    """The best signal for each plant that these keys draw.
+    """The best signal for each plant that these keys draw; the seed is that of the starts.
 
     Raises:
         ValueError: where no safe signal was found for a plant.
     """
     own = jnp.repeat(keys, num_starts)[:, None]
-    starts = _first_signals(env, jax.random.split(jax.random.key(0), len(own)))
+    starts = _first_signals(env, jax.random.split(jax.random.key(seed), len(own)))
     found = _search(env, settings, starts, lambda _: own, report)
     return _at_the_limit(env, found, own, settings.near, len(keys))
 

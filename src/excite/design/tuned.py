@@ -111,7 +111,14 @@ def tuned_signal(
         judged.append(Tuned(excitation, options, value, violations, len(fresh), trials))
         if violations == 0:
             break
-    return min(judged, key=lambda tuned: tuned.violations)
+    best = min(judged, key=lambda tuned: tuned.violations)
+    if best.violations == best.episodes or not np.isfinite(best.value):
+        raise ValueError(
+            f"no setting of {excitation!r} was found that is of use: the best has "
+            f"{best.violations} violations on {best.episodes} plants; a smaller spread, a "
+            "shorter experiment or more trials may help"
+        )
+    return best
 
 
 def _cost(trial: Any) -> float:

@@ -118,6 +118,11 @@ class AbstractError(AbstractObjective):
     form: str = eqx.field(static=True, default="relative")
     weight: Float[Array, ""] = eqx.field(converter=number, default=1.0)
 
+    def __check_init__(self) -> None:
+        """Raises ValueError for an unknown form."""
+        if self.form not in ("relative", "log", "goals"):
+            raise ValueError(f"form must be relative, log or goals: got {self.form!r}")
+
     def final(self, plant: AbstractPlant, memory: Any, params: Params) -> Float[Array, ""]:
         """What the estimate at the end is worth."""
         return self.of_errors(self.relative_errors(plant, memory, params)[None])

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ..information import relative_size
 from ..plant import AbstractPlant, Params
 from .base import (
     MAX_SENSITIVITY,
@@ -51,6 +52,11 @@ class InformationGain(AbstractObjective):
     dense: bool = eqx.field(static=True, default=True)
     max_sensitivity: Float[Array, ""] = eqx.field(converter=number, default=MAX_SENSITIVITY)
 
+    def __check_init__(self) -> None:
+        """Raises ValueError for an unknown criterion."""
+        if self.criterion not in ("D", "A", "E"):
+            raise ValueError(f"criterion must be D, A or E: got {self.criterion!r}")
+
     def init(self, plant: AbstractPlant, measured: Float[Array, " output"]) -> InformationMemory:
         """The prior's information; the initial state is known."""
         del measured
@@ -82,8 +88,8 @@ class InformationGain(AbstractObjective):
         self, plant: AbstractPlant, memory: InformationMemory, params: Params
     ) -> Float[Array, " param"]:
         """Least relative standard deviations (Cramér-Rao with the prior)."""
-        del plant, params
-        return jnp.sqrt(jnp.diagonal(jnp.linalg.inv(memory.information)))
+        deviation = jnp.sqrt(jnp.diagonal(jnp.linalg.inv(memory.information)))
+        return deviation * relative_size(plant, params) / jnp.abs(jnp.stack(params))
 
     def _value(self, information: Float[Array, "param param"]) -> Float[Array, ""]:
         chosen = np.flatnonzero(self.targets)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -16,19 +17,23 @@ def frontier_figure(rows: Sequence[Mapping[str, Any]], title: str) -> matplotlib
     """Information of every method against its violation rate, with the rate's interval."""
     first = [row for row in rows if row["estimator"] == rows[0]["estimator"]]
     figure, axes = new_figure(1, 1, height=4.6, width=7.6)
-    axis = axes[0, 0]
-    for i, row in enumerate(r for r in first if "log_det_information" in r):
+    axis, below = axes[0, 0], -math.inf
+    chosen = [(i, row) for i, row in enumerate(first) if "log_det_information" in row]
+    values = [row["log_det_information"] for _, row in chosen]
+    gap = (max(values, default=0.0) - min(values, default=0.0)) / 26  # of two lines of text
+    for i, row in sorted(chosen, key=lambda pair: pair[1]["log_det_information"]):
         rate, (low, high) = row["violation_rate"]["estimate"], row["violation_rate"]["ci95"]
         bars = [[100 * max(0.0, rate - low)], [100 * max(0.0, high - rate)]]
-        style = {"color": colour_of(i), "marker": _MARKERS[i % len(_MARKERS)]}
-        axis.errorbar(
-            100 * rate, row["log_det_information"], xerr=bars, ls="", capsize=2, ms=6,
-            label=row["method"], **style,
+        value, style = row["log_det_information"], {"color": colour_of(i)}
+        axis.errorbar(100 * rate, value, xerr=bars, marker="o", ms=5, capsize=2, **style)
+        below = max(below + gap, value)
+        axis.annotate(
+            row["method"], (100 * high, value), (100 * max(high, 0.001) * 1.15, below),
+            va="center", fontsize=7.5, **style,
         )  # fmt: skip
     axis.set_xscale("symlog", linthresh=0.1)
     axis.set(xlim=(-0.01, 110), xlabel="violations [% of experiments, 95 % interval]")
     axis.set(ylabel="log det of the Fisher information")
-    add_legend(figure, axis)
     add_title(figure, title)
     return figure
 

@@ -109,7 +109,7 @@ class DecisionSettings(RewardSettings):
         normalise_penalty: whether the safety penalty is divided by the number of steps.
     """
 
-    terms: list[RewardSettings] = []
+    terms: Annotated[list[RewardSettings], Field(min_length=1)] = []
     window: Annotated[Count, Field(le=10_000)] = 80
     clocks: list[Positive] = []
     output_scale: dict[str, Positive] = {}
@@ -171,8 +171,9 @@ class Agent:
         shared = {name: value for name, value in decision.items() if name not in rewards}
         process = checked(DecisionSettings, {**shared, **own.decision}, "decision")
         _require_one_reward(process)
-        if process.reward == "information":  # another agent may use what all have in common
-            _require_used(own.decision if "reward" in own.decision else process.model_fields_set)
+        if process.reward is not None:  # another agent may use what all have in common
+            stated = own.decision if "reward" in own.decision else process.model_fields_set
+            _require_used(_kind(process.reward, process, estimators), stated)
         targets = own.targets or []
         if len(set(targets)) < len(targets):
             raise ValueError(f"targets must differ from each other, got {', '.join(targets)}")
@@ -227,10 +228,11 @@ class Agent:
         self, chosen: RewardSettings, plant: AbstractPlant, spread: float
     ) -> AbstractObjective:
         has_mapping = isinstance(plant, AbstractARXPlant)
+        form = chosen.reward or ("relative" if has_mapping else "information")
+        if chosen.reward is None or chosen is not self.decision:  # the others were checked
+            _require_used(_kind(form, chosen, self.estimators), chosen.model_fields_set)
         targets = target_mask(plant.definition, self.targets)
-        if chosen.reward == "information" or (chosen.reward is None and not has_mapping):
-            if chosen is not self.decision or chosen.reward is None:
-                _require_used(chosen.model_fields_set)
+        if form == "information":
             return InformationGain(
                 targets,
                 prior_sd_of(spread),
@@ -244,13 +246,13 @@ class Agent:
         estimator = estimator_named(own.kind, own.options)
         target_mask(plant.definition, list(chosen.goals) or None)  # checks the names
         goals = [chosen.goals.get(p.name, 1.0) for p in plant.definition.parameters]
-        common = targets, goals, chosen.reward or "relative", chosen.weight
+        common = targets, goals, form, chosen.weight
         if isinstance(estimator, NLS):
             bound = {"max_sensitivity": chosen.max_sensitivity}
             return OutputError(*common, prior_sd=prior_sd_of(spread), **bound)
         if not (has_mapping and isinstance(estimator, ARX)):
             raise ValueError(
-                f"the reward {chosen.reward!r} from the estimator {chosen.estimator!r} needs "
+                f"the reward {form!r} from the estimator {chosen.estimator!r} needs "
                 "an ARX estimator, and a plant with a mapping from ARX coefficients; the "
                 "estimator 'nls' and the reward 'information' need neither"
             )
@@ -301,11 +303,26 @@ def _require_one_reward(process: DecisionSettings) -> None:
         raise ValueError(f"decision: with terms, {beside[0]!r} belongs to one of them")
 
 
-def _require_used(names: Iterable[str]) -> None:
-    """Raises ValueError for settings of another reward than `information`."""
-    unused = sorted({"estimator", "goals", "start_covariance"} & set(names))
+_USED = {
+    "information": {"dense", "criterion", "max_sensitivity"},
+    "errors of nls": {"goals", "estimator", "max_sensitivity"},
+    "errors of an ARX estimator": {"goals", "estimator", "start_covariance"},
+}
+"""Settings that kinds of reward have beside `reward` and `weight`."""
+
+
+def _kind(form: str, chosen: RewardSettings, estimators: Mapping[str, EstimatorSettings]) -> str:
+    if form == "information":
+        return "information"
+    own = estimators.get(chosen.estimator, EstimatorSettings(kind=chosen.estimator))
+    return "errors of nls" if own.kind == "nls" else "errors of an ARX estimator"
+
+
+def _require_used(kind: str, names: Iterable[str]) -> None:
+    """Raises ValueError for a setting of another kind of reward."""
+    unused = sorted(set().union(*_USED.values()) & set(names) - _USED[kind])
     if unused:
-        raise ValueError(f"decision: the reward 'information' has no {unused[0]!r}")
+        raise ValueError(f"decision: the reward {kind!r} has no {unused[0]!r}")
 
 
 def _cycles(clocks: Sequence[float], dt: float) -> tuple[float, ...]:

@@ -80,8 +80,8 @@ class GradientSettings:
         """Raises ValueError for a value that is not allowed."""
         check_counts(self, "num_updates", "num_plants", "watch_every", "watch_episodes")
         check_positive(self, "learning_rate", "max_grad_norm", "last_gain", "penalty_weight")
-        check_not_negative(self, "penalty_growth", "penalty_decay", "violation_rate")
-        check_fractions(self, "margin", "near")
+        check_not_negative(self, "penalty_growth", "penalty_decay")
+        check_fractions(self, "margin", "near", "violation_rate")
         check_widths(self)
 
 
@@ -370,8 +370,8 @@ def _require_finite(now: Progress, settings: GradientSettings, num_updates: int)
     if in_a_row >= min(settings.watch_every, settings.num_updates) and num_updates:
         raise ValueError(
             f"the gradient was not finite in the last {in_a_row} updates: the plant or its "
-            "sensitivities grow without bound under this policy; give the plant a critical "
-            "level, a shorter experiment, or a smaller spread"
+            "sensitivities grow without bound under this policy; a critical level where "
+            "the plant has none, a shorter experiment or a smaller spread may help"
         )
 
 
