@@ -165,10 +165,10 @@ class Agent:
         Raises:
             ValueError: for a setting that does not exist or is not allowed.
         """
-        rewards = ({"terms"} if "reward" in own.decision else set()) | (
-            set(RewardSettings.model_fields) if "terms" in own.decision else set()
-        )
-        shared = {name: value for name, value in decision.items() if name not in rewards}
+        replaced = {"terms"} if "reward" in own.decision else set()
+        if "terms" in own.decision:
+            replaced = set(RewardSettings.model_fields)
+        shared = {name: value for name, value in decision.items() if name not in replaced}
         process = checked(DecisionSettings, {**shared, **own.decision}, "decision")
         _require_one_reward(process)
         if process.reward is not None:  # another agent may use what all have in common
