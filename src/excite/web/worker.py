@@ -1,6 +1,6 @@
 """A process that computes for the page: `python -m excite.web.worker`.
 
-One line of JSON in is a call, every line out an event. It ends with its input, so that no
+One line of JSON in is a call, every line out an event of it, by its number. It ends with its input, so that no
 worker outlives the server, and looks for a line between two events: that stops the work.
 """
 
@@ -20,11 +20,12 @@ from ..files import json_ready
 
 MAX_MEMORY = 6 * 2**30
 """Bytes of data: a file that unpacks to more than the computer holds is refused, not loaded."""
+_MAX_SENTENCE = 1000  # characters; a file's content may be quoted in it
 
 
 def main() -> None:
     """Answers calls until the input ends."""
-    with os.fdopen(os.dup(1), "w", encoding="utf-8") as out:
+    with os.fdopen(os.dup(1), "w", encoding="utf-8", errors="replace") as out:
         os.dup2(2, 1)  # whatever a library prints is no event
         live = importlib.import_module("excite.live")
         resource.setrlimit(resource.RLIMIT_DATA, (MAX_MEMORY, MAX_MEMORY))
@@ -32,8 +33,9 @@ def main() -> None:
         for line in sys.stdin.buffer:
             call = json.loads(line)
             if call != "stop":  # one that came too late is of no concern
+                number = call.pop("number")
                 for event in _events(live, **call):
-                    _write(out, event)
+                    _write(out, {**event, "number": number})
 
 
 def _events(live: Any, target: str, arguments: dict[str, Any]) -> Iterator[dict[str, Any]]:
@@ -59,7 +61,10 @@ def _named(error: Exception) -> str:
 
 
 def _failure(sentence: str) -> dict[str, Any]:
-    return {"kind": "failed", "sentence": " ".join(sentence.split())}
+    sentence = " ".join(sentence.split())
+    if len(sentence) > _MAX_SENTENCE:
+        sentence = f"{sentence[:_MAX_SENTENCE]}…"
+    return {"kind": "failed", "sentence": sentence}
 
 
 def _write(out: Any, event: dict[str, Any]) -> None:
