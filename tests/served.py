@@ -52,6 +52,7 @@ def browser(address: str) -> Iterator[httpx.Client]:
     """A client that has opened the page, and tells where its requests come from."""
     with httpx.Client(base_url=address, headers={"origin": address}, timeout=120) as client:
         assert client.get("/").status_code == 200
+        assert client.post("/api/session", json={}).json() == {"is_known": True}
         yield client
 
 

@@ -20,9 +20,10 @@ from starlette.testclient import TestClient
 
 from excite.files import write_json
 from excite.web import Settings, application
-from excite.web.base import MAX_JOBS, MAX_UPLOAD, RefusedError, Session
+from excite.web.base import MAX_JOBS, MAX_SESSIONS, MAX_UPLOAD, RefusedError, Session, Sessions
 from excite.web.runs import found
-from excite.web.security import MAX_TRIES
+from excite.web.security import MAX_TRIES, _source
+from excite.web.trainings import Training
 
 HERE = "http://127.0.0.1:8000"
 
@@ -171,7 +172,7 @@ def test_ten_clients_at_once(address: str, told: Told):
             for _ in range(10)
         ]
         try:
-            await asyncio.gather(*(c.get("/") for c in clients))
+            await asyncio.gather(*(c.post("/api/session", json={}) for c in clients))
             return await asyncio.gather(*(one(c, seed) for seed, c in enumerate(clients)))
         finally:
             await asyncio.gather(*(c.aclose() for c in clients))
@@ -277,6 +278,18 @@ def test_a_bad_file_is_one_sentence_and_nothing_is_run(name: str, client, told: 
     assert "/tmp" not in answer.text
 
 
+@pytest.mark.parametrize("header", [26 * 2**20 * "\x01", 13 * 2**20 * "\x01,"])
+def test_a_file_of_names_alone_leaves_the_others_alone(header: str, client, told: Told):
+    """As JSON it is six times longer, more than a worker may say at once."""
+    del told
+    answer = client.post("/api/uploads?name=a.csv", content=f"{header}\n".encode())
+    assert answer.status_code == 422
+    assert len(answer.json()["sentence"]) < 1100
+    for _ in range(3):  # one worker and the other
+        again = client.post("/api/uploads?name=a.csv", content="time,x\n0,1\n1,2\n")
+        assert again.json()["columns"] == {"time": 2, "x": 2}
+
+
 def test_a_script_in_a_column_stays_text(client, told: Told):
     del told
     script = "<script>alert(1)</script>"
@@ -305,15 +318,15 @@ def guarded(runs: Path, scratch: Path, **settings: Any) -> TestClient:
 @pytest.fixture
 def page(runs: Path, scratch: Path) -> TestClient:
     opened = guarded(runs, scratch)
-    assert opened.get("/").status_code == 200
+    assert opened.post("/api/session", json={}).json() == {"is_known": True}
     return opened
 
 
-def test_the_page_comes_with_its_headers_and_a_secret(page: TestClient):
-    answer = page.get("/", headers={"cookie": ""})
+def test_the_page_comes_with_its_headers_and_its_door_with_a_secret(page: TestClient):
+    answer = page.get("/")
     assert "default-src 'self'" in answer.headers["content-security-policy"]
     assert answer.headers["x-content-type-options"] == "nosniff"
-    cookie = answer.headers["set-cookie"]
+    cookie = page.post("/api/session", json={}, headers={"cookie": ""}).headers["set-cookie"]
     assert cookie.startswith("excite_8000=")
     assert "HttpOnly; SameSite=Strict" in cookie
     text = answer.text + page.get("/static/bench.js").text
@@ -423,12 +436,29 @@ def test_the_run_folder_is_listed_as_it_is(page: TestClient, runs: Path):
         {"params": {"J_p": "0.1"}},
         {"noise": {str(i): 1 for i in range(40)}},
         {"seed": -1},
+        {"amplitude": 10**400},
+        {"params": {"\ud800": "x"}},
+        {"params": {"J_p": -(10**400)}},
     ],
 )
 def test_a_request_is_names_and_numbers_and_nothing_else(change: dict, page: TestClient):
-    answer = page.post("/api/experiments", json={**EXPERIMENT, **change})
+    answer = page.post("/api/experiments", content=json.dumps({**EXPERIMENT, **change}))
     assert answer.status_code == 400
     assert answer.json()["sentence"]
+
+
+def test_a_defect_is_one_sentence(page: TestClient, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("excite.web.runs.found", lambda folder: 1 / 0)
+    answer = page.get("/api/runs")
+    assert answer.status_code == 500
+    assert "its terminal says why" in answer.json()["sentence"]
+    assert answer.headers["x-content-type-options"] == "nosniff"
+
+
+def test_half_a_character_is_no_token(runs: Path, scratch: Path):
+    client = guarded(runs, scratch, token="right-token")
+    answer = client.post("/api/session", content=b'{"token": "\\ud800"}')
+    assert (answer.status_code, answer.json()["sentence"]) == (400, "the request is no JSON object")
 
 
 @pytest.mark.parametrize("content", [b"", b"[1]", b"{", b"\xff", b"[" * 10000, b"NaN"])
@@ -494,12 +524,37 @@ def test_a_browser_has_so_many_things_under_way(tmp_path: Path):
     session.begin()
 
 
-def test_a_picture_in_a_foreign_page_makes_no_session(runs: Path, scratch: Path):
+def test_who_only_comes_to_the_page_gets_no_secret(runs: Path, scratch: Path):
+    """A link in a foreign page, which comes without the cookie, would take the old one away."""
     stranger = guarded(runs, scratch)
-    for place in ("image", "iframe", "empty"):
-        answer = stranger.get("/", headers={"sec-fetch-dest": place})
-        assert answer.status_code == 403
+    for headers in ({}, {"sec-fetch-site": "cross-site"}, {"sec-fetch-dest": "image"}):
+        answer = stranger.get("/", headers=headers)
+        assert answer.status_code == 200
         assert "set-cookie" not in answer.headers
+    assert not list(scratch.iterdir())
+
+
+def test_who_has_a_secret_keeps_it(page: TestClient, scratch: Path):
+    answer = page.post("/api/session", json={})
+    assert answer.json() == {"is_known": True}
+    assert "set-cookie" not in answer.headers
+    assert len(list(scratch.iterdir())) == 1
+
+
+def test_what_computes_is_not_idle(tmp_path: Path):
+    sessions = Sessions(tmp_path)
+    first, second, *_ = [sessions.new() for _ in range(MAX_SESSIONS)]
+    busy, done = sessions.get(first), sessions.get(second)
+    assert busy is not None
+    assert done is not None
+    busy.trainings["x"], done.trainings["x"] = (Training("x", tmp_path, []) for _ in range(2))
+    done.trainings["x"].state = "finished"
+    for session in (sessions.get(key) for key in list(sessions._all)[2:]):
+        assert session is not None
+        session.seen = time.monotonic() + 1
+    sessions.new()
+    assert sessions.get(first) is busy
+    assert sessions.get(second) is None
 
 
 # -------------------------------------------------------------------------------- the token
@@ -508,7 +563,11 @@ def test_a_picture_in_a_foreign_page_makes_no_session(runs: Path, scratch: Path)
 def test_a_token_is_needed_where_there_is_one(runs: Path, scratch: Path):
     client = guarded(runs, scratch, token="right-token")
     assert client.get("/").status_code == 200  # the page itself says nothing
-    assert client.get("/api/session").json() == {"is_known": False}
+    for _ in range(MAX_SESSIONS + 1):
+        answer = client.post("/api/session", json={})
+        assert answer.json() == {"is_known": False}
+    assert "set-cookie" not in answer.headers
+    assert not list(scratch.iterdir()), "nothing is kept for strangers"
     for path in ("/api/runs", "/api/catalogue", "/api/run?name=some/study", "/api/trainings"):
         assert client.get(path).status_code == 401
     assert client.post("/api/experiments", json=EXPERIMENT).status_code == 401
@@ -518,12 +577,35 @@ def test_a_token_is_needed_where_there_is_one(runs: Path, scratch: Path):
 
 def test_a_token_cannot_be_guessed(runs: Path, scratch: Path):
     client = guarded(runs, scratch, token="right-token")
-    client.get("/")
     for guess in ["", "right-toke", None, 7, ["right-token"], "x" * 60, *"abcdefg"][:MAX_TRIES]:
         assert client.post("/api/session", json={"token": guess}).status_code == 401
     answer = client.post("/api/session", json={"token": "right-token"})
     assert answer.status_code == 429, "the right one, too, has to wait then"
     assert client.get("/api/runs").status_code == 401
+    other = TestClient(client.app, HERE, client=("10.0.0.9", 1), headers={"origin": HERE})
+    answer = other.post("/api/session", json={"token": "right-token"})
+    assert answer.status_code == 200, "who comes from elsewhere does not"
+
+
+@pytest.mark.parametrize(
+    ("address", "source"),
+    [
+        ("10.0.0.9", "10.0.0.9/32"),
+        ("2001:db8:1:2:3::4", "2001:db8:1:2::/64"),
+        ("testclient", "testclient"),
+    ],
+)
+def test_tries_are_counted_by_address(address: str, source: str):
+    assert _source({"client": (address, 1)}) == source
+
+
+def test_its_own_names_are_looked_up_once(runs, scratch, monkeypatch: pytest.MonkeyPatch):
+    asked = []
+    monkeypatch.setattr(socket, "getfqdn", lambda: asked.append(1) or "Its.Own.Name")
+    client = guarded(runs, scratch, host="0.0.0.0", token="right-token")
+    for _ in range(3):
+        assert client.get("/", headers={"host": "its.own.name:8000"}).status_code == 200
+    assert len(asked) == 1
 
 
 def test_every_address_of_this_computer_is_answered_where_all_are_bound(runs, scratch):

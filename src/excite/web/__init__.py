@@ -75,7 +75,7 @@ def application(
 
     routes = [
         Route("/", lambda request: FileResponse(_STATIC / "index.html")),
-        Route("/api/session", _session(settings), methods=["GET", "POST"]),
+        Route("/api/session", _session, methods=["POST"]),
         Route("/api/catalogue", catalogue),
         *stream_routes(workers, _body),
         *place_routes(workers, partial(run_of, settings.runs)),
@@ -90,16 +90,14 @@ def application(
     )
 
 
-def _session(settings: Settings) -> Callable[[Request], Any]:
-    """Whether this browser may come in; POST shows the token."""
-
-    async def answer(request: Request) -> JSONResponse:
-        if request.method == "POST":
-            request.state.show_token((await _body(request)).get("token"))
-        is_known = settings.token is None or request.state.session.is_known
-        return JSONResponse({"is_known": is_known})
-
-    return answer
+async def _session(request: Request) -> JSONResponse:
+    """Whether this browser may come in; lets it in where it shows the token, or none is needed."""
+    asked = await _body(request)
+    if request.state.session is not None:  # it stays the one it is
+        return JSONResponse({"is_known": True})
+    cookie = request.state.enter(asked)
+    headers = {} if cookie is None else {"set-cookie": cookie}
+    return JSONResponse({"is_known": cookie is not None}, headers=headers)
 
 
 async def _body(request: Request) -> dict[str, Any]:
@@ -111,6 +109,7 @@ async def _body(request: Request) -> dict[str, Any]:
             raise RefusedError(413, "the request is too large")
     try:
         asked = json.loads(bytes(content))
+        json.dumps(asked, ensure_ascii=False).encode()  # half a character is no text
     except (ValueError, RecursionError):
         asked = None
     if not isinstance(asked, dict):

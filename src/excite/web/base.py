@@ -68,10 +68,9 @@ class Pool(Protocol):
 
 @dataclass
 class Session:
-    """One browser: what it may see, and nobody else.
+    """One browser that may come in: what it may see, and nobody else.
 
     Attributes:
-        is_known: whether it has shown the token, where there is one.
         folder: its uploads and results.
         stops: how to stop what is under way, by its name; None for what is short.
         kept: folders of results and uploads by name, oldest first.
@@ -79,7 +78,6 @@ class Session:
     """
 
     folder: Path
-    is_known: bool = False
     stops: dict[str, Any] = field(default_factory=dict)
     kept: dict[str, Path] = field(default_factory=dict)
     trainings: dict[str, Any] = field(default_factory=dict)
@@ -103,6 +101,11 @@ class Session:
     def forget(self, name: str) -> None:
         """Removes a result or upload."""
         shutil.rmtree(self.kept.pop(name, self.folder / "nothing"), ignore_errors=True)
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether nothing of it is under way."""
+        return not (self.stops or any(t.is_running for t in self.trainings.values()))
 
     def begin(self, stop: Any = None) -> str:
         """The name of one more thing that is under way, until `end`.
@@ -134,9 +137,9 @@ class Sessions:
             session.seen = time.monotonic()
         return session
 
-    def new(self) -> tuple[str, Session]:
-        """A session and its secret; where there are too many, the idlest gives way."""
-        idle = [s for s in self._all if not (self._all[s].stops or self._all[s].trainings)]
+    def new(self) -> str:
+        """The secret of a new session; where there are too many, the idlest gives way."""
+        idle = [secret for secret, session in self._all.items() if session.is_idle]
         if len(self._all) >= MAX_SESSIONS:
             if not idle:
                 raise RefusedError(503, "too many browsers are working here")
@@ -144,7 +147,7 @@ class Sessions:
             shutil.rmtree(self._all.pop(gone).folder, ignore_errors=True)
         secret = secrets.token_urlsafe(32)
         self._all[secret] = Session(Path(tempfile.mkdtemp(dir=self._folder)))
-        return secret, self._all[secret]
+        return secret
 
 
 # ------------------------------------------------------------- what a browser may ask for
@@ -161,11 +164,18 @@ def word(asked: Mapping[str, Any], key: str) -> str:
 def number(asked: Mapping[str, Any], key: str, lower: float, upper: float) -> float:
     """A finite number of a range."""
     value = asked.get(key)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, int | float) or not _is_finite(value):
         raise RefusedError(400, f"{key}: a number is needed")
     if not lower <= value <= upper:
         raise RefusedError(400, f"{key} must lie between {lower:g} and {upper:g}: got {value:g}")
     return float(value)
+
+
+def _is_finite(value: float) -> bool:
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # a whole number of very many digits
+        return False
 
 
 def whole(asked: Mapping[str, Any], key: str, lower: int, upper: int) -> int:
