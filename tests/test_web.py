@@ -1,10 +1,12 @@
 """The server of the bench page: its numbers, its limits, and who may ask for what."""
 
 import asyncio
+import contextlib
 import csv
 import json
 import os
 import pickle
+import signal
 import socket
 import subprocess
 import sys
@@ -26,6 +28,9 @@ from excite.web.security import MAX_TRIES, _source
 from excite.web.trainings import Training
 
 HERE = "http://127.0.0.1:8000"
+TRAINING = {
+    "plant": "aero2", "name": "mine", "objective": "D", "updates": 1, "steps": 60, "spread": 0.3,
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -250,6 +255,54 @@ def test_a_browser_that_leaves_takes_its_work_along(address: str, told: Told):
                 assert answer.status_code == 200
                 assert json.loads(next(answer.iter_lines()))["kind"] == "job"
             time.sleep(0.2)
+
+
+def trainings_in(folder: Path) -> set[int]:
+    """Processes of `excite train` into this folder, with those that they have started."""
+    found = set()
+    for place in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):
+            if f"--out\0{folder}".encode() in (place / "cmdline").read_bytes():
+                found.add(int(place.name))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("number", "code"),
+    [
+        (signal.SIGINT, 0),
+        (signal.SIGTERM, 143),
+        (signal.SIGHUP, 129),
+        (signal.SIGKILL, -9),
+    ],
+)
+def test_nothing_outlives_the_server(number: int, code: int, tmp_path: Path):
+    """Neither a training, nor a worker, nor what was uploaded."""
+    runs, scratch = tmp_path / "runs", tmp_path / "scratch"
+    runs.mkdir()
+    scratch.mkdir()
+    asked = {**TRAINING, "updates": 100_000}
+    with served(runs, "--workers", "1", ended_by=number, code=code, scratch=scratch) as where:
+        with browser(where) as opened:
+            assert opened.post("/api/uploads?name=a.csv", content="time,x\n0,1\n1,2\n").is_success
+            assert opened.post("/api/trainings", json=asked).is_success
+            assert list(scratch.glob("excite-bench-*/*/*/a.csv"))
+        workers = processes_of(where)
+        assert workers
+        assert trainings_in(runs)
+    assert number == signal.SIGKILL or not list(scratch.glob("excite-bench-*"))
+    deadline = time.monotonic() + 30
+    while trainings_in(runs) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not trainings_in(runs)
+    assert not [pid for pid in workers if is_running(pid)]
+
+
+def is_running(process: int) -> bool:
+    try:
+        return "excite.web.worker" in Path(f"/proc/{process}/cmdline").read_text()
+    except OSError:
+        return False
 
 
 # ------------------------------------------------------------------------------ bad files
@@ -489,15 +542,13 @@ def test_what_is_too_large_is_refused_before_it_is_read(page: TestClient, scratc
     ],
 )  # fmt: skip
 def test_a_training_takes_names_and_numbers_alone(change: dict, page: TestClient, runs: Path):
-    asked = {"plant": "aero2", "name": "mine", "objective": "D", "updates": 1, "steps": 60}
-    answer = page.post("/api/trainings", json={**asked, "spread": 0.3, **change})
+    answer = page.post("/api/trainings", json={**TRAINING, **change})
     assert answer.status_code == 400
     assert sorted(p.name for p in runs.iterdir()) == ["elsewhere", "some"]
 
 
 def test_a_training_never_goes_where_something_is(page: TestClient):
-    asked = {"plant": "aero2", "name": "some", "objective": "D", "updates": 1, "steps": 60}
-    assert page.post("/api/trainings", json={**asked, "spread": 0.3}).status_code == 409
+    assert page.post("/api/trainings", json={**TRAINING, "name": "some"}).status_code == 409
 
 
 def test_a_browser_cannot_see_or_stop_what_is_anothers(address: str, client, told: Told):

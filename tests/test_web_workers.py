@@ -26,7 +26,7 @@ ANSWERS = {
     "no JSON": 'print("hello\\n" + good if target == "bad" else good, flush=True)',
     "no event": 'print("[1]\\n" + good if target == "bad" else good, flush=True)',
     "nobody's": 'print(good.replace("number", "x") if target == "bad" else good, flush=True)',
-    "another's": 'print(json.dumps({"kind": "end", "number": number - (target == "bad")}), flush=True)',
+    "another's": 'print(good.replace(": ", ": 9") if target == "bad" else good, flush=True)',
 }  # fmt: skip
 
 

@@ -1,7 +1,8 @@
 """A process that computes for the page: `python -m excite.web.worker`.
 
-One line of JSON in is a call, every line out an event of it, by its number. It ends with its input, so that no
-worker outlives the server, and looks for a line between two events: that stops the work.
+One line of JSON in is a call, every line out an event of it, by its number. It ends with its
+input, so that no worker outlives the server, and looks for a line between two events: that
+stops the work.
 """
 
 from __future__ import annotations
@@ -24,7 +25,12 @@ _MAX_SENTENCE = 1000  # characters; a file's content may be quoted in it
 
 
 def main() -> None:
-    """Answers calls until the input ends."""
+    """Answers calls until the input ends, or nobody is left to read the answers."""
+    with contextlib.suppress(BrokenPipeError):
+        _answer()
+
+
+def _answer() -> None:
     with os.fdopen(os.dup(1), "w", encoding="utf-8", errors="replace") as out:
         os.dup2(2, 1)  # whatever a library prints is no event
         live = importlib.import_module("excite.live")
