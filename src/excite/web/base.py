@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
 import secrets
 import shutil
 import tempfile
 import time
-from collections.abc import AsyncGenerator, Mapping
+from collections.abc import AsyncGenerator, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -23,7 +24,7 @@ MAX_JOBS = 4
 """Things a browser may have under way at once."""
 MAX_SESSIONS = 256
 MAX_KEPT = 8
-"""Results and uploads that are kept for a browser; older ones give way."""
+"""Results, and likewise uploads, that are kept for a browser; what was used last stays."""
 
 _WORD = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
 
@@ -67,40 +68,73 @@ class Pool(Protocol):
 
 
 @dataclass
+class Place:
+    """A folder for an upload or a result.
+
+    Attributes:
+        kind: "upload" or "result"; each gives way to its own kind alone.
+        num_users: how many things under way need it now.
+        is_done: whether it holds what it was made for.
+    """
+
+    folder: Path
+    kind: str
+    num_users: int = 0
+    is_done: bool = False
+
+
+@dataclass
 class Session:
     """One browser that may come in: what it may see, and nobody else.
 
     Attributes:
         folder: its uploads and results.
         stops: how to stop what is under way, by its name; None for what is short.
-        kept: folders of results and uploads by name, oldest first.
+        kept: results and uploads by name, the one used last at the end.
         trainings: trainings it has started, by name.
     """
 
     folder: Path
     stops: dict[str, Any] = field(default_factory=dict)
-    kept: dict[str, Path] = field(default_factory=dict)
+    kept: dict[str, Place] = field(default_factory=dict)
     trainings: dict[str, Any] = field(default_factory=dict)
     seen: float = field(default_factory=time.monotonic)
 
-    def new_place(self) -> tuple[str, Path]:
-        """A name that cannot be guessed and an empty folder for it."""
-        while len(self.kept) >= MAX_KEPT:
-            oldest = next(iter(self.kept))
-            shutil.rmtree(self.kept.pop(oldest), ignore_errors=True)
-        name = secrets.token_urlsafe(12)
-        self.kept[name] = Path(tempfile.mkdtemp(dir=self.folder))
-        return name, self.kept[name]
+    @contextlib.contextmanager
+    def making(self, kind: str) -> Iterator[tuple[str, Place]]:
+        """A name that cannot be guessed, and its place, which goes where it is not done."""
+        name, folder = secrets.token_urlsafe(12), Path(tempfile.mkdtemp(dir=self.folder))
+        place = self.kept[name] = Place(folder, kind)
+        self._give_way(kind, name)
+        try:
+            with self.using(name):
+                yield name, place
+        finally:
+            if not place.is_done:
+                self._forget(name)
 
-    def place(self, name: str) -> Path:
-        """The folder of a result or upload of this browser."""
-        if name not in self.kept:
+    @contextlib.contextmanager
+    def using(self, name: str) -> Iterator[Path]:
+        """The folder of a result or upload of this browser, which stays for that long."""
+        place = self.kept.pop(name, None)
+        if place is None:
             raise RefusedError(404, "there is no such result in this browser; run it again")
-        return self.kept[name]
+        self.kept[name] = place  # the last one now
+        place.num_users += 1
+        try:
+            yield place.folder
+        finally:
+            place.num_users -= 1
 
-    def forget(self, name: str) -> None:
-        """Removes a result or upload."""
-        shutil.rmtree(self.kept.pop(name, self.folder / "nothing"), ignore_errors=True)
+    def _give_way(self, kind: str, new: str) -> None:
+        """Removes what was not used for longest, and is not in use, where there is too much."""
+        same = [name for name, place in self.kept.items() if place.kind == kind]
+        free = [name for name in same if not self.kept[name].num_users and name != new]
+        for name in free[: max(0, len(same) - MAX_KEPT)]:
+            self._forget(name)
+
+    def _forget(self, name: str) -> None:
+        shutil.rmtree(self.kept.pop(name).folder, ignore_errors=True)
 
     @property
     def is_idle(self) -> bool:
