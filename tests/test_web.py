@@ -6,6 +6,7 @@ import csv
 import json
 import os
 import pickle
+import re
 import signal
 import socket
 import subprocess
@@ -21,6 +22,7 @@ from served import EXPERIMENT, MAX_GAP, Told, browser, served, streamed
 from starlette.testclient import TestClient
 
 from excite.files import write_json
+from excite.report import report_html
 from excite.web import Settings, application
 from excite.web.base import MAX_JOBS, MAX_SESSIONS, MAX_UPLOAD, RefusedError, Session, Sessions
 from excite.web.runs import found
@@ -49,8 +51,14 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def address(runs: Path) -> Iterator[str]:
-    with served(runs, "--workers", "2") as where:
+def temporary(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the server keeps what it keeps for browsers."""
+    return tmp_path_factory.mktemp("scratch")
+
+
+@pytest.fixture(scope="module")
+def address(runs: Path, temporary: Path) -> Iterator[str]:
+    with served(runs, "--workers", "2", scratch=temporary) as where:
         yield where
 
 
@@ -141,7 +149,9 @@ def test_a_stream_has_no_gaps(told: Told):
     assert told.gap < MAX_GAP
 
 
-def test_an_uploaded_file_is_identified_as_at_the_command_line(client, told: Told):
+def test_an_uploaded_file_is_identified_as_at_the_command_line(
+    client, told: Told, temporary: Path
+):
     text = told.of("record.csv")[0]["text"].replace("pitch", "theta")
     uploaded = client.post("/api/uploads?name=my log.csv", content=text).json()
     assert uploaded["columns"] == {"time": 501, "voltage": 501, "theta": 501}
@@ -153,7 +163,10 @@ def test_an_uploaded_file_is_identified_as_at_the_command_line(client, told: Tol
     assert event["identification"]["files"] == ["my_log.csv"]
     report = client.get(f"/api/results/{event['result']}/report.html")
     assert "attachment" in report.headers["content-disposition"]
-    assert "J_p" in report.text
+    estimate = client.get(f"/api/results/{event['result']}/estimate.json").content
+    files = temporary.glob("*/*/*/run/estimate.json")
+    [run] = [file.parent for file in files if file.read_bytes() == estimate]
+    assert report.text == report_html([run])
 
 
 def test_ten_clients_at_once(address: str, told: Told):
@@ -387,6 +400,33 @@ def test_the_page_comes_with_its_headers_and_its_door_with_a_secret(page: TestCl
     assert "https://" not in text
 
 
+def contrast(first: str, second: str) -> float:
+    """Of two colours, as the Web Content Accessibility Guidelines count it."""
+
+    def luminance(colour: str) -> float:
+        digits = colour if len(colour) == 6 else "".join(2 * digit for digit in colour)
+        parts = [int(digits[i : i + 2], 16) / 255 for i in (0, 2, 4)]
+        linear = [p / 12.92 if p <= 0.04045 else ((p + 0.055) / 1.055) ** 2.4 for p in parts]
+        return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+    low, high = sorted((luminance(first), luminance(second)))
+    return (high + 0.05) / (low + 0.05)
+
+
+def test_texts_and_borders_can_be_seen(page: TestClient):
+    style = page.get("/static/bench.css").text
+    light, dark = re.findall(r":root \{(.*?)\}", style, re.DOTALL)
+    assert contrast("000", "ffffff") == pytest.approx(21)
+    for scheme in (light, dark):
+        colour = dict(re.findall(r"--([a-z]+): #([0-9a-f]+);", scheme))
+        for text in ("ink", "soft", "warning", "critical", "good", "accent"):
+            assert contrast(colour[text], colour["card"]) >= 4.5, text
+        for behind in ("field", "card", "paper"):
+            assert contrast(colour["edge"], colour[behind]) >= 3
+    for rule in ("input, select { width", "button { padding"):
+        assert "1px solid var(--edge)" in style.partition(rule)[2].partition("}")[0]
+
+
 @pytest.mark.parametrize(
     "host", ["evil.example", "evil.example:8000", "127.0.0.1:8001", "127.0.0.1", "", "[", "a:b:c"]
 )
@@ -563,7 +603,23 @@ def test_a_browser_cannot_see_or_stop_what_is_anothers(address: str, client, tol
             assert other.delete(f"/api/jobs/{job}").status_code == 404
             kinds = [json.loads(line)["kind"] for line in lines]
         assert kinds[-1] == "end"
+
+
+def test_a_browser_cannot_see_or_stop_anothers_training(tmp_path: Path):
+    asked = {**TRAINING, "updates": 100_000}
+    with (
+        served(tmp_path, "--workers", "1") as where,
+        browser(where) as own,
+        browser(where) as other,
+    ):
+        name = own.post("/api/trainings", json=asked).json()["name"]
         assert other.get("/api/trainings").json() == {"trainings": []}
+        assert other.delete(f"/api/trainings/{name}").status_code == 404
+        [training] = own.get("/api/trainings").json()["trainings"]
+        assert training["state"] in ("starting", "training")
+        assert trainings_in(tmp_path)
+        assert own.delete(f"/api/trainings/{name}").json()["state"] == "stopped"
+        assert not trainings_in(tmp_path)
 
 
 def test_a_browser_has_so_many_things_under_way(tmp_path: Path):
@@ -617,7 +673,7 @@ def test_a_token_is_needed_where_there_is_one(runs: Path, scratch: Path):
     for _ in range(MAX_SESSIONS + 1):
         answer = client.post("/api/session", json={})
         assert answer.json() == {"is_known": False}
-    assert "set-cookie" not in answer.headers
+        assert "set-cookie" not in answer.headers
     assert not list(scratch.iterdir()), "nothing is kept for strangers"
     for path in ("/api/runs", "/api/catalogue", "/api/run?name=some/study", "/api/trainings"):
         assert client.get(path).status_code == 401

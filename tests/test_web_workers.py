@@ -87,9 +87,9 @@ def test_a_worker_that_answers_oddly_is_replaced_and_nobody_waits(kind: str, pro
 def test_workers_that_do_not_start_are_said_to(text: str | None, program: Path):
     if text is not None:
         write(program, text)
-    for events in answers("catalogue", "catalogue", "episode", "episode"):
+    for events in answers("catalogue", "episode", "episode"):
         assert events[-1]["kind"] == "failed"
-    assert "do not start" in events[-1]["sentence"]
+        assert "do not start" in events[-1]["sentence"]
 
 
 def test_workers_that_do_not_start_are_tried_only_so_often(program: Path, tmp_path: Path):
