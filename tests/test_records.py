@@ -4,6 +4,7 @@ import json
 import math
 import os
 import pickle
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 
@@ -23,7 +24,7 @@ from excite.files import (
     write_json,
 )
 from excite.plant import EMPS, Aero2
-from excite.records import Record, read_record, require_record_path, write_record
+from excite.records import Record, columns_in, read_record, require_record_path, write_record
 
 AERO2, EMPS_D, TWO_MASSES = Aero2.definition, EMPS.definition, TwoMasses.definition
 
@@ -321,6 +322,34 @@ def test_a_file_that_cannot_be_used_is_one_sentence(name, content, fragments, tm
     assert str(path) in sentence
     assert "\n" not in sentence
     assert [f for f in fragments if f not in sentence] == []
+
+
+def test_a_mat_file_that_unpacks_to_very_much_is_not_unpacked(tmp_path: Path):
+    path = tmp_path / "r.mat"
+    columns = {"time": np.zeros(34_000_000, np.uint8)}
+    scipy.io.savemat(path, columns, do_compression=True)
+    assert path.stat().st_size < 50_000
+    tracemalloc.start()
+    try:
+        with pytest.raises(ValueError, match="259 MiB unpacked, more than 256"):
+            columns_in(path)
+        assert tracemalloc.get_traced_memory()[1] < 5e6
+    finally:
+        tracemalloc.stop()
+
+
+def test_of_a_mat_file_vectors_of_numbers_are_columns_and_nothing_else(tmp_path: Path):
+    vectors = {
+        "time": np.arange(3.0),
+        "is_on": np.array([True, False, True]),
+        "q": np.int16([1, 2]),
+    }
+    others = {"log": {"x": np.arange(9)}, "note": "text", "one": 1.0, "matrix": np.eye(3)}
+    scipy.io.savemat(tmp_path / "r.mat", {**vectors, **others})
+    found = columns_in(tmp_path / "r.mat")
+    assert found.keys() == vectors.keys()
+    for name, values in vectors.items():
+        np.testing.assert_array_equal(np.asarray(found[name], float), values)
 
 
 @pytest.mark.parametrize("name", ["nowhere.csv", "nowhere.mat", "folder.csv"])

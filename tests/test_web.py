@@ -17,7 +17,9 @@ from pathlib import Path
 from typing import Any
 
 import httpx2 as httpx
+import numpy as np
 import pytest
+import scipy.io
 from served import EXPERIMENT, MAX_GAP, Told, browser, served, streamed
 from starlette.testclient import TestClient
 
@@ -149,9 +151,7 @@ def test_a_stream_has_no_gaps(told: Told):
     assert told.gap < MAX_GAP
 
 
-def test_an_uploaded_file_is_identified_as_at_the_command_line(
-    client, told: Told, temporary: Path
-):
+def test_an_uploaded_file_is_identified_as_at_the_command_line(client, told: Told, temporary: Path):
     text = told.of("record.csv")[0]["text"].replace("pitch", "theta")
     uploaded = client.post("/api/uploads?name=my log.csv", content=text).json()
     assert uploaded["columns"] == {"time": 501, "voltage": 501, "theta": 501}
@@ -167,6 +167,30 @@ def test_an_uploaded_file_is_identified_as_at_the_command_line(
     files = temporary.glob("*/*/*/run/estimate.json")
     [run] = [file.parent for file in files if file.read_bytes() == estimate]
     assert report.text == report_html([run])
+
+
+def test_an_uploaded_mat_file_is_identified(client, told: Told, tmp_path: Path):
+    rows = list(csv.DictReader(told.of("record.csv")[0]["text"].splitlines()))
+    path = tmp_path / "log.mat"
+    table = {name: [float(row[name]) for row in rows] for name in rows[0]}
+    scipy.io.savemat(path, {**table, "notes": "text"}, do_compression=True)
+    uploaded = client.post("/api/uploads?name=log.mat", content=path.read_bytes()).json()
+    assert uploaded["columns"] == dict.fromkeys(("time", "voltage", "pitch"), 501)
+    asked = {"upload": uploaded["upload"], "plant": "aero2", "estimator": "nls"}
+    asked |= {"columns": {}, "scales": {}, "initial_state": "known"}
+    [event] = streamed(client, "/api/identifications", asked).of("identified")
+    own = told.of("result")[0]["identification"]
+    assert event["identification"]["params"] == own["params"]
+
+
+def test_a_mat_file_that_unpacks_to_very_much_is_refused(client, told: Told, tmp_path: Path):
+    del told
+    bomb = {"time": np.zeros(150_000_000, np.uint8)}
+    scipy.io.savemat(tmp_path / "a.mat", bomb, do_compression=True)
+    content = (tmp_path / "a.mat").read_bytes()
+    answer = client.post("/api/uploads?name=a.mat", content=content)
+    assert answer.status_code == 422
+    assert "unpacked" in answer.json()["sentence"]
 
 
 def test_ten_clients_at_once(address: str, told: Told):

@@ -11,6 +11,7 @@ import pytest
 
 from excite.live import columns
 from excite.web import workers as module
+from excite.web.base import without_folders
 from excite.web.workers import Workers
 
 HEADER = f"""#!{sys.executable}
@@ -96,6 +97,30 @@ def test_workers_that_do_not_start_are_tried_only_so_often(program: Path, tmp_pa
     write(program, f"#!/bin/sh\necho x >> {tmp_path}/starts\nexit 1\n")
     answers("catalogue", "catalogue")
     assert len((tmp_path / "starts").read_text().split()) == module.MAX_FAILURES
+
+
+@pytest.mark.parametrize(
+    ("gib", "num_workers", "limit"), [(64, 2, 6), (16, 2, 4), (16, 4, 2), (4, 4, 2)]
+)
+def test_workers_together_take_half_of_the_memory(
+    gib: int, num_workers: int, limit: int, monkeypatch: pytest.MonkeyPatch
+):
+    sizes = {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": gib * 2**18}
+    monkeypatch.setattr("os.sysconf", sizes.get)
+    assert module._memory(num_workers) == limit * 2**30
+
+
+@pytest.mark.parametrize(
+    ("sentence", "shown"),
+    [
+        ("/tmp/excite-bench-a1/b2/run: no such folder", "run: no such folder"),
+        ("[Errno 2] No such file: '/tmp/x/y.json'", "[Errno 2] No such file: 'y.json'"),
+        ("the rate is 3 rad/s, not 1/2/3 of it", "the rate is 3 rad/s, not 1/2/3 of it"),
+        ("a.csv: see https://example.org/a/b", "a.csv: see https://example.org/a/b"),
+    ],
+)
+def test_sentences_name_files_and_not_their_folders(sentence: str, shown: str):
+    assert without_folders(sentence) == shown
 
 
 @pytest.mark.parametrize("header", ["\x01" * 201, ",".join(f"c{i}" for i in range(501))])

@@ -246,15 +246,19 @@ def _read_mat(path: Path) -> dict[str, np.ndarray | list[str]]:
     reader = _require_matlab(path)
     try:
         names, size = _vectors_in(reader.whosmat(path))
-        if size > _MAX_UNPACKED:
-            raise ValueError(f"{size / 2**20:.0f} MiB unpacked, of at most {_MAX_UNPACKED >> 20}")
-        content = reader.loadmat(path, variable_names=names) if names else {}
+        is_small = size <= _MAX_UNPACKED
+        content = reader.loadmat(path, variable_names=names) if names and is_small else {}
     except NotImplementedError:
         raise ValueError(
             f"{path}: MAT files of version 7.3 are HDF5; save it with -v7 or as CSV"
         ) from None
     except Exception as error:  # a damaged file makes the reader fail in any way
         raise ValueError(f"{path}: not a readable MAT file ({error})") from None
+    if not is_small:
+        raise ValueError(
+            f"{path}: its columns take {size / 2**20:.0f} MiB unpacked, more than "
+            f"{_MAX_UNPACKED >> 20}; save it with fewer of them"
+        )
     return {
         name: np.asarray(value, float).ravel()
         for name, value in content.items()

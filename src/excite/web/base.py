@@ -26,7 +26,13 @@ MAX_SESSIONS = 256
 MAX_KEPT = 8
 """Results, and likewise uploads, that are kept for a browser; what was used last stays."""
 
+_FOLDERS = re.compile(r"(?<![\w.:/])/(?:[^\s/:'\"]+/)+")
 _WORD = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
+
+
+def without_folders(sentence: str) -> str:
+    """A sentence that names files, and not where on this computer they lie."""
+    return _FOLDERS.sub("", sentence)
 
 
 class RefusedError(Exception):

@@ -23,7 +23,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse
 from starlette.routing import Route
 
-from .base import RefusedError, number, whole, word
+from .base import RefusedError, number, whole, without_folders, word
 
 MAX_TRAININGS = 2
 _PATIENCE = 10.0  # seconds for a training to end when it is interrupted
@@ -86,7 +86,8 @@ class Training:
         elif self.state == "stopping":
             self.state = "stopped"
         else:
-            self.state, self.sentence = "failed", (last or ["it ended without a word"])[0]
+            self.state = "failed"
+            self.sentence = without_folders((last or ["it ended without a word"])[0])
 
     def _look(self) -> None:
         for path in self.folder.glob("seeds/*/0/progress.json"):

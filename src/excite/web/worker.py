@@ -1,8 +1,9 @@
-"""A process that computes for the page: `python -m excite.web.worker`.
+"""A process that computes for the page: `python -m excite.web.worker BYTES`.
 
 One line of JSON in is a call, every line out an event of it, by its number. It ends with its
 input, so that no worker outlives the server, and looks for a line between two events: that
-stops the work.
+stops the work. It takes no more data than BYTES: a file that unpacks to more than the
+computer holds is refused, not loaded.
 """
 
 from __future__ import annotations
@@ -18,9 +19,8 @@ from collections.abc import Iterator
 from typing import Any
 
 from ..files import json_ready
+from .base import without_folders
 
-MAX_MEMORY = 6 * 2**30
-"""Bytes of data: a file that unpacks to more than the computer holds is refused, not loaded."""
 _MAX_SENTENCE = 1000  # characters; a file's content may be quoted in it
 
 
@@ -34,7 +34,8 @@ def _answer() -> None:
     with os.fdopen(os.dup(1), "w", encoding="utf-8", errors="replace") as out:
         os.dup2(2, 1)  # whatever a library prints is no event
         live = importlib.import_module("excite.live")
-        resource.setrlimit(resource.RLIMIT_DATA, (MAX_MEMORY, MAX_MEMORY))
+        limit = int(sys.argv[1])
+        resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
         _write(out, {"kind": "ready"})
         for line in sys.stdin.buffer:
             call = json.loads(line)
@@ -67,7 +68,7 @@ def _named(error: Exception) -> str:
 
 
 def _failure(sentence: str) -> dict[str, Any]:
-    sentence = " ".join(sentence.split())
+    sentence = without_folders(" ".join(sentence.split()))
     if len(sentence) > _MAX_SENTENCE:
         sentence = f"{sentence[:_MAX_SENTENCE]}…"
     return {"kind": "failed", "sentence": sentence}

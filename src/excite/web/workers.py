@@ -28,6 +28,7 @@ MAX_WAITING = 64
 """Calls in the queue."""
 MAX_FAILURES = 3
 """Processes that end before they are ready, one after the other, until a lane gives up."""
+_MEMORY = 2 * 2**30, 6 * 2**30  # bytes of a worker: it needs the first, and gets no more
 _LINE = 64 * 2**20  # bytes; a longer event is a defect
 _TIME_LIMIT = 900.0  # seconds a single call may take
 _ONE = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NPROC", "JAX_ENABLE_X64")
@@ -110,7 +111,8 @@ class Workers:
 
     async def _started(self) -> asyncio.subprocess.Process | None:
         """A process that is ready; None where there can be none."""
-        command = sys.executable, "-m", f"{__package__}.worker"
+        limit = str(_memory(self._num_workers))
+        command = sys.executable, "-m", f"{__package__}.worker", limit
         pipe = asyncio.subprocess.PIPE
         try:
             process = await asyncio.create_subprocess_exec(
@@ -180,6 +182,13 @@ async def _pass_on(process: asyncio.subprocess.Process, job: _Job) -> bool:
         job.events.put_nowait(_failure("the answer of the worker cannot be used; it was replaced"))
         return False
     return True
+
+
+def _memory(num_workers: int) -> int:
+    """Bytes a worker may take: all of them together half of what this computer has."""
+    half = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
+    least, most = _MEMORY
+    return max(least, min(most, half // num_workers))
 
 
 def _send(process: asyncio.subprocess.Process, line: str) -> None:
