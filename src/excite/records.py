@@ -255,17 +255,10 @@ def _read_mat(path: Path) -> dict[str, np.ndarray | list[str]]:
     except Exception as error:  # a damaged file makes the reader fail in any way
         raise ValueError(f"{path}: not a readable MAT file ({error})") from None
     if not is_small:
-        raise ValueError(
-            f"{path}: its columns take {size / 2**20:.0f} MiB unpacked, more than "
-            f"{_MAX_UNPACKED >> 20}; save it with fewer of them"
-        )
-    return {
-        name: np.asarray(value, float).ravel()
-        for name, value in content.items()
-        if isinstance(value, np.ndarray)
-        and value.dtype.kind in "fiu"
-        and max(value.shape, default=0) == value.size > 1
-    }
+        sizes = f"{size / 2**20:.0f} MiB unpacked, more than {_MAX_UNPACKED >> 20}"
+        raise ValueError(f"{path}: its columns take {sizes}; save it with fewer of them")
+    vectors = {name: content[name] for name in names if name in content}
+    return {n: np.asarray(v, float).ravel() for n, v in vectors.items() if v.dtype.kind in "fiu"}
 
 
 def _vectors_in(listed: list[tuple[str, tuple[int, ...], str]]) -> tuple[list[str], int]:
