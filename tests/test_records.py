@@ -339,7 +339,7 @@ def test_of_a_mat_file_vectors_of_numbers_are_columns_and_nothing_else(tmp_path:
     vectors = {
         "time": np.arange(3.0),
         "is_on": np.array([True, False, True]),
-        "q": np.int16([1, 2]),
+        "q": np.array([1, 2], np.int16),
     }
     others = {"log": {"x": np.arange(9)}, "note": "text", "one": 1.0, "matrix": np.eye(3)}
     scipy.io.savemat(tmp_path / "r.mat", {**vectors, **others})

@@ -179,10 +179,11 @@ async def _answered(app: ASGIApp, scope: Scope, receive: Receive, send: Send) ->
     except ClientDisconnect:  # nobody waits for an answer
         return
     except Exception:
+        if is_begun:  # the connection has to break
+            raise
         _LOG.exception("a request failed")
-        if not is_begun:
-            sentence = "the server has failed at this request; its terminal says why"
-            await JSONResponse({"sentence": sentence}, 500)(scope, receive, send)
+        sentence = "the server has failed at this request; its terminal says why"
+        await JSONResponse({"sentence": sentence}, 500)(scope, receive, send)
 
 
 def _check_origin(headers: Headers, scope: Scope) -> None:
