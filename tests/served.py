@@ -2,9 +2,11 @@
 
 import contextlib
 import json
+import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,16 +25,25 @@ EXPERIMENT = {
     "others": ["prbs", "aero2"],
     "seconds": 5,
 }
+TMP = Path(tempfile.gettempdir())
 MAX_GAP = 0.2
 """Seconds between two parts of a stream."""
 
 
 @contextlib.contextmanager
-def served(runs: Path, *options: str) -> Iterator[str]:
-    """The address of a page; interrupted afterwards, it has to end cleanly."""
+def served(
+    runs: Path, *options: str, ended_by: int = signal.SIGINT, code: int = 0, scratch: Path = TMP
+) -> Iterator[str]:
+    """The address of a page; a signal ends it afterwards, cleanly.
+
+    Args:
+        code: its exit code then.
+        scratch: the folder of temporary files.
+    """
     words = [sys.executable, "-m", "excite", "serve", "--port", "0", "--json", *options]
-    pipe = subprocess.PIPE
-    with subprocess.Popen([*words, "--runs", str(runs)], stdout=pipe, stderr=pipe) as process:
+    pipe, own = subprocess.PIPE, {**os.environ, "TMPDIR": str(scratch)}
+    words += ["--runs", str(runs)]
+    with subprocess.Popen(words, stdout=pipe, stderr=pipe, env=own) as process:
         try:
             told = b""
             while not told.endswith(b"}\n") and process.stdout:
@@ -40,9 +51,9 @@ def served(runs: Path, *options: str) -> Iterator[str]:
                 assert line, process.stderr and process.stderr.read().decode()
                 told += line
             yield json.loads(told)["address"].rstrip("/")
-            process.send_signal(signal.SIGINT)
+            process.send_signal(ended_by)
             out, err = process.communicate(timeout=20)
-            assert (process.returncode, out, err) == (0, b"", b""), err.decode()
+            assert (process.returncode, out, err) == (code, b"", b""), err.decode()
         finally:
             process.kill()
 
@@ -52,6 +63,7 @@ def browser(address: str) -> Iterator[httpx.Client]:
     """A client that has opened the page, and tells where its requests come from."""
     with httpx.Client(base_url=address, headers={"origin": address}, timeout=120) as client:
         assert client.get("/").status_code == 200
+        assert client.post("/api/session", json={}).json() == {"is_known": True}
         yield client
 
 

@@ -29,10 +29,14 @@ WIDTHS = (360, 1440)
 WATCH = """
 addEventListener("DOMContentLoaded", () => {
   const times = (window.frames_seen = []);
+  const said = (window.sentences_said = []);
   const status = document.querySelector("#experiment .status");
+  const progress = document.querySelector("#experiment .progress");
+  if (!status) return; // another page
+  new MutationObserver(() => said.push(status.textContent)).observe(status, { childList: true });
   new MutationObserver(() => {
-    if (status.textContent.startsWith("Running")) times.push(performance.now());
-  }).observe(status, { childList: true });
+    if (progress.textContent) times.push(performance.now());
+  }).observe(progress, { childList: true });
 });
 """
 
@@ -116,12 +120,15 @@ def test_a_run_from_choosing_to_the_report(address: str, page: Page, tmp_path: P
     # Once more, warm: now nothing is to hold the stream up, nor the first paint.
     gaps, paints = [], []
     for _ in range(3):  # the computer has other tests to run
-        page.evaluate("window.frames_seen.length = 0")
+        page.evaluate("window.frames_seen.length = window.sentences_said.length = 0")
         page.get_by_role("button", name="Run", exact=True).click()
         expect(status(page)).to_have_text(re.compile("^Running"), timeout=WAIT)
         expect(status(page)).to_have_text("Done.", timeout=WAIT)
         times = page.evaluate("window.frames_seen")
         assert len(times) > 25
+        said = page.evaluate("window.sentences_said")  # by a screen reader
+        assert "Running." in said
+        assert len(said) < 8, said
         gaps.append(max(b - a for a, b in itertools.pairwise(times)))
         if gaps[-1] < 1000 * MAX_GAP:
             break
@@ -249,6 +256,32 @@ def test_a_training_is_started_and_stopped(address: str, page: Page):
     require_no_sideways_scroll(page)
 
 
+def test_a_link_in_a_foreign_page_leaves_the_browser_its_own(address: str, page: Page):
+    ready(page, address)
+    [before] = page.context.cookies()
+    link = f"<a href='{address}/'>look</a>"
+    answer: Any = {"content_type": "text/html", "body": link}
+    page.route("http://foreign.example/", lambda route: route.fulfill(**answer))
+    page.goto("http://foreign.example/")
+    page.get_by_role("link").click()
+    expect(page.locator("#experiment .primary")).to_be_enabled(timeout=WAIT)
+    [after] = page.context.cookies()
+    assert after == before
+
+
+def test_a_download_that_is_refused_says_why(address: str, page: Page):
+    page.goto(f"{address}/#runs")
+    page.get_by_role("button", name="a_study").click()
+    refusal: Any = {"status": 429, "json": {"sentence": "4 things are under way"}}
+    page.route("**/report.html*", lambda route: route.fulfill(**refusal))
+    page.locator("#run-view .downloads a").first.click()
+    expect(status(page, "runs")).to_have_text("4 things are under way")
+    expect(status(page, "runs")).to_have_class(re.compile("bad"))
+    with page.expect_download() as waiting:
+        page.locator("#run-view a[href$='table.md']").click()
+    assert waiting.value.suggested_filename == "table.md"
+
+
 def test_a_token_lets_the_browser_in_and_leaves_the_address(chromium: Browser, tmp_path: Path):
     with served(tmp_path, "--token", "a-good-token", "--workers", "1") as where:
         root = where.partition("#")[0].rstrip("/")
@@ -261,6 +294,6 @@ def test_a_token_lets_the_browser_in_and_leaves_the_address(chromium: Browser, t
         stranger.close()
         known = chromium.new_page()
         known.goto(where)
-        expect(known.locator("#experiment")).to_be_visible()
-        assert known.url == f"{root}/"
+        expect(known).to_have_url(f"{root}/")
+        expect(known.locator("#experiment .primary")).to_be_enabled(timeout=WAIT)
         known.close()

@@ -23,7 +23,7 @@ from excite.files import (
     write_json,
 )
 from excite.plant import EMPS, Aero2
-from excite.records import Record, read_record, require_record_path, write_record
+from excite.records import Record, columns_in, read_record, require_record_path, write_record
 
 AERO2, EMPS_D, TWO_MASSES = Aero2.definition, EMPS.definition, TwoMasses.definition
 
@@ -321,6 +321,32 @@ def test_a_file_that_cannot_be_used_is_one_sentence(name, content, fragments, tm
     assert str(path) in sentence
     assert "\n" not in sentence
     assert [f for f in fragments if f not in sentence] == []
+
+
+def test_a_mat_file_that_unpacks_to_very_much_is_not_loaded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    path = tmp_path / "r.mat"
+    columns = {"time": np.zeros(34_000_000, np.uint8)}
+    scipy.io.savemat(path, columns, do_compression=True)
+    assert path.stat().st_size < 50_000
+    monkeypatch.delattr(scipy.io, "loadmat")
+    with pytest.raises(ValueError, match="259 MiB unpacked, more than 256"):
+        columns_in(path)
+
+
+def test_of_a_mat_file_vectors_of_numbers_are_columns_and_nothing_else(tmp_path: Path):
+    vectors = {
+        "time": np.arange(3.0),
+        "is_on": np.array([True, False, True]),
+        "q": np.array([1, 2], np.int16),
+    }
+    others = {"log": {"x": np.arange(9)}, "note": "text", "one": 1.0, "matrix": np.eye(3)}
+    scipy.io.savemat(tmp_path / "r.mat", {**vectors, **others})
+    found = columns_in(tmp_path / "r.mat")
+    assert found.keys() == vectors.keys()
+    for name, values in vectors.items():
+        np.testing.assert_array_equal(np.asarray(found[name], float), values)
 
 
 @pytest.mark.parametrize("name", ["nowhere.csv", "nowhere.mat", "folder.csv"])

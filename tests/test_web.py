@@ -1,10 +1,13 @@
 """The server of the bench page: its numbers, its limits, and who may ask for what."""
 
 import asyncio
+import contextlib
 import csv
 import json
 import os
 import pickle
+import re
+import signal
 import socket
 import subprocess
 import sys
@@ -14,17 +17,24 @@ from pathlib import Path
 from typing import Any
 
 import httpx2 as httpx
+import numpy as np
 import pytest
+import scipy.io
 from served import EXPERIMENT, MAX_GAP, Told, browser, served, streamed
 from starlette.testclient import TestClient
 
 from excite.files import write_json
+from excite.report import report_html
 from excite.web import Settings, application
-from excite.web.base import MAX_JOBS, MAX_UPLOAD, RefusedError, Session
+from excite.web.base import MAX_JOBS, MAX_SESSIONS, MAX_UPLOAD, RefusedError, Session, Sessions
 from excite.web.runs import found
-from excite.web.security import MAX_TRIES
+from excite.web.security import MAX_TRIES, _source
+from excite.web.trainings import Training
 
 HERE = "http://127.0.0.1:8000"
+TRAINING = {
+    "plant": "aero2", "name": "mine", "objective": "D", "updates": 1, "steps": 60, "spread": 0.3,
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -43,8 +53,14 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def address(runs: Path) -> Iterator[str]:
-    with served(runs, "--workers", "2") as where:
+def temporary(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the server keeps what it keeps for browsers."""
+    return tmp_path_factory.mktemp("scratch")
+
+
+@pytest.fixture(scope="module")
+def address(runs: Path, temporary: Path) -> Iterator[str]:
+    with served(runs, "--workers", "2", scratch=temporary) as where:
         yield where
 
 
@@ -135,7 +151,7 @@ def test_a_stream_has_no_gaps(told: Told):
     assert told.gap < MAX_GAP
 
 
-def test_an_uploaded_file_is_identified_as_at_the_command_line(client, told: Told):
+def test_an_uploaded_file_is_identified_as_at_the_command_line(client, told: Told, temporary: Path):
     text = told.of("record.csv")[0]["text"].replace("pitch", "theta")
     uploaded = client.post("/api/uploads?name=my log.csv", content=text).json()
     assert uploaded["columns"] == {"time": 501, "voltage": 501, "theta": 501}
@@ -147,7 +163,34 @@ def test_an_uploaded_file_is_identified_as_at_the_command_line(client, told: Tol
     assert event["identification"]["files"] == ["my_log.csv"]
     report = client.get(f"/api/results/{event['result']}/report.html")
     assert "attachment" in report.headers["content-disposition"]
-    assert "J_p" in report.text
+    estimate = client.get(f"/api/results/{event['result']}/estimate.json").content
+    files = temporary.glob("*/*/*/run/estimate.json")
+    [run] = [file.parent for file in files if file.read_bytes() == estimate]
+    assert report.text == report_html([run])
+
+
+def test_an_uploaded_mat_file_is_identified(client, told: Told, tmp_path: Path):
+    rows = list(csv.DictReader(told.of("record.csv")[0]["text"].splitlines()))
+    path = tmp_path / "log.mat"
+    table = {name: [float(row[name]) for row in rows] for name in rows[0]}
+    scipy.io.savemat(path, {**table, "notes": "text"}, do_compression=True)
+    uploaded = client.post("/api/uploads?name=log.mat", content=path.read_bytes()).json()
+    assert uploaded["columns"] == dict.fromkeys(("time", "voltage", "pitch"), 501)
+    asked = {"upload": uploaded["upload"], "plant": "aero2", "estimator": "nls"}
+    asked |= {"columns": {}, "scales": {}, "initial_state": "known"}
+    [event] = streamed(client, "/api/identifications", asked).of("identified")
+    own = told.of("result")[0]["identification"]
+    assert event["identification"]["params"] == own["params"]
+
+
+def test_a_mat_file_that_unpacks_to_very_much_is_refused(client, told: Told, tmp_path: Path):
+    del told
+    bomb = {"time": np.zeros(150_000_000, np.uint8)}
+    scipy.io.savemat(tmp_path / "a.mat", bomb, do_compression=True)
+    content = (tmp_path / "a.mat").read_bytes()
+    answer = client.post("/api/uploads?name=a.mat", content=content)
+    assert answer.status_code == 422
+    assert "unpacked" in answer.json()["sentence"]
 
 
 def test_ten_clients_at_once(address: str, told: Told):
@@ -171,7 +214,7 @@ def test_ten_clients_at_once(address: str, told: Told):
             for _ in range(10)
         ]
         try:
-            await asyncio.gather(*(c.get("/") for c in clients))
+            await asyncio.gather(*(c.post("/api/session", json={}) for c in clients))
             return await asyncio.gather(*(one(c, seed) for seed, c in enumerate(clients)))
         finally:
             await asyncio.gather(*(c.aclose() for c in clients))
@@ -251,6 +294,54 @@ def test_a_browser_that_leaves_takes_its_work_along(address: str, told: Told):
             time.sleep(0.2)
 
 
+def trainings_in(folder: Path) -> set[int]:
+    """Processes of `excite train` into this folder, with those that they have started."""
+    found = set()
+    for place in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):
+            if f"--out\0{folder}".encode() in (place / "cmdline").read_bytes():
+                found.add(int(place.name))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("number", "code"),
+    [
+        (signal.SIGINT, 0),
+        (signal.SIGTERM, 143),
+        (signal.SIGHUP, 129),
+        (signal.SIGKILL, -9),
+    ],
+)
+def test_nothing_outlives_the_server(number: int, code: int, tmp_path: Path):
+    """Neither a training, nor a worker, nor what was uploaded."""
+    runs, scratch = tmp_path / "runs", tmp_path / "scratch"
+    runs.mkdir()
+    scratch.mkdir()
+    asked = {**TRAINING, "updates": 100_000}
+    with served(runs, "--workers", "1", ended_by=number, code=code, scratch=scratch) as where:
+        with browser(where) as opened:
+            assert opened.post("/api/uploads?name=a.csv", content="time,x\n0,1\n1,2\n").is_success
+            assert opened.post("/api/trainings", json=asked).is_success
+            assert list(scratch.glob("excite-bench-*/*/*/a.csv"))
+        workers = processes_of(where)
+        assert workers
+        assert trainings_in(runs)
+    assert number == signal.SIGKILL or not list(scratch.glob("excite-bench-*"))
+    deadline = time.monotonic() + 30
+    while trainings_in(runs) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not trainings_in(runs)
+    assert not [pid for pid in workers if is_running(pid)]
+
+
+def is_running(process: int) -> bool:
+    try:
+        return "excite.web.worker" in Path(f"/proc/{process}/cmdline").read_text()
+    except OSError:
+        return False
+
+
 # ------------------------------------------------------------------------------ bad files
 
 
@@ -275,6 +366,18 @@ def test_a_bad_file_is_one_sentence_and_nothing_is_run(name: str, client, told: 
     assert answer.status_code in (400, 415, 422)
     assert sentence in answer.json()["sentence"]
     assert "/tmp" not in answer.text
+
+
+@pytest.mark.parametrize("header", [26 * 2**20 * "\x01", 13 * 2**20 * "\x01,"])
+def test_a_file_of_names_alone_leaves_the_others_alone(header: str, client, told: Told):
+    """As JSON it is six times longer, more than a worker may say at once."""
+    del told
+    answer = client.post("/api/uploads?name=a.csv", content=f"{header}\n".encode())
+    assert answer.status_code == 422
+    assert len(answer.json()["sentence"]) < 1100
+    for _ in range(3):  # one worker and the other
+        again = client.post("/api/uploads?name=a.csv", content="time,x\n0,1\n1,2\n")
+        assert again.json()["columns"] == {"time": 2, "x": 2}
 
 
 def test_a_script_in_a_column_stays_text(client, told: Told):
@@ -305,20 +408,47 @@ def guarded(runs: Path, scratch: Path, **settings: Any) -> TestClient:
 @pytest.fixture
 def page(runs: Path, scratch: Path) -> TestClient:
     opened = guarded(runs, scratch)
-    assert opened.get("/").status_code == 200
+    assert opened.post("/api/session", json={}).json() == {"is_known": True}
     return opened
 
 
-def test_the_page_comes_with_its_headers_and_a_secret(page: TestClient):
-    answer = page.get("/", headers={"cookie": ""})
+def test_the_page_comes_with_its_headers_and_its_door_with_a_secret(page: TestClient):
+    answer = page.get("/")
     assert "default-src 'self'" in answer.headers["content-security-policy"]
     assert answer.headers["x-content-type-options"] == "nosniff"
-    cookie = answer.headers["set-cookie"]
+    cookie = page.post("/api/session", json={}, headers={"cookie": ""}).headers["set-cookie"]
     assert cookie.startswith("excite_8000=")
     assert "HttpOnly; SameSite=Strict" in cookie
     text = answer.text + page.get("/static/bench.js").text
     assert "http://" not in text.replace("http://www.w3.org", "")
     assert "https://" not in text
+
+
+def contrast(first: str, second: str) -> float:
+    """Of two colours, as the Web Content Accessibility Guidelines count it."""
+
+    def luminance(colour: str) -> float:
+        digits = colour if len(colour) == 6 else "".join(2 * digit for digit in colour)
+        parts = [int(digits[i : i + 2], 16) / 255 for i in (0, 2, 4)]
+        linear = [p / 12.92 if p <= 0.04045 else ((p + 0.055) / 1.055) ** 2.4 for p in parts]
+        return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+    low, high = sorted((luminance(first), luminance(second)))
+    return (high + 0.05) / (low + 0.05)
+
+
+def test_texts_and_borders_can_be_seen(page: TestClient):
+    style = page.get("/static/bench.css").text
+    light, dark = re.findall(r":root \{(.*?)\}", style, re.DOTALL)
+    assert contrast("000", "ffffff") == pytest.approx(21)
+    for scheme in (light, dark):
+        colour = dict(re.findall(r"--([a-z]+): #([0-9a-f]+);", scheme))
+        for text in ("ink", "soft", "warning", "critical", "good", "accent"):
+            assert contrast(colour[text], colour["card"]) >= 4.5, text
+        for behind in ("field", "card", "paper"):
+            assert contrast(colour["edge"], colour[behind]) >= 3
+    for rule in ("input, select { width", "button { padding"):
+        assert "1px solid var(--edge)" in style.partition(rule)[2].partition("}")[0]
 
 
 @pytest.mark.parametrize(
@@ -423,12 +553,29 @@ def test_the_run_folder_is_listed_as_it_is(page: TestClient, runs: Path):
         {"params": {"J_p": "0.1"}},
         {"noise": {str(i): 1 for i in range(40)}},
         {"seed": -1},
+        {"amplitude": 10**400},
+        {"params": {"\ud800": "x"}},
+        {"params": {"J_p": -(10**400)}},
     ],
 )
 def test_a_request_is_names_and_numbers_and_nothing_else(change: dict, page: TestClient):
-    answer = page.post("/api/experiments", json={**EXPERIMENT, **change})
+    answer = page.post("/api/experiments", content=json.dumps({**EXPERIMENT, **change}))
     assert answer.status_code == 400
     assert answer.json()["sentence"]
+
+
+def test_a_defect_is_one_sentence(page: TestClient, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("excite.web.runs.found", lambda folder: 1 / 0)
+    answer = page.get("/api/runs")
+    assert answer.status_code == 500
+    assert "its terminal says why" in answer.json()["sentence"]
+    assert answer.headers["x-content-type-options"] == "nosniff"
+
+
+def test_half_a_character_is_no_token(runs: Path, scratch: Path):
+    client = guarded(runs, scratch, token="right-token")
+    answer = client.post("/api/session", content=b'{"token": "\\ud800"}')
+    assert (answer.status_code, answer.json()["sentence"]) == (400, "the request is no JSON object")
 
 
 @pytest.mark.parametrize("content", [b"", b"[1]", b"{", b"\xff", b"[" * 10000, b"NaN"])
@@ -459,15 +606,13 @@ def test_what_is_too_large_is_refused_before_it_is_read(page: TestClient, scratc
     ],
 )  # fmt: skip
 def test_a_training_takes_names_and_numbers_alone(change: dict, page: TestClient, runs: Path):
-    asked = {"plant": "aero2", "name": "mine", "objective": "D", "updates": 1, "steps": 60}
-    answer = page.post("/api/trainings", json={**asked, "spread": 0.3, **change})
+    answer = page.post("/api/trainings", json={**TRAINING, **change})
     assert answer.status_code == 400
     assert sorted(p.name for p in runs.iterdir()) == ["elsewhere", "some"]
 
 
 def test_a_training_never_goes_where_something_is(page: TestClient):
-    asked = {"plant": "aero2", "name": "some", "objective": "D", "updates": 1, "steps": 60}
-    assert page.post("/api/trainings", json={**asked, "spread": 0.3}).status_code == 409
+    assert page.post("/api/trainings", json={**TRAINING, "name": "some"}).status_code == 409
 
 
 def test_a_browser_cannot_see_or_stop_what_is_anothers(address: str, client, told: Told):
@@ -482,7 +627,23 @@ def test_a_browser_cannot_see_or_stop_what_is_anothers(address: str, client, tol
             assert other.delete(f"/api/jobs/{job}").status_code == 404
             kinds = [json.loads(line)["kind"] for line in lines]
         assert kinds[-1] == "end"
+
+
+def test_a_browser_cannot_see_or_stop_anothers_training(tmp_path: Path):
+    asked = {**TRAINING, "updates": 100_000}
+    with (
+        served(tmp_path, "--workers", "1") as where,
+        browser(where) as own,
+        browser(where) as other,
+    ):
+        name = own.post("/api/trainings", json=asked).json()["name"]
         assert other.get("/api/trainings").json() == {"trainings": []}
+        assert other.delete(f"/api/trainings/{name}").status_code == 404
+        [training] = own.get("/api/trainings").json()["trainings"]
+        assert training["state"] in ("starting", "training")
+        assert trainings_in(tmp_path)
+        assert own.delete(f"/api/trainings/{name}").json()["state"] == "stopped"
+        assert not trainings_in(tmp_path)
 
 
 def test_a_browser_has_so_many_things_under_way(tmp_path: Path):
@@ -494,12 +655,37 @@ def test_a_browser_has_so_many_things_under_way(tmp_path: Path):
     session.begin()
 
 
-def test_a_picture_in_a_foreign_page_makes_no_session(runs: Path, scratch: Path):
+def test_who_only_comes_to_the_page_gets_no_secret(runs: Path, scratch: Path):
+    """A link in a foreign page, which comes without the cookie, would take the old one away."""
     stranger = guarded(runs, scratch)
-    for place in ("image", "iframe", "empty"):
-        answer = stranger.get("/", headers={"sec-fetch-dest": place})
-        assert answer.status_code == 403
+    for headers in ({}, {"sec-fetch-site": "cross-site"}, {"sec-fetch-dest": "image"}):
+        answer = stranger.get("/", headers=headers)
+        assert answer.status_code == 200
         assert "set-cookie" not in answer.headers
+    assert not list(scratch.iterdir())
+
+
+def test_who_has_a_secret_keeps_it(page: TestClient, scratch: Path):
+    answer = page.post("/api/session", json={})
+    assert answer.json() == {"is_known": True}
+    assert "set-cookie" not in answer.headers
+    assert len(list(scratch.iterdir())) == 1
+
+
+def test_what_computes_is_not_idle(tmp_path: Path):
+    sessions = Sessions(tmp_path)
+    first, second, *_ = [sessions.new() for _ in range(MAX_SESSIONS)]
+    busy, done = sessions.get(first), sessions.get(second)
+    assert busy is not None
+    assert done is not None
+    busy.trainings["x"], done.trainings["x"] = (Training("x", tmp_path, []) for _ in range(2))
+    done.trainings["x"].state = "finished"
+    for session in (sessions.get(key) for key in list(sessions._all)[2:]):
+        assert session is not None
+        session.seen = time.monotonic() + 1
+    sessions.new()
+    assert sessions.get(first) is busy
+    assert sessions.get(second) is None
 
 
 # -------------------------------------------------------------------------------- the token
@@ -508,7 +694,11 @@ def test_a_picture_in_a_foreign_page_makes_no_session(runs: Path, scratch: Path)
 def test_a_token_is_needed_where_there_is_one(runs: Path, scratch: Path):
     client = guarded(runs, scratch, token="right-token")
     assert client.get("/").status_code == 200  # the page itself says nothing
-    assert client.get("/api/session").json() == {"is_known": False}
+    for _ in range(MAX_SESSIONS + 1):
+        answer = client.post("/api/session", json={})
+        assert answer.json() == {"is_known": False}
+        assert "set-cookie" not in answer.headers
+    assert not list(scratch.iterdir()), "nothing is kept for strangers"
     for path in ("/api/runs", "/api/catalogue", "/api/run?name=some/study", "/api/trainings"):
         assert client.get(path).status_code == 401
     assert client.post("/api/experiments", json=EXPERIMENT).status_code == 401
@@ -518,12 +708,35 @@ def test_a_token_is_needed_where_there_is_one(runs: Path, scratch: Path):
 
 def test_a_token_cannot_be_guessed(runs: Path, scratch: Path):
     client = guarded(runs, scratch, token="right-token")
-    client.get("/")
     for guess in ["", "right-toke", None, 7, ["right-token"], "x" * 60, *"abcdefg"][:MAX_TRIES]:
         assert client.post("/api/session", json={"token": guess}).status_code == 401
     answer = client.post("/api/session", json={"token": "right-token"})
     assert answer.status_code == 429, "the right one, too, has to wait then"
     assert client.get("/api/runs").status_code == 401
+    other = TestClient(client.app, HERE, client=("10.0.0.9", 1), headers={"origin": HERE})
+    answer = other.post("/api/session", json={"token": "right-token"})
+    assert answer.status_code == 200, "who comes from elsewhere does not"
+
+
+@pytest.mark.parametrize(
+    ("address", "source"),
+    [
+        ("10.0.0.9", "10.0.0.9/32"),
+        ("2001:db8:1:2:3::4", "2001:db8:1:2::/64"),
+        ("testclient", "testclient"),
+    ],
+)
+def test_tries_are_counted_by_address(address: str, source: str):
+    assert _source({"client": (address, 1)}) == source
+
+
+def test_its_own_names_are_looked_up_once(runs, scratch, monkeypatch: pytest.MonkeyPatch):
+    asked = []
+    monkeypatch.setattr(socket, "getfqdn", lambda: asked.append(1) or "Its.Own.Name")
+    client = guarded(runs, scratch, host="0.0.0.0", token="right-token")
+    for _ in range(3):
+        assert client.get("/", headers={"host": "its.own.name:8000"}).status_code == 200
+    assert len(asked) == 1
 
 
 def test_every_address_of_this_computer_is_answered_where_all_are_bound(runs, scratch):

@@ -52,6 +52,7 @@ Event = dict[str, Any]
 NUM_ESTIMATES = 20
 _FIRST = 40  # samples before the first estimate, the shortest horizon of the estimator
 _MAX_POINTS = 2000  # more cannot be told apart on a screen
+_MAX_COLUMNS, _MAX_NAME = 500, 200  # of an uploaded file, and characters of a column's name
 
 
 # ------------------------------------------------------------------------- what there is
@@ -305,6 +306,11 @@ def columns(folder: str, name: str) -> Iterator[Event]:
         table = columns_in(Path(name))
     if not table:
         raise ValueError(f"{name} has no column of numbers")
+    if len(table) > _MAX_COLUMNS or max(map(len, table)) > _MAX_NAME:
+        raise ValueError(
+            f"{name} has {len(table)} columns, the longest name has {max(map(len, table))} "
+            f"characters; at most {_MAX_COLUMNS} columns of {_MAX_NAME} characters are taken"
+        )
     yield {"kind": "columns", "columns": {word: len(values) for word, values in table.items()}}
 
 

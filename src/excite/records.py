@@ -13,6 +13,7 @@ import io
 import json
 import math
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -33,6 +34,8 @@ _UNEVEN = 0.05  # of the sampling time: more than printing it with few digits ex
 _TIMES_LIMIT = 2.0  # inputs beyond this many times the limits are in another unit
 _TIMES_DT = 50.0  # likewise sampling times this many times the plant's
 _TIMES_SCALE = 10.0  # likewise outputs beyond this many times their typical size
+_MAX_UNPACKED = 256 * 2**20  # bytes of all columns of a MAT file, which is compressed
+_MAT_NUMBERS = re.compile(r"double|single|u?int(8|16|32|64)|logical")
 
 
 @dataclass(frozen=True)
@@ -242,20 +245,30 @@ def _require_matlab(path: Path) -> Any:
 def _read_mat(path: Path) -> dict[str, np.ndarray | list[str]]:
     reader = _require_matlab(path)
     try:
-        content = reader.loadmat(path)
+        names, size = _vectors_in(reader.whosmat(path))
+        is_small = size <= _MAX_UNPACKED
+        content = reader.loadmat(path, variable_names=names) if names and is_small else {}
     except NotImplementedError:
         raise ValueError(
             f"{path}: MAT files of version 7.3 are HDF5; save it with -v7 or as CSV"
         ) from None
     except Exception as error:  # a damaged file makes the reader fail in any way
         raise ValueError(f"{path}: not a readable MAT file ({error})") from None
-    return {
-        name: np.asarray(value, float).ravel()
-        for name, value in content.items()
-        if isinstance(value, np.ndarray)
-        and value.dtype.kind in "fiu"
-        and max(value.shape, default=0) == value.size > 1
+    if not is_small:
+        sizes = f"{size / 2**20:.0f} MiB unpacked, more than {_MAX_UNPACKED >> 20}"
+        raise ValueError(f"{path}: its columns take {sizes}; save it with fewer of them")
+    vectors = {name: content[name] for name in names if name in content}
+    return {n: np.asarray(v, float).ravel() for n, v in vectors.items() if v.dtype.kind in "fiu"}
+
+
+def _vectors_in(listed: list[tuple[str, tuple[int, ...], str]]) -> tuple[list[str], int]:
+    """Names of all vectors of numbers in a MAT file, and their bytes; nothing else is loaded."""
+    vectors = {
+        name: math.prod(shape)
+        for name, shape, kind in listed
+        if _MAT_NUMBERS.fullmatch(kind) and max(shape, default=0) == math.prod(shape) > 1
     }
+    return list(vectors), 8 * sum(vectors.values())
 
 
 def _column(

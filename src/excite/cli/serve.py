@@ -77,7 +77,9 @@ def serve(
         told = {"address": address, "token": token, "runs": str(runs)}
         num_workers = workers or min(4, len(os.sched_getaffinity(0)))
         settings = Settings(runs.absolute(), host, token, num_workers, cache_folder())
-        serve_here(settings, listening, lambda: _tell(told, as_json))
+        code = serve_here(settings, listening, lambda: _tell(told, as_json))
+    if code:  # a signal: nobody may be there to read
+        click.get_current_context().exit(code)
     if not as_json:
         click.echo("stopped")
 

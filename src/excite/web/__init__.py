@@ -11,9 +11,10 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import signal
 import socket
 import tempfile
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Generator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -75,7 +76,7 @@ def application(
 
     routes = [
         Route("/", lambda request: FileResponse(_STATIC / "index.html")),
-        Route("/api/session", _session(settings), methods=["GET", "POST"]),
+        Route("/api/session", _session, methods=["POST"]),
         Route("/api/catalogue", catalogue),
         *stream_routes(workers, _body),
         *place_routes(workers, partial(run_of, settings.runs)),
@@ -90,16 +91,14 @@ def application(
     )
 
 
-def _session(settings: Settings) -> Callable[[Request], Any]:
-    """Whether this browser may come in; POST shows the token."""
-
-    async def answer(request: Request) -> JSONResponse:
-        if request.method == "POST":
-            request.state.show_token((await _body(request)).get("token"))
-        is_known = settings.token is None or request.state.session.is_known
-        return JSONResponse({"is_known": is_known})
-
-    return answer
+async def _session(request: Request) -> JSONResponse:
+    """Whether this browser may come in; lets it in where it shows the token, or none is needed."""
+    asked = await _body(request)
+    if request.state.session is not None:  # it stays the one it is
+        return JSONResponse({"is_known": True})
+    cookie = request.state.enter(asked)
+    headers = {} if cookie is None else {"set-cookie": cookie}
+    return JSONResponse({"is_known": cookie is not None}, headers=headers)
 
 
 async def _body(request: Request) -> dict[str, Any]:
@@ -111,6 +110,7 @@ async def _body(request: Request) -> dict[str, Any]:
             raise RefusedError(413, "the request is too large")
     try:
         asked = json.loads(bytes(content))
+        json.dumps(asked, ensure_ascii=False).encode()  # half a character is no text
     except (ValueError, RecursionError):
         asked = None
     if not isinstance(asked, dict):
@@ -124,7 +124,20 @@ def _refused(request: Request, error: RefusedError) -> JSONResponse:
 
 
 class _Server(uvicorn.Server):
-    """A server whose workers end first, so that no request waits for them."""
+    """A server that a signal ends; its workers end first, so that no request waits for them."""
+
+    def __init__(self, config: uvicorn.Config, came: list[int]) -> None:
+        super().__init__(config)
+        self._came = came
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Generator[None]:
+        """Leaves the signals to `serve`, which has to clean up after them."""
+        yield
+
+    async def on_tick(self, counter: int) -> bool:
+        """Whether it is to end."""
+        return await super().on_tick(counter) or bool(self._came)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Ends what computes, then what serves."""
@@ -133,9 +146,27 @@ class _Server(uvicorn.Server):
         await super().shutdown(sockets)
 
 
-def serve(settings: Settings, listening: socket.socket, ready: Callable[[], None]) -> None:
-    """Serves until interrupted, on a socket that is bound already; calls `ready` at its start."""
-    with tempfile.TemporaryDirectory(prefix="excite-bench-", ignore_cleanup_errors=True) as scratch:
+@contextlib.contextmanager
+def _signals() -> Generator[list[int]]:
+    """Ctrl-C, a closed terminal and a polite kill, as they come; none of them ends anything."""
+    came = list[int]()
+    kinds = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = {kind: signal.signal(kind, lambda number, _: came.append(number)) for kind in kinds}
+    try:
+        yield came
+    finally:
+        for kind, handler in before.items():
+            signal.signal(kind, handler)
+
+
+def serve(settings: Settings, listening: socket.socket, ready: Callable[[], None]) -> int:
+    """Serves until a signal comes, on a socket that is bound already; calls `ready` at its start.
+
+    Returns:
+        The exit code: 0 after Ctrl-C, which is how a page is ended, else that of the signal.
+    """
+    folder = partial(tempfile.TemporaryDirectory, ignore_cleanup_errors=True)
+    with _signals() as came, folder(prefix="excite-bench-") as scratch:
         config = uvicorn.Config(
             application(settings, Path(scratch), ready),
             log_level="error",
@@ -143,5 +174,6 @@ def serve(settings: Settings, listening: socket.socket, ready: Callable[[], None
             proxy_headers=False,
             timeout_graceful_shutdown=1,
         )
-        with contextlib.suppress(KeyboardInterrupt):
-            _Server(config).run(sockets=[listening])
+        _Server(config, came).run(sockets=[listening])
+    first = (came or [signal.SIGINT])[0]
+    return 0 if first == signal.SIGINT else 128 + first

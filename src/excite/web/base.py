@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
 import secrets
 import shutil
 import tempfile
 import time
-from collections.abc import AsyncGenerator, Mapping
+from collections.abc import AsyncGenerator, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -23,9 +24,15 @@ MAX_JOBS = 4
 """Things a browser may have under way at once."""
 MAX_SESSIONS = 256
 MAX_KEPT = 8
-"""Results and uploads that are kept for a browser; older ones give way."""
+"""Results, and likewise uploads, that are kept for a browser; what was used last stays."""
 
+_FOLDERS = re.compile(r"(?<![\w.:/])/(?:[^\s/:'\"]+/)+")
 _WORD = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
+
+
+def without_folders(sentence: str) -> str:
+    """A sentence that names files, and not where on this computer they lie."""
+    return _FOLDERS.sub("", sentence)
 
 
 class RefusedError(Exception):
@@ -67,42 +74,78 @@ class Pool(Protocol):
 
 
 @dataclass
-class Session:
-    """One browser: what it may see, and nobody else.
+class Place:
+    """A folder for an upload or a result.
 
     Attributes:
-        is_known: whether it has shown the token, where there is one.
+        kind: "upload" or "result"; each gives way to its own kind alone.
+        num_users: how many things under way need it now.
+        is_done: whether it holds what it was made for.
+    """
+
+    folder: Path
+    kind: str
+    num_users: int = 0
+    is_done: bool = False
+
+
+@dataclass
+class Session:
+    """One browser that may come in: what it may see, and nobody else.
+
+    Attributes:
         folder: its uploads and results.
         stops: how to stop what is under way, by its name; None for what is short.
-        kept: folders of results and uploads by name, oldest first.
+        kept: results and uploads by name, the one used last at the end.
         trainings: trainings it has started, by name.
     """
 
     folder: Path
-    is_known: bool = False
     stops: dict[str, Any] = field(default_factory=dict)
-    kept: dict[str, Path] = field(default_factory=dict)
+    kept: dict[str, Place] = field(default_factory=dict)
     trainings: dict[str, Any] = field(default_factory=dict)
     seen: float = field(default_factory=time.monotonic)
 
-    def new_place(self) -> tuple[str, Path]:
-        """A name that cannot be guessed and an empty folder for it."""
-        while len(self.kept) >= MAX_KEPT:
-            oldest = next(iter(self.kept))
-            shutil.rmtree(self.kept.pop(oldest), ignore_errors=True)
-        name = secrets.token_urlsafe(12)
-        self.kept[name] = Path(tempfile.mkdtemp(dir=self.folder))
-        return name, self.kept[name]
+    @contextlib.contextmanager
+    def making(self, kind: str) -> Iterator[tuple[str, Place]]:
+        """A name that cannot be guessed, and its place, which goes where it is not done."""
+        name, folder = secrets.token_urlsafe(12), Path(tempfile.mkdtemp(dir=self.folder))
+        place = self.kept[name] = Place(folder, kind)
+        self._give_way(kind, name)
+        try:
+            with self.using(name):
+                yield name, place
+        finally:
+            if not place.is_done:
+                self._forget(name)
 
-    def place(self, name: str) -> Path:
-        """The folder of a result or upload of this browser."""
-        if name not in self.kept:
+    @contextlib.contextmanager
+    def using(self, name: str) -> Iterator[Path]:
+        """The folder of a result or upload of this browser, which stays for that long."""
+        place = self.kept.pop(name, None)
+        if place is None:
             raise RefusedError(404, "there is no such result in this browser; run it again")
-        return self.kept[name]
+        self.kept[name] = place  # the last one now
+        place.num_users += 1
+        try:
+            yield place.folder
+        finally:
+            place.num_users -= 1
 
-    def forget(self, name: str) -> None:
-        """Removes a result or upload."""
-        shutil.rmtree(self.kept.pop(name, self.folder / "nothing"), ignore_errors=True)
+    def _give_way(self, kind: str, new: str) -> None:
+        """Removes what was not used for longest, and is not in use, where there is too much."""
+        same = [name for name, place in self.kept.items() if place.kind == kind]
+        free = [name for name in same if not self.kept[name].num_users and name != new]
+        for name in free[: max(0, len(same) - MAX_KEPT)]:
+            self._forget(name)
+
+    def _forget(self, name: str) -> None:
+        shutil.rmtree(self.kept.pop(name).folder, ignore_errors=True)
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether nothing of it is under way."""
+        return not (self.stops or any(t.is_running for t in self.trainings.values()))
 
     def begin(self, stop: Any = None) -> str:
         """The name of one more thing that is under way, until `end`.
@@ -134,9 +177,9 @@ class Sessions:
             session.seen = time.monotonic()
         return session
 
-    def new(self) -> tuple[str, Session]:
-        """A session and its secret; where there are too many, the idlest gives way."""
-        idle = [s for s in self._all if not (self._all[s].stops or self._all[s].trainings)]
+    def new(self) -> str:
+        """The secret of a new session; where there are too many, the idlest gives way."""
+        idle = [secret for secret, session in self._all.items() if session.is_idle]
         if len(self._all) >= MAX_SESSIONS:
             if not idle:
                 raise RefusedError(503, "too many browsers are working here")
@@ -144,7 +187,7 @@ class Sessions:
             shutil.rmtree(self._all.pop(gone).folder, ignore_errors=True)
         secret = secrets.token_urlsafe(32)
         self._all[secret] = Session(Path(tempfile.mkdtemp(dir=self._folder)))
-        return secret, self._all[secret]
+        return secret
 
 
 # ------------------------------------------------------------- what a browser may ask for
@@ -161,11 +204,18 @@ def word(asked: Mapping[str, Any], key: str) -> str:
 def number(asked: Mapping[str, Any], key: str, lower: float, upper: float) -> float:
     """A finite number of a range."""
     value = asked.get(key)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, int | float) or not _is_finite(value):
         raise RefusedError(400, f"{key}: a number is needed")
     if not lower <= value <= upper:
         raise RefusedError(400, f"{key} must lie between {lower:g} and {upper:g}: got {value:g}")
     return float(value)
+
+
+def _is_finite(value: float) -> bool:
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # a whole number of very many digits
+        return False
 
 
 def whole(asked: Mapping[str, Any], key: str, lower: int, upper: int) -> int:

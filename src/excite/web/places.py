@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tempfile
 from collections.abc import Callable
 from contextlib import aclosing
 from pathlib import Path
@@ -32,43 +33,46 @@ def routes(pool: Pool, run_of: Callable[[Request], Path]) -> list[Route]:
         session: Session = request.state.session
         file = _file_name(request.query_params.get("name", ""))
         job = session.begin()
-        name, place = session.new_place()
         try:
-            (place / file).write_bytes(await _content(request))
-            told = await _last(pool, "columns", {"folder": str(place), "name": file}, True)
-        except BaseException:
-            session.forget(name)
-            raise
+            with session.making("upload") as (name, place):
+                (place.folder / file).write_bytes(await _content(request))
+                wanted = {"folder": str(place.folder), "name": file}
+                told = await _last(pool, "columns", wanted, True)
+                place.is_done = True
         finally:
             session.end(job)
         return JSONResponse({"upload": name, "file": file, "columns": told["columns"]})
 
     def file(request: Request) -> FileResponse:
-        place, name = request.state.session.place(request.path_params["name"]), request.path_params
-        path = place / "run" / name["file"]
-        if name["file"] not in _DOWNLOADS or not path.is_file():
+        asked = request.path_params
+        with request.state.session.using(asked["name"]) as folder:
+            path = folder / "run" / asked["file"]
+        if asked["file"] not in _DOWNLOADS or not path.is_file():
             raise RefusedError(404, "this result has no such file")
         return FileResponse(path, media_type=_DOWNLOADS[path.name], filename=path.name)
 
     async def report(request: Request) -> Response:
         session: Session = request.state.session
-        run = session.place(request.path_params["name"]) / "run"
-        if not run.is_dir():
-            raise RefusedError(404, "there is nothing to report of yet")
-        return await _reported(session, run)
+        with session.using(request.path_params["name"]) as folder:
+            if not (folder / "run").is_dir():
+                raise RefusedError(404, "there is nothing to report of yet")
+            return await _reported(session, folder / "run")
 
     async def run_report(request: Request) -> Response:
-        return await _reported(request.state.session, run_of(request))
+        run = run_of(request)
+        if any(path.is_symlink() for path in run.rglob("*")):
+            raise RefusedError(422, "this run holds links, which the page does not follow")
+        return await _reported(request.state.session, run)
 
     async def _reported(session: Session, run: Path) -> Response:
         job = session.begin()
-        name, place = session.new_place()
         try:
-            out = str(place / "report.html")
-            await _last(pool, "reported", {"folders": [str(run)], "out": out}, False)
-            content = (place / "report.html").read_bytes()
+            with tempfile.TemporaryDirectory(dir=session.folder) as folder:
+                out = Path(folder) / "report.html"
+                wanted = {"folders": [str(run)], "out": str(out)}
+                await _last(pool, "reported", wanted, False)
+                content = out.read_bytes()
         finally:
-            session.forget(name)
             session.end(job)
         return Response(
             content,

@@ -88,34 +88,45 @@ def _files(run: Path) -> dict[str, Path]:
     return {
         path.relative_to(run).as_posix(): path
         for path in sorted(each())
-        if path.suffix in _TYPES and path.is_file() and _is_inside(path, run)
+        if path.suffix in _TYPES and _is_inside(path, run)
     }
 
 
 def _is_inside(path: Path, run: Path) -> bool:
-    return not path.is_symlink() and path.resolve().is_relative_to(run.resolve())
+    """Whether this is a file of the run itself: no link, nor behind one."""
+    inside = not path.is_symlink() and path.resolve().is_relative_to(run.resolve())
+    return inside and path.is_file()
 
 
-def _json(path: Path) -> dict[str, Any]:
-    """Content of a JSON file; empty where it is missing, or damaged."""
+def _text(run: Path, name: str) -> str:
+    """Content of a file of a run; empty where it is missing, damaged, too long or elsewhere."""
+    path = run / name
     try:
-        if path.stat().st_size > _MAX_TEXT:
-            return {}
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
+        if not _is_inside(path, run) or path.stat().st_size > _MAX_TEXT:
+            return ""
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        return ""
+
+
+def _json(run: Path, name: str) -> dict[str, Any]:
+    """Content of a JSON file of a run; empty where there is none."""
+    try:
+        content = json.loads(_text(run, name))
+    except (ValueError, RecursionError):
         return {}
     return content if isinstance(content, dict) else {}
 
 
 def _summary(name: str, run: Path) -> dict[str, Any]:
-    marker, study = _json(run / "run.json"), _json(run / "study.json")
+    marker, study = _json(run, "run.json"), _json(run, "study.json")
     plant = marker.get("plant")
     return {
         "name": name,
         "kind": str(marker.get("kind", "")).removeprefix("excite "),
         "plant": str(plant.get("name", "")) if isinstance(plant, dict) else "",
         "title": str(study.get("title") or study.get("name") or ""),
-        "is_finished": any((run / f).is_file() for f in ("table.json", "estimate.json")),
+        "is_finished": any(_is_inside(run / f, run) for f in ("table.json", "estimate.json")),
     }
 
 
@@ -124,20 +135,17 @@ def _content(run: Path) -> dict[str, Any]:
     files = _files(run)
     return {
         **_summary(run.name, run),
-        **_table(run / "table.md"),
-        "estimate": _json(run / "estimate.json"),
+        **_table(_text(run, "table.md")),
+        "estimate": _json(run, "estimate.json"),
         "curves": _curves(run),
         "figures": [name for name in files if name.endswith(".png")],
         "files": [name for name in files if not name.endswith(".png")],
     }
 
 
-def _table(path: Path) -> dict[str, Any]:
-    """Header, rows and notes of the first table of a Markdown file."""
-    try:
-        lines = path.read_text(encoding="utf-8")[:_MAX_TEXT].splitlines()
-    except (OSError, UnicodeDecodeError):
-        return {"header": [], "rows": [], "notes": []}
+def _table(text: str) -> dict[str, Any]:
+    """Header, rows and notes of the first table of a Markdown text."""
+    lines = text.splitlines()
     first = next((i for i, line in enumerate(lines) if line.startswith("|")), len(lines))
     end = next((i for i in range(first, len(lines)) if not lines[i].startswith("|")), len(lines))
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[first:end]]

@@ -2,30 +2,38 @@
 
 The page answers to the name it is bound to and no other, so that a foreign name that is
 made to point here (DNS rebinding) reads nothing. What changes anything must come from the
-page itself, and every browser has a secret that the page's own scripts cannot read.
+page itself, and every browser has a secret that the page's own scripts cannot read. Only the
+page's own request makes one, after the token where there is one: whoever is led here by a
+link in a foreign page, which no such cookie goes along with, keeps the one he has.
 """
 
 from __future__ import annotations
 
 import hmac
 import ipaddress
+import logging
 import socket
 import time
 from collections import deque
+from collections.abc import Mapping
 from http.cookies import CookieError, SimpleCookie
+from typing import Any
 from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
+from starlette.requests import ClientDisconnect
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from .base import RefusedError, Session, Sessions, Settings
 
 MAX_TRIES = 10
-"""Wrong tokens in a minute, from everywhere together."""
+"""Wrong tokens in a minute, from one address."""
+_MAX_SOURCES = 4096
 _LOCAL = ("localhost", "127.0.0.1", "::1")
 _OPEN = ("/", "/api/session")
-"""What is answered before a token is shown: the page itself, which says nothing."""
+"""What is answered before a token is shown: the page itself, which says nothing, and the door."""
+_LOG = logging.getLogger(__name__)
 _HEADERS = {
     "content-security-policy": "default-src 'self'; object-src 'none'; base-uri 'none'; "
     "form-action 'none'; frame-ancestors 'none'",
@@ -52,30 +60,31 @@ class Guard:
 
     def __init__(self, app: ASGIApp, settings: Settings, sessions: Sessions) -> None:
         self._app, self._settings, self._sessions = app, settings, sessions
-        self._wrong: deque[float] = deque()
+        self._wrong: dict[str, deque[float]] = {}
+        self._names = {settings.host, *_LOCAL}
+        if not is_loopback(settings.host):  # looked up once: a name server may be slow
+            self._names |= {socket.gethostname().lower(), socket.getfqdn().lower()}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Passes a request on, or refuses it."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        answer, cookie = _with_headers(send), None
+        answer = _with_headers(send)
         try:
             headers = Headers(scope=scope)
             self._check_host(headers, scope)
             _check_origin(headers, scope)
-            if scope["path"].startswith("/static/"):
-                await self._app(scope, receive, answer)
-                return
-            session, cookie = self._session(headers, scope)
-            self._check_known(session, scope)
+            session = self._session(headers, scope)
+            if session is None and not _is_open(scope["path"]):
+                raise self._stranger()
             scope.setdefault("state", {})["session"] = session
-            scope["state"]["show_token"] = lambda token: self._show_token(session, token)
+            scope["state"]["enter"] = lambda asked: self._enter(asked, scope)
         except RefusedError as refused:
             refusal = JSONResponse({"sentence": refused.sentence}, refused.status)
             await refusal(scope, receive, answer)
             return
-        await self._app(scope, receive, _with_cookie(answer, cookie) if cookie else answer)
+        await _answered(self._app, scope, receive, answer)
 
     def _check_host(self, headers: Headers, scope: Scope) -> None:
         hosts = headers.getlist("host")
@@ -90,56 +99,91 @@ class Guard:
 
     def _is_own(self, name: str) -> bool:
         host = self._settings.host
-        if is_loopback(host):
-            return name in (*_LOCAL, host)
-        if name in (host, *_LOCAL, socket.gethostname().lower(), socket.getfqdn().lower()):
-            return True
+        if name in self._names or is_loopback(host):
+            return name in self._names
         try:  # a number cannot be made to point elsewhere
             return ipaddress.ip_address(host).is_unspecified and bool(ipaddress.ip_address(name))
         except ValueError:
             return False
 
-    def _session(self, headers: Headers, scope: Scope) -> tuple[Session, str | None]:
-        """The browser's session; a new one, and its cookie, where the page is opened."""
-        # Cookies are shared by all ports of a computer: each server has a name of its own.
-        name = f"excite_{(scope.get('server') or ('', 0))[1]}"
+    def _session(self, headers: Headers, scope: Scope) -> Session | None:
+        """The session whose secret the browser shows."""
         try:
-            morsel = SimpleCookie(headers.get("cookie", "")).get(name)
+            morsel = SimpleCookie(headers.get("cookie", "")).get(_cookie(scope))
         except CookieError:
             morsel = None
-        session = self._sessions.get(morsel.value) if morsel else None
-        if session is not None:
-            return session, None
-        # Nor does a picture in a foreign page, that is not one, make sessions.
-        if scope["path"] != "/" or headers.get("sec-fetch-dest") not in (None, "document"):
-            raise RefusedError(403, "this browser is not known here; open the page again")
-        secret, session = self._sessions.new()
-        return session, f"{name}={secret}; HttpOnly; SameSite=Strict; Path=/"
+        return self._sessions.get(morsel.value) if morsel else None
 
-    def _check_known(self, session: Session, scope: Scope) -> None:
-        if self._settings.token is None or session.is_known:
-            return
-        if scope["path"] not in _OPEN:
-            raise RefusedError(
-                401, "the token is needed; it was printed where the page was started"
-            )
+    def _stranger(self) -> RefusedError:
+        if self._settings.token is None:
+            return RefusedError(403, "this browser is not known here; open the page again")
+        return RefusedError(401, "the token is needed; it was printed where the page was started")
 
-    def _show_token(self, session: Session, token: object) -> None:
-        """Lets a browser in that knows the token.
+    def _enter(self, asked: Mapping[str, Any], scope: Scope) -> str | None:
+        """The cookie of a new session; None where the token is needed and was not shown.
 
         Raises:
-            RefusedError: for another, or after too many others.
+            RefusedError: for a wrong token, or after too many of them.
         """
+        if self._settings.token is not None:
+            if "token" not in asked:
+                return None
+            self._check_token(asked["token"], self._settings.token, _source(scope))
+        return f"{_cookie(scope)}={self._sessions.new()}; HttpOnly; SameSite=Strict; Path=/"
+
+    def _check_token(self, token: object, own: str, source: str) -> None:
         now = time.monotonic()
-        while self._wrong and now - self._wrong[0] > 60:
-            self._wrong.popleft()
-        if len(self._wrong) >= MAX_TRIES:
+        # The others' tries do not count: nobody can lock out who knows the token.
+        self._wrong = {s: w for s, w in self._wrong.items() if now - w[-1] < 60}
+        wrong = self._wrong.get(source, deque(maxlen=MAX_TRIES))
+        if len(wrong) == MAX_TRIES and now - wrong[0] < 60:
             raise RefusedError(429, "too many wrong tokens; wait a minute")
-        own = (self._settings.token or "").encode()
-        if not (isinstance(token, str) and hmac.compare_digest(token.encode(), own)):
-            self._wrong.append(now)
-            raise RefusedError(401, "this is not the token")
-        session.is_known = True
+        if isinstance(token, str) and hmac.compare_digest(token.encode(), own.encode()):
+            return
+        wrong.append(now)
+        if len(self._wrong) < _MAX_SOURCES:
+            self._wrong[source] = wrong
+        raise RefusedError(401, "this is not the token")
+
+
+def _is_open(path: str) -> bool:
+    return path in _OPEN or path.startswith("/static/")
+
+
+def _cookie(scope: Scope) -> str:
+    """Its name: cookies are shared by all ports of a computer, and each server has its own."""
+    return f"excite_{(scope.get('server') or ('', 0))[1]}"
+
+
+def _source(scope: Scope) -> str:
+    """Where a request comes from; of version 6 the network, for a computer has many of them."""
+    address = (scope.get("client") or ("", 0))[0]
+    try:
+        number = ipaddress.ip_address(address)
+    except ValueError:
+        return address
+    return str(ipaddress.ip_network((number, 64 if number.version == 6 else 32), strict=False))
+
+
+async def _answered(app: ASGIApp, scope: Scope, receive: Receive, send: Send) -> None:
+    """Passes a request on; a defect is one sentence for the user, the rest for the terminal."""
+    is_begun = False
+
+    async def answer(message: Message) -> None:
+        nonlocal is_begun
+        is_begun = True
+        await send(message)
+
+    try:
+        await app(scope, receive, answer)
+    except ClientDisconnect:  # nobody waits for an answer
+        return
+    except Exception:
+        if is_begun:  # the connection has to break
+            raise
+        _LOG.exception("a request failed")
+        sentence = "the server has failed at this request; its terminal says why"
+        await JSONResponse({"sentence": sentence}, 500)(scope, receive, send)
 
 
 def _check_origin(headers: Headers, scope: Scope) -> None:
@@ -160,15 +204,6 @@ def _with_headers(send: Send) -> Send:
             headers = MutableHeaders(scope=message)
             for name, value in _HEADERS.items():
                 headers.setdefault(name, value)
-        await send(message)
-
-    return answer
-
-
-def _with_cookie(send: Send, cookie: str) -> Send:
-    async def answer(message: Message) -> None:
-        if message["type"] == "http.response.start":
-            MutableHeaders(scope=message).append("set-cookie", cookie)
         await send(message)
 
     return answer

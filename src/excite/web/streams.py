@@ -41,9 +41,10 @@ def routes(pool: Pool, body: Callable[[Request], Any]) -> list[Route]:
 
     async def identification(request: Request) -> StreamingResponse:
         session, asked = request.state.session, await body(request)
-        source = session.place(str(asked.get("upload")))
-        asked = _identification(asked)
-        return _streamed(session, lambda stop: _identified(pool, session, asked, source, stop))
+        upload = str(asked.get("upload"))
+        with session.using(upload):  # or there is none
+            asked = _identification(asked)
+        return _streamed(session, lambda stop: _identified(pool, session, asked, upload, stop))
 
     async def stop(request: Request) -> JSONResponse:
         stops = request.state.session.stops
@@ -137,18 +138,20 @@ async def _lively(events: Events, stop: asyncio.Event) -> Events:
 
 
 async def _identified(
-    pool: Pool, session: Session, asked: Event, source: Any, stop: asyncio.Event
+    pool: Pool, session: Session, asked: Event, upload: str, stop: asyncio.Event
 ) -> Events:
-    name, place = session.new_place()
-    arguments = {
-        "asked": asked,
-        "source": str(source),
-        "name": next(iter(source.iterdir())).name,
-        "folder": str(place / "run"),
-    }
-    async with aclosing(_lively(pool.events("identified", arguments), stop)) as events:
-        async for event in events:
-            yield {**event, "result": name} if event["kind"] == "identified" else event
+    with session.using(upload) as source, session.making("result") as (name, place):
+        arguments = {
+            "asked": asked,
+            "source": str(source),
+            "name": next(iter(source.iterdir())).name,
+            "folder": str(place.folder / "run"),
+        }
+        async with aclosing(_lively(pool.events("identified", arguments), stop)) as events:
+            async for event in events:
+                if event["kind"] == "identified":
+                    place.is_done, event["result"] = True, name
+                yield event
 
 
 async def _played(
@@ -164,10 +167,19 @@ async def _played(
                 yield event
     if shown is None:
         return
-    name, place = session.new_place()
-    arguments = {"asked": asked, "folder": str(place / "run")}
     player = _Player(shown, seconds)
     yield player.plan()
+    with session.making("result") as (name, place):
+        arguments = {"asked": asked, "folder": str(place.folder / "run")}
+        async with aclosing(_followed(pool, arguments, player, stop)) as events:
+            async for event in events:
+                if event["kind"] == "result":
+                    place.is_done, event["result"] = event["identification"] is not None, name
+                yield event
+
+
+async def _followed(pool: Pool, arguments: Event, player: _Player, stop: asyncio.Event) -> Events:
+    """Frames of samples, and what is found from them."""
     waiting = asyncio.Queue[Event]()
 
     async def follow() -> None:
@@ -179,7 +191,7 @@ async def _played(
     following = asyncio.create_task(follow())
     try:
         async for event in _mixed(player, waiting, stop):
-            yield {**event, "result": name} if event["kind"] == "result" else event
+            yield event
     finally:
         following.cancel()
         await asyncio.gather(following, return_exceptions=True)

@@ -1,13 +1,14 @@
 """Trainings: `excite train`, started and interrupted as at the command line.
 
-A training goes on when its page is closed, and ends with the server. Interrupted, it keeps
-its checkpoint, and the same command goes on from there.
+A training goes on when its page is closed, and ends with the server, however that ends.
+Interrupted, it keeps its checkpoint, and the same command goes on from there.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import ctypes
 import json
 import os
 import re
@@ -22,10 +23,12 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse
 from starlette.routing import Route
 
-from .base import RefusedError, number, whole, word
+from .base import RefusedError, number, whole, without_folders, word
 
 MAX_TRAININGS = 2
 _PATIENCE = 10.0  # seconds for a training to end when it is interrupted
+_LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None
+_WHEN_PARENT_ENDS = 1  # PR_SET_PDEATHSIG of prctl(2)
 _OBJECTIVES = ("D", "A", "E", "relative", "log", "goals", "nls")
 
 
@@ -45,7 +48,7 @@ class Training:
             sys.executable, "-m", "excite", *self.words, "--out", str(self.folder),
             stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.DEVNULL,
             stderr=asyncio.subprocess.PIPE, start_new_session=True,
-            preexec_fn=_step_back,
+            preexec_fn=_prepared,
         )  # fmt: skip
         self._followed = asyncio.create_task(self._follow(self._process))
 
@@ -83,7 +86,8 @@ class Training:
         elif self.state == "stopping":
             self.state = "stopped"
         else:
-            self.state, self.sentence = "failed", (last or ["it ended without a word"])[0]
+            self.state = "failed"
+            self.sentence = without_folders((last or ["it ended without a word"])[0])
 
     def _look(self) -> None:
         for path in self.folder.glob("seeds/*/0/progress.json"):
@@ -165,6 +169,8 @@ def _free(folder: Path, name: str) -> Path:
     return path
 
 
-def _step_back() -> None:
-    """What is being watched comes first."""
+def _prepared() -> None:
+    """What is being watched comes first; a server that is killed interrupts its trainings."""
     os.nice(10)
+    if _LIBC is not None:
+        _LIBC.prctl(_WHEN_PARENT_ENDS, signal.SIGINT)

@@ -1,7 +1,9 @@
-"""A process that computes for the page: `python -m excite.web.worker`.
+"""A process that computes for the page: `python -m excite.web.worker BYTES`.
 
-One line of JSON in is a call, every line out an event. It ends with its input, so that no
-worker outlives the server, and looks for a line between two events: that stops the work.
+One line of JSON in is a call, every line out an event of it, by its number. It ends with its
+input, so that no worker outlives the server, and looks for a line between two events: that
+stops the work. It takes no more data than BYTES: a file that unpacks to more than the
+computer holds is refused, not loaded.
 """
 
 from __future__ import annotations
@@ -17,23 +19,30 @@ from collections.abc import Iterator
 from typing import Any
 
 from ..files import json_ready
+from .base import without_folders
 
-MAX_MEMORY = 6 * 2**30
-"""Bytes of data: a file that unpacks to more than the computer holds is refused, not loaded."""
+_MAX_SENTENCE = 1000  # characters; a file's content may be quoted in it
 
 
 def main() -> None:
-    """Answers calls until the input ends."""
-    with os.fdopen(os.dup(1), "w", encoding="utf-8") as out:
+    """Answers calls until the input ends, or nobody is left to read the answers."""
+    with contextlib.suppress(BrokenPipeError):
+        _answer()
+
+
+def _answer() -> None:
+    with os.fdopen(os.dup(1), "w", encoding="utf-8", errors="replace") as out:
         os.dup2(2, 1)  # whatever a library prints is no event
         live = importlib.import_module("excite.live")
-        resource.setrlimit(resource.RLIMIT_DATA, (MAX_MEMORY, MAX_MEMORY))
+        limit = int(sys.argv[1])
+        resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
         _write(out, {"kind": "ready"})
         for line in sys.stdin.buffer:
             call = json.loads(line)
             if call != "stop":  # one that came too late is of no concern
+                number = call.pop("number")
                 for event in _events(live, **call):
-                    _write(out, event)
+                    _write(out, {**event, "number": number})
 
 
 def _events(live: Any, target: str, arguments: dict[str, Any]) -> Iterator[dict[str, Any]]:
@@ -59,7 +68,10 @@ def _named(error: Exception) -> str:
 
 
 def _failure(sentence: str) -> dict[str, Any]:
-    return {"kind": "failed", "sentence": " ".join(sentence.split())}
+    sentence = without_folders(" ".join(sentence.split()))
+    if len(sentence) > _MAX_SENTENCE:
+        sentence = f"{sentence[:_MAX_SENTENCE]}…"
+    return {"kind": "failed", "sentence": sentence}
 
 
 def _write(out: Any, event: dict[str, Any]) -> None:

@@ -2,7 +2,8 @@
 
 A worker does one thing at a time. What is asked to stop is told so, and where it does not
 listen within half a second, for it is deep in a computation, its process is killed and
-another started; nothing half-written is left, for files appear whole or not at all.
+another started; nothing half-written is left, for files appear whole or not at all. So is
+one that says anything but an event of the call it was given.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import asyncio
 import contextlib
 import itertools
 import json
+import logging
 import os
 import sys
 from collections.abc import AsyncGenerator, Mapping
@@ -19,10 +21,14 @@ from typing import Any
 
 from .base import RefusedError
 
+_LOG = logging.getLogger(__name__)
 GRACE = 0.5
 """Seconds in which work stops by itself."""
 MAX_WAITING = 64
 """Calls in the queue."""
+MAX_FAILURES = 3
+"""Processes that end before they are ready, one after the other, until a lane gives up."""
+_MEMORY = 2 * 2**30, 6 * 2**30  # bytes of a worker: it needs the first, and gets no more
 _LINE = 64 * 2**20  # bytes; a longer event is a defect
 _TIME_LIMIT = 900.0  # seconds a single call may take
 _ONE = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NPROC", "JAX_ENABLE_X64")
@@ -35,7 +41,7 @@ class Workers:
         self._num_workers, self._environment = num_workers, _environment(cache)
         self._queue: asyncio.PriorityQueue[tuple[int, int, _Job]] = asyncio.PriorityQueue()
         self._numbers, self._lanes = itertools.count(), list[asyncio.Task]()
-        self._jobs = set[_Job]()
+        self._jobs, self._num_broken = set[_Job](), 0
 
     async def open(self) -> None:
         """Starts the processes; they warm up while the page is served."""
@@ -59,8 +65,8 @@ class Workers:
         """
         if self._queue.qsize() >= MAX_WAITING:
             raise RefusedError(503, "too much is waiting for the workers; try again later")
-        job = _Job(_call(target, arguments))
-        self._queue.put_nowait((0 if urgent else 1, next(self._numbers), job))
+        job = _Job(next(self._numbers), target, arguments)
+        self._queue.put_nowait((0 if urgent else 1, job.number, job))
         self._jobs.add(job)
         try:
             while True:
@@ -73,51 +79,73 @@ class Workers:
             job.stop.set()
 
     async def _lane(self) -> None:
-        """One worker, its successors, and what they do one after the other."""
-        while True:
-            process, is_warm = await self._started(), False
-            try:
-                while process.returncode is None:
-                    if not is_warm and self._queue.empty():  # otherwise somebody waits already
-                        await _served(process, _Job(_call("warm_up", {})))
-                        is_warm = True
-                        continue
-                    _, _, job = await self._queue.get()
-                    if not job.stop.is_set():
-                        await _served(process, job)
-            finally:
-                await _ended(process)
+        """One worker and its successors; where none starts, the last lane tells everybody."""
+        num_failures = 0
+        while num_failures < MAX_FAILURES:
+            is_good = await self._worked()
+            num_failures = 0 if is_good else num_failures + 1
+        self._num_broken += 1
+        while self._num_broken == self._num_workers:
+            _, _, job = await self._queue.get()
+            job.events.put_nowait(_failure("the workers do not start; the terminal says why"))
 
-    async def _started(self) -> asyncio.subprocess.Process:
-        command = sys.executable, "-m", f"{__package__}.worker"
-        pipe = asyncio.subprocess.PIPE
-        process = await asyncio.create_subprocess_exec(
-            *command, stdin=pipe, stdout=pipe, env=self._environment, limit=_LINE,
-            start_new_session=True,  # Ctrl-C is the server's
-            preexec_fn=_step_back,
-        )  # fmt: skip
+    async def _worked(self) -> bool:
+        """What one worker does until it ends; whether it came to work at all."""
+        process, is_warm = await self._started(), False
+        if process is None:
+            return False
         try:
-            await _next_event(process)  # it is ready
-        except BaseException:
+            while process.returncode is None:
+                if not is_warm and self._queue.empty():  # otherwise somebody waits already
+                    await _served(process, _Job(next(self._numbers), "warm_up", {}))
+                    is_warm = process.returncode is None
+                    if not is_warm:
+                        return False
+                    continue
+                _, _, job = await self._queue.get()
+                if not job.stop.is_set():
+                    await _served(process, job)
+        finally:
             await _ended(process)
-            raise
-        return process
+        return True
 
-
-def _call(target: str, arguments: Mapping[str, Any]) -> str:
-    return json.dumps({"target": target, "arguments": dict(arguments)})
+    async def _started(self) -> asyncio.subprocess.Process | None:
+        """A process that is ready; None where there can be none."""
+        limit = str(_memory(self._num_workers))
+        command = sys.executable, "-m", f"{__package__}.worker", limit
+        pipe = asyncio.subprocess.PIPE
+        try:
+            process = await asyncio.create_subprocess_exec(
+                *command, stdin=pipe, stdout=pipe, env=self._environment, limit=_LINE,
+                start_new_session=True,  # Ctrl-C is the server's
+                preexec_fn=_step_back,
+            )  # fmt: skip
+        except OSError as error:
+            _LOG.error("no worker can be started: %s", error)
+            return None
+        is_ready = False
+        try:
+            is_ready = await _next_event(process) == {"kind": "ready"}
+        except ValueError as error:
+            _LOG.error("a worker does not start: %s", error)
+        finally:
+            if not is_ready:
+                await _ended(process)
+        return process if is_ready else None
 
 
 class _Job:
     """A call in the queue or under way, and its events."""
 
-    def __init__(self, call: str) -> None:
-        self.call, self.stop = call, asyncio.Event()
+    def __init__(self, number: int, target: str, arguments: Mapping[str, Any]) -> None:
+        self.number, self.stop = number, asyncio.Event()
+        call = {"number": number, "target": target, "arguments": dict(arguments)}
+        self.call = json.dumps(call)
         self.events: asyncio.Queue[dict[str, Any]] = asyncio.Queue()
 
 
 async def _served(process: asyncio.subprocess.Process, job: _Job) -> None:
-    """Passes a call and its events on; kills the process where it will not stop."""
+    """Passes a call and its events on; kills the process where it will not stop, or errs."""
     job.events.put_nowait({"kind": "started"})
     stopped = asyncio.create_task(job.stop.wait())
     work = asyncio.create_task(_pass_on(process, job))
@@ -129,20 +157,38 @@ async def _served(process: asyncio.subprocess.Process, job: _Job) -> None:
             with contextlib.suppress(OSError):
                 _send(process, '"stop"')
             await asyncio.wait({work}, timeout=GRACE)
-        if not work.done():
-            process.kill()
-            await process.wait()
+        if not work.done() or not work.result():
+            await _ended(process)
     finally:
         stopped.cancel()
         work.cancel()
 
 
-async def _pass_on(process: asyncio.subprocess.Process, job: _Job) -> None:
-    _send(process, job.call)
-    event = {"kind": ""}
-    while event["kind"] not in ("end", "failed"):
-        event = await _next_event(process)
-        job.events.put_nowait(event)
+async def _pass_on(process: asyncio.subprocess.Process, job: _Job) -> bool:
+    """Passes events on until the last; whether the process can be given another call."""
+    try:
+        _send(process, job.call)
+        event = {"kind": ""}
+        while event["kind"] not in ("end", "failed"):
+            event = await _next_event(process)
+            if event is None:
+                job.events.put_nowait(_failure("the worker ended unexpectedly; run it again"))
+                return False
+            if event.pop("number", None) != job.number:
+                raise ValueError("it answered another call")
+            job.events.put_nowait(event)
+    except Exception as error:  # what follows in the pipe would be taken for the next answer
+        _LOG.error("a worker was replaced: %s", error)
+        job.events.put_nowait(_failure("the answer of the worker cannot be used; it was replaced"))
+        return False
+    return True
+
+
+def _memory(num_workers: int) -> int:
+    """Bytes a worker may take: all of them together half of what this computer has."""
+    half = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
+    least, most = _MEMORY
+    return max(least, min(most, half // num_workers))
 
 
 def _send(process: asyncio.subprocess.Process, line: str) -> None:
@@ -150,12 +196,10 @@ def _send(process: asyncio.subprocess.Process, line: str) -> None:
         process.stdin.write(f"{line}\n".encode())
 
 
-async def _next_event(process: asyncio.subprocess.Process) -> dict[str, Any]:
+async def _next_event(process: asyncio.subprocess.Process) -> dict[str, Any] | None:
+    """The next event; None where the process has ended."""
     line = b"" if process.stdout is None else await process.stdout.readline()
-    if line:
-        return json.loads(line)
-    await process.wait()
-    return _failure("the worker ended unexpectedly; run it again")
+    return json.loads(line) if line else None
 
 
 async def _ended(process: asyncio.subprocess.Process) -> None:

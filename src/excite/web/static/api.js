@@ -22,11 +22,15 @@ export const options = (select, entries, chosen) => select.replaceChildren(...en
     ? el("optgroup", { label: entry.label }, ...entry.group.map((name) => el("option", { value: name, selected: name === chosen }, name)))
     : el("option", { value: entry, selected: entry === chosen }, entry)));
 
+/** What is read out by a screen reader: a start, an end, a failure; once each. */
 export function say(form, sentence, isBad = false) {
   const status = form.querySelector(".status");
-  status.textContent = sentence;
+  if (status.textContent !== sentence) status.textContent = sentence;
   status.classList.toggle("bad", isBad);
 }
+
+/** How far it is: shown, and not read out. */
+export const tell = (form, sentence) => { form.querySelector(".progress").textContent = sentence; };
 
 async function sentenceOf(response) {
   try { return (await response.json()).sentence ?? "the server did not understand"; }
@@ -88,6 +92,7 @@ export class Task {
     } catch (error) {
       say(this.form, error.message, true);
     } finally {
+      tell(this.form, "");
       this.job = null;
       this.start.disabled = false;
       this.halt.disabled = true;
@@ -102,4 +107,22 @@ export class Task {
   }
 }
 
-export const download = (address, text) => el("a", { href: address, download: "" }, text);
+/** A link to a file; where there is none, the page says why instead of saving the answer. */
+export function download(address, text) {
+  const name = (new URLSearchParams(address.split("?")[1]).get("file") ?? address.split("?")[0]).split("/").at(-1);
+  return el("a", { href: address, download: name, click: (event) => { event.preventDefault(); save(event.currentTarget); } }, text);
+}
+
+async function save(link) {
+  const section = link.closest("main > section");
+  link.setAttribute("aria-busy", "true");
+  try {
+    const file = URL.createObjectURL(await (await answered(link.href)).blob());
+    el("a", { href: file, download: link.download }).click();
+    setTimeout(() => URL.revokeObjectURL(file), 60_000);
+  } catch (error) {
+    say(section, error.message, true);
+  } finally {
+    link.removeAttribute("aria-busy");
+  }
+}

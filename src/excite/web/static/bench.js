@@ -50,7 +50,7 @@ function knock() {
 door.addEventListener("submit", (event) => { event.preventDefault(); show(document.getElementById("token").value); });
 
 try {
-  const { is_known: isKnown } = await get("api/session");
+  const { is_known: isKnown } = await post("api/session", {});
   const brought = location.hash.slice(1);
   if (isKnown) await enter();
   else if (brought && !(brought in parts)) {

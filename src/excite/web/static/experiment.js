@@ -1,6 +1,6 @@
 // Choose a plant and an excitation, press run, watch what is identified.
 
-import { download, el, options, say, symbol, Task } from "./api.js";
+import { download, el, options, say, symbol, Task, tell } from "./api.js";
 import { Plot, range, shown } from "./plot.js";
 
 const section = document.getElementById("experiment"), form = section.querySelector("form");
@@ -107,7 +107,8 @@ function run() {
     else if (event.kind === "plan") live = new Live(event);
     else if (event.kind === "samples") {
       live.samples(event);
-      say(form, live.isFull ? waiting(live) : `Running: ${shown(live.time.at(-1))} of ${shown(live.end)} s`);
+      say(form, live.isFull ? waiting(live) : "Running.");
+      tell(form, live.isFull ? "" : `${shown(live.time.at(-1))} of ${shown(live.end)} s`);
     } else if (event.kind === "estimate") {
       live.estimate(event);
       if (live.isFull) say(form, waiting(live));

@@ -1,6 +1,6 @@
 // A recorded experiment: drop a file, map its columns, identify.
 
-import { download, el, options, say, symbol, Task, upload } from "./api.js";
+import { download, el, options, say, symbol, Task, tell, upload } from "./api.js";
 import { Plot, range, shown } from "./plot.js";
 
 const section = document.getElementById("record"), form = section.querySelector("form");
@@ -72,7 +72,8 @@ function identify() {
   say(form, "Waiting for a worker…");
   const start = Date.now();
   task.run("api/identifications", wanted, (event) => {
-    if (event.kind === "started" || event.kind === "pulse") say(form, `Identifying, ${Math.round((Date.now() - start) / 1000)} s…`);
+    if (event.kind === "started") say(form, "Identifying…");
+    else if (event.kind === "pulse") tell(form, `${Math.round((Date.now() - start) / 1000)} s`);
     else if (event.kind === "identified") show(event);
   });
 }

@@ -27,7 +27,7 @@ async function show(run, button) {
     if (content.estimate.params) {
       const estimate = el("table");
       table(estimate, content.estimate);
-      card.append(el("div", { class: "scroll" }, estimate), el("ul", {}, ...(content.estimate.verdict ?? []).map((text) => el("li", {}, text))));
+      card.append(el("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Table of parameters" }, estimate), el("ul", {}, ...(content.estimate.verdict ?? []).map((text) => el("li", {}, text))));
     }
     if (content.rows.length) card.append(rows(content));
     card.append(...content.notes.map((note) => el("p", { class: "hint" }, note)));

@@ -46,8 +46,10 @@ const isRunning = ({ state }) => ["starting", "training", "stopping"].includes(s
 function show(training) {
   if (!cards.has(training.name)) cards.set(training.name, newCard(training));
   const card = cards.get(training.name), rows = training.curve;
-  const running = { starting: "starting; the first look takes a minute or so", training: `training, ${rows.at(-1)?.steps ?? 0} steps`, stopped: "stopped; the command goes on from here" };
-  card.state.textContent = training.sentence || running[training.state] || training.state;
+  const running = { starting: "starting; the first look takes a minute or so", training: "training", stopped: "stopped; the command goes on from here" };
+  const sentence = training.sentence || running[training.state] || training.state;
+  if (card.state.textContent !== sentence) card.state.textContent = sentence;
+  card.far.textContent = isRunning(training) && rows.length ? `${rows.at(-1).steps} steps` : "";
   card.state.className = training.state === "failed" ? "bad" : "";
   card.stop.disabled = !isRunning(training);
   if (!rows.length) return;
@@ -57,12 +59,12 @@ function show(training) {
 }
 
 function newCard(training) {
-  const card = { state: el("p", { role: "status" }), plots: el("div", { class: "plots small" }) };
+  const card = { state: el("p", { role: "status" }), far: el("p", { class: "progress" }), plots: el("div", { class: "plots small" }) };
   card.stop = el("button", { type: "button", click: async () => {
     card.stop.disabled = true;
     try { show(await remove(`api/trainings/${training.name}`)); } catch (error) { say(form, error.message, true); }
   } }, "Stop");
   at("trainings").prepend(el("section", { class: "card", "aria-label": `Training ${training.folder}` },
-    el("h2", {}, training.folder), card.state, el("p", {}, el("code", {}, training.command)), card.plots, el("p", { class: "row" }, card.stop)));
+    el("h2", {}, training.folder), card.state, card.far, el("p", {}, el("code", {}, training.command)), card.plots, el("p", { class: "row" }, card.stop)));
   return card;
 }

@@ -1,0 +1,162 @@
+"""What the bench page keeps for a browser, and for how long; links in the run folder."""
+
+import json
+import shutil
+from collections.abc import AsyncGenerator, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+from starlette.testclient import TestClient
+
+from excite.files import write_json
+from excite.web import Settings, application
+from excite.web.base import MAX_KEPT, RefusedError, Session
+from excite.web.workers import Workers
+
+HERE = "http://127.0.0.1:8000"
+ASKED = {"plant": "aero2", "estimator": "nls", "initial_state": "free"}
+
+
+async def answered(
+    workers: Workers, target: str, arguments: Mapping[str, Any], urgent: bool = False
+) -> AsyncGenerator[dict[str, Any]]:
+    """What workers would say, at once; identifications with a column "bad" fail."""
+    del workers, urgent
+    if target == "columns":
+        yield {"kind": "columns", "columns": {"time": 2}}
+    elif target == "reported":
+        if not all(Path(folder).is_dir() for folder in arguments["folders"]):
+            yield {"kind": "failed", "sentence": f"{arguments['folders'][0]}: no such folder"}
+            return
+        Path(arguments["out"]).write_text("a report")
+    elif "bad" in arguments["asked"]["columns"].values():
+        yield {"kind": "failed", "sentence": "no column 'bad'"}
+        return
+    else:
+        Path(arguments["folder"]).mkdir()
+        (Path(arguments["folder"]) / "record.csv").write_text("time\n")
+        yield {"kind": "identified"}
+    yield {"kind": "end"}
+
+
+@pytest.fixture
+def page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> TestClient:
+    monkeypatch.setattr(Workers, "events", answered)
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "scratch").mkdir()
+    app = application(Settings(tmp_path / "runs", num_workers=0), tmp_path / "scratch")
+    client = TestClient(app, base_url=HERE, headers={"origin": HERE})
+    assert client.post("/api/session", json={}).is_success
+    return client
+
+
+def uploaded(page: TestClient) -> str:
+    return page.post("/api/uploads?name=a.csv", content="time\n0\n").json()["upload"]
+
+
+def identified(page: TestClient, upload: str, column: str = "time") -> str | None:
+    """The name of the result, where there is one."""
+    asked = {**ASKED, "upload": upload, "columns": {"time": column}}
+    lines = page.post("/api/identifications", json=asked).text.splitlines()
+    return json.loads(lines[1]).get("result")
+
+
+def test_the_oldest_of_all_that_is_kept_has_a_report(page: TestClient):
+    upload = uploaded(page)
+    results = [identified(page, upload) for _ in range(MAX_KEPT)]
+    for result in results:
+        answer = page.get(f"/api/results/{result}/report.html")
+        assert (answer.status_code, answer.text) == (200, "a report")
+    assert page.get(f"/api/results/{results[0]}/record.csv").is_success
+
+
+def test_mistakes_take_no_place(page: TestClient, tmp_path: Path):
+    upload = uploaded(page)
+    result = identified(page, upload)
+    for _ in range(2 * MAX_KEPT):
+        assert identified(page, upload, "bad") is None
+    assert identified(page, upload)
+    assert page.get(f"/api/results/{result}/record.csv").is_success
+    assert len(list(tmp_path.glob("scratch/*/*"))) == 3
+
+
+def test_what_was_used_last_stays(page: TestClient):
+    uploads = [uploaded(page) for _ in range(MAX_KEPT)]
+    results = [identified(page, uploads[0]) for _ in range(MAX_KEPT)]
+    assert page.get(f"/api/results/{results[0]}/record.csv").is_success
+    assert identified(page, uploads[0]), "results take no upload's place"
+    assert page.get(f"/api/results/{results[0]}/record.csv").is_success
+    assert page.get(f"/api/results/{results[1]}/record.csv").status_code == 404
+    assert uploaded(page)
+    assert identified(page, uploads[0])
+    asked = {**ASKED, "upload": uploads[1], "columns": {}}
+    assert page.post("/api/identifications", json=asked).status_code == 404
+
+
+def test_what_is_in_use_stays(tmp_path: Path):
+    session = Session(tmp_path)
+
+    def made() -> str:
+        with session.making("result") as (name, place):
+            place.is_done = True
+        return name
+
+    oldest = made()
+    with session.using(oldest) as folder, session.making("result") as (name, place):
+        for _ in range(2 * MAX_KEPT):
+            made()
+        assert folder.is_dir()
+        assert place.folder.is_dir()
+    assert name not in session.kept
+    made()
+    made()
+    with pytest.raises(RefusedError, match="run it again"), session.using(oldest):
+        pass
+    assert not folder.exists()
+    assert len(session.kept) == MAX_KEPT
+
+
+# ---------------------------------------------------------------------------------- links
+
+
+LINKED = ("run.json", "study.json", "estimate.json", "table.json", "table.md", "figure.png")
+
+
+@pytest.fixture
+def run(page: TestClient, tmp_path: Path) -> Path:
+    """A run every file of which is a link to a secret beside the run folder, but its marker."""
+    del page
+    run = tmp_path / "runs" / "a"
+    run.mkdir()
+    secret = {"kind": "SECRET", "title": "SECRET", "plant": {"name": "SECRET"}}
+    write_json(tmp_path / "secret.json", secret)
+    (tmp_path / "secret.md").write_text("| SECRET |\n| --- |\n| SECRET |\n")
+    (tmp_path / "curves").mkdir()
+    (tmp_path / "curves" / "curve.csv").write_text("SECRET\n1\n")
+    shutil.copy(tmp_path / "curves" / "curve.csv", tmp_path / "curves" / "policy.safetensors")
+    for name in LINKED:
+        (run / name).symlink_to(tmp_path / f"secret.{'md' if name == 'table.md' else 'json'}")
+    (run / "seeds" / "agent").mkdir(parents=True)
+    (run / "seeds" / "agent" / "0").symlink_to(tmp_path / "curves", target_is_directory=True)
+    return run
+
+
+def test_links_in_a_run_are_not_followed(page: TestClient, run: Path):
+    shown = [page.get("/api/runs"), page.get("/api/run", params={"name": "a"})]
+    for name in (*LINKED, "seeds/agent/0/policy.safetensors", "seeds/agent/0/curve.csv"):
+        shown.append(page.get("/api/run/file", params={"name": "a", "file": name}))
+        assert shown[-1].status_code == 404
+    assert all("SECRET" not in answer.text for answer in shown)
+    assert not shown[0].json()["runs"][0]["is_finished"]
+    assert shown[1].json()["curves"] == {}
+
+
+def test_a_run_with_links_has_no_report(page: TestClient, run: Path):
+    answer = page.get("/api/run/report.html", params={"name": "a"})
+    assert answer.status_code == 422
+    assert "links" in answer.json()["sentence"]
+    shutil.rmtree(run)
+    run.mkdir()
+    write_json(run / "run.json", {"kind": "excite study"})
+    assert page.get("/api/run/report.html", params={"name": "a"}).text == "a report"
