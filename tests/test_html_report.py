@@ -3,6 +3,7 @@
 import csv
 import html
 import json
+import math
 import re
 import shutil
 import subprocess
@@ -21,6 +22,8 @@ from excite.report import (
     footnotes,
     parameter_cells,
     report_html,
+    residual_cells,
+    residual_in_words,
     table_header,
 )
 
@@ -176,7 +179,8 @@ def test_a_study_makes_one_small_page_with_the_table_of_the_command_line(name, c
     assert_is_self_contained(page)
     assert_has_the_table_of_the_command_line(page, RESULTS / name, capsys)
     assert page.tags["svg"] >= 1
-    assert page.tags["img"] == (RESULTS / name / "episodes.png").is_file()
+    is_old = not (RESULTS / name / "episodes.json").is_file()
+    assert page.tags["img"] == (is_old and (RESULTS / name / "episodes.png").is_file())
 
 
 @pytest.mark.parametrize("name", ["one", "both", "bench", "rig.csv", "chirp.csv"])
@@ -265,13 +269,39 @@ def test_parameters_are_those_of_the_command_line(name, made, capsys, monkeypatc
         assert re.search(r"\s+".join(map(re.escape, row)), shown)
     for sentence in result["verdict"]:
         assert sentence in page.words
-    (output, fit, _, p, white), *held_out = page.table_with("output", "fit")[1:]
-    assert f"{output}: fit {fit}, residual white with p = {p}" in shown
-    assert white == ("white" if result["whiteness_p_value"]["pitch"] >= 0.05 else "not white")
+    (output, fit, _, *tests), *held_out = page.table_with("output", "fit")[1:]
+    assert f"{output}: fit {fit}, {residual_in_words(result, output)}\n" in shown
+    assert tests == residual_cells(result, output)
     assert len(held_out) == len(result["validation"])
     correlation = re.search("largest correlation: (.*)", shown)
     assert correlation
     assert f"Largest correlation: {correlation[1]}." in "".join(page.words)
+
+
+@pytest.mark.parametrize(
+    ("white", "structure", "cells", "words"),
+    [
+        (0.03, 0.04, ["yes", "0.0300", "no", "0.0400"],
+         "residual white (p = 0.0300), does not follow the input (p = 0.0400)"),
+        (1e-9, 0.009, ["no", "1.00e-09", "yes", "0.00900"],
+         "residual not white (p = 1.00e-09), follows the input (p = 0.00900)"),
+        (None, math.nan, ["–", "–", "–", "–"], "residual too small to be tested"),
+    ],
+)  # fmt: skip
+def test_a_residual_is_judged_at_one_percent_everywhere(white, structure, cells, words, here):
+    path = here / "one" / "estimate.json"
+    tests = {"whiteness_p_value": {"pitch": white}, "structure_p_value": {"pitch": structure}}
+    path.write_text(json.dumps({**read(path), **tests}))
+    page = Page(report_html([here / "one"]))
+    header, row = page.table_with("output", "fit")
+    assert header[3:] == ["white", "p", "follows the input", "p"]
+    assert row[3:] == cells
+    assert residual_in_words(tests, "pitch") == words
+
+
+def test_a_folder_from_before_the_second_test_is_read(here):
+    without(here / "one" / "estimate.json", "structure_p_value")()
+    assert Page(report_html([here / "one"])).table_with("output", "fit")[1][-2:] == ["–", "–"]
 
 
 def test_a_simulated_plants_own_parameters_stand_beside_the_estimates(made):
@@ -431,7 +461,7 @@ def damage(path: str, text: str = "{") -> object:
     return lambda: Path(path).write_text(text)
 
 
-def without(path: str, key: str) -> object:
+def without(path: str | Path, key: str) -> object:
     def remove() -> None:
         content = read(Path(path))
         del content[key]

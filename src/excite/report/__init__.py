@@ -35,5 +35,7 @@ from .tables import largest_correlation as largest_correlation
 from .tables import parameter_cells as parameter_cells
 from .tables import parameter_header as parameter_header
 from .tables import reference_cells as reference_cells
+from .tables import residual_cells as residual_cells
+from .tables import residual_in_words as residual_in_words
 from .tables import table_cells as table_cells
 from .tables import table_header as table_header
