@@ -13,6 +13,7 @@ from functools import cache
 from html.parser import HTMLParser
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from excite.cli import main
@@ -20,6 +21,7 @@ from excite.report import (
     all_cells,
     differences_cells,
     footnotes,
+    number,
     parameter_cells,
     report_html,
     residual_cells,
@@ -396,7 +398,7 @@ def test_several_runs_stand_side_by_side(made):
     page = page_of(made / "one", made / "both", made / "bench", made / "one")
     assert_is_self_contained(page)
     header, *rows = page.table_with("", "unit")
-    assert header[2:] == ["1. one", "2. both", "3. one"]
+    assert header[2:] == ["1. one", "2. both", "4. one"]  # as in the contents
     shown = {row[0]: row[2:] for row in rows}
     for name, cells in shown.items():
         assert cells[0] == cells[2], name
@@ -406,6 +408,68 @@ def test_several_runs_stand_side_by_side(made):
             own = parameter_cells(name, p)
             assert shown[name][column] == f"{own[2]} ({own[4]})"
     assert {"run1", "run2", "run3", "run4"} <= page.uses & set(page.ids)
+
+
+def test_several_studies_stand_side_by_side_by_their_common_methods():
+    page = page_of(RESULTS / "table1", RESULTS / "paper", RESULTS / "emps")
+    assert_is_self_contained(page)
+    header, *rows = page.table_with("method", "estimator", "study")
+    shown = {tuple(row[:3]): dict(zip(header[3:], row[3:], strict=True)) for row in rows}
+    assert {title for _, _, title in shown} == {"1. table1", "2. paper"}
+    assert {method for method, _, _ in shown} == {"RL(all)"}
+    for name, title in (("table1", "1. table1"), ("paper", "2. paper")):
+        for row in read(RESULTS / name / "table.json")["rows"]:
+            if row["method"] == "RL(all)" and row["estimator"] in ("arx-rls", "nls"):
+                cells = shown["RL(all)", row["estimator"], title]
+                error = row["relative_error_percent"]["D_p"]
+                assert cells["D_p error %"] == f"{number(error['mean'])} ± {number(error['sd'])}"
+                assert cells["violations (95 %)"].startswith(f"{row['violations']}/")
+    settings = {row[0]: row[1:] for row in page.table_with("", "1. table1", "2. paper")[1:]}
+    assert all(first != second for first, second in settings.values())
+    assert settings["decision: output_scale: pitch"] == ["0.3", "–"]
+
+
+def test_studies_without_a_common_method_say_so_and_other_plants_are_not_compared(here):
+    shutil.copytree("bench", "other")
+    for name in ("random", "chirp"):
+        renamed(here / "other" / "table.json", name, new=f"new {name}")
+    sentence = "1. bench and 2. other have no method and estimator in common."
+    assert sentence in Page(report_html([here / "bench", here / "other"])).words
+    renamed(here / "other" / "table.json", "J_p", new="other")
+    assert "side by side" not in report_html([here / "bench", here / "other"])
+
+
+def test_long_records_make_no_large_page_and_keep_their_peaks(here):
+    result, rng = read(here / "one" / "estimate.json"), np.random.default_rng(0)
+    count, length, peak = 6, 7999, 3.3
+    for i in range(1, count + 1):
+        time, noise = 0.02 * np.arange(length), rng.normal(size=(3, length))
+        noise[1, 4321] = peak
+        for name, columns in (("record", "time,voltage,pitch"), ("simulated", "time,pitch")):
+            values = [time, noise[0], noise[1]] if name == "record" else [time, 0.2 * noise[2]]
+            np.savetxt(here / "one" / f"{name}_{i}.csv", np.transpose(values), delimiter=",",
+                       header=columns, comments="")  # fmt: skip
+    (here / "one" / "estimate.json").write_text(json.dumps({**result, "files": ["a.csv"] * count}))
+    page = Page(report_html([here / "one"]))
+    assert_is_self_contained(page)
+    assert len(page.text) > LIMIT / 10
+
+
+def test_a_page_that_stays_too_large_says_so(made, monkeypatch):
+    assert "larger than" not in page_of(made / "one").text
+    monkeypatch.setattr("excite.report.html.MAX_BYTES", 10_000)
+    assert "easier to send on several" in report_html([made / "one"])
+
+
+def test_what_scrolls_on_a_screen_is_reached_by_the_keyboard_and_named(made):
+    text = page_of(RESULTS / "table1").text
+    boxes = re.findall('<div class="scroll[^>]*>', text)
+    stops = [box for box in boxes if "tabindex" in box]
+    assert 0 < len(stops) < len(boxes)
+    names = [re.findall('role="region" aria-label="([^"]*)"', box) for box in stops]
+    assert all(len(name) == 1 and len(name[0]) > 15 for name in names)
+    assert "table: Table 1: learned excitation beside the baselines" in [name[0] for name in names]
+    assert "tabindex" not in page_of(made / "one").text  # nothing in it is that wide
 
 
 def test_a_single_run_needs_no_list_of_contents(made):

@@ -45,7 +45,7 @@ from .names import (
 from .plant import AbstractPlant, Params, params_from
 from .policy import mismatch, read_policy, shipped_policies
 from .records import Record, columns_in, read_record
-from .report import report_html
+from .report import kept_samples, report_html
 from .safety import critical_levels, is_violation, max_abs_output
 from .simulation import Trajectory, run_episode
 
@@ -347,15 +347,16 @@ def identified(asked: Mapping[str, Any], source: str, name: str, folder: str) ->
     result = identify(plant, [record], estimator, initial_state=asked["initial_state"])
     write_run(result, Path(folder), command=_identification_again(asked, name))
     fitted = result.fitted[0]
-    every = max(1, len(record.time) // _MAX_POINTS)
+    signals = [*record.inputs.T, *record.outputs.T, *fitted.simulated.T]
+    kept = kept_samples(signals, _MAX_POINTS)
     yield {
         "kind": "identified",
         "plant": _shown(result.plant),
         "identification": result.to_dict(),
-        "time": record.time[::every],
-        "inputs": record.inputs[::every],
-        "outputs": record.outputs[::every],
-        "simulated": fitted.simulated[::every],
+        "time": record.time[kept],
+        "inputs": record.inputs[kept],
+        "outputs": record.outputs[kept],
+        "simulated": fitted.simulated[kept],
     }
 
 

@@ -7,6 +7,7 @@ line of this room computes an experiment.
 from .base import PLOT_ENDINGS as PLOT_ENDINGS
 from .base import digits_for as digits_for
 from .base import image as image
+from .base import kept_samples as kept_samples
 from .base import number as number
 from .base import require_plot_path as require_plot_path
 from .base import save as save

@@ -40,8 +40,9 @@ from .base import (
 
 _MAX_RECORDS = 6  # drawn of one run
 _TESTS = (
-    "White: without correlation in time (Ljung-Box). Follows the input: cross-correlation with past "
-    f"inputs, a sign that the structure of the plant is wrong. Both are said where p < {RARE:g}."
+    "White: without correlation in time (Ljung-Box). Follows the input: correlated with past "
+    "inputs, a sign that the structure of the plant is wrong for the data. Both are judged at "
+    f"p = {RARE:g}."
 )
 _ADVICE = "'excite identify --out' writes it again"
 
@@ -221,13 +222,9 @@ def _likely_command(experiment: Experiment) -> str:
     )
 
 
-def comparison(experiments: Sequence[Experiment]) -> str:
-    """Estimates, with their intervals, and fits of several experiments side by side."""
-    header = [
-        "",
-        "unit",
-        *(f"{i}. {e.folder.absolute().name}" for i, e in enumerate(experiments, 1)),
-    ]
+def comparison(numbered: Mapping[str, Experiment]) -> str:
+    """Estimates, with their intervals, and fits of several experiments side by side, by title."""
+    header, experiments = ["", "unit", *numbered], list(numbered.values())
     names = {n: p["unit"] for e in experiments for n, p in e.result["params"].items()}
     outputs = list(dict.fromkeys(n for e in experiments for n in e.result["fit_percent"]))
     rows = [["status", "", *(e.result["status"] for e in experiments)]]
@@ -237,7 +234,7 @@ def comparison(experiments: Sequence[Experiment]) -> str:
     for output in outputs:
         fits = [number(e.result["fit_percent"].get(output), 4) for e in experiments]
         rows.append([f"fit of {output}", "%", *fits])
-    return table(header, rows)
+    return table(header, rows, name="Experiments side by side")
 
 
 def _interval(name: str, params: Mapping[str, Any]) -> str:
