@@ -330,7 +330,7 @@ def _settings_beside(group: Mapping[str, StudyRun]) -> str:
     if not rows:
         return ""
     differ = table(["", *group], rows, 1 + len(group), name="settings in which they differ")
-    return paragraph("Settings in which they differ:") + differ
+    return paragraph("Settings in which they differ; a dash is the default:") + differ
 
 
 def _flat(settings: Mapping[str, Any]) -> dict[str, str]:
