@@ -302,7 +302,8 @@ def test_a_residual_is_judged_at_one_percent_everywhere(white, structure, cells,
 
 
 def test_a_folder_from_before_the_second_test_is_read(here):
-    without(here / "one" / "estimate.json", "structure_p_value")()
+    path = here / "one" / "estimate.json"
+    path.write_text(json.dumps({k: v for k, v in read(path).items() if k != "structure_p_value"}))
     assert Page(report_html([here / "one"])).table_with("output", "fit")[1][-2:] == ["–", "–"]
 
 
@@ -520,7 +521,7 @@ def damage(path: str, text: str = "{") -> object:
     return lambda: Path(path).write_text(text)
 
 
-def without(path: str | Path, key: str) -> object:
+def without(path: str, key: str) -> object:
     def remove() -> None:
         content = read(Path(path))
         del content[key]

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from catalogue import TwoMasses
 
-from excite.description import PlantDescription
+from excite.description import HALF_95, PlantDescription
 from excite.plant import EMPS, Aero2, CartPole
 from excite.records import Record
 from excite.report import (
@@ -501,7 +501,7 @@ def test_the_autocorrelation_of_white_noise_lies_between_the_dashed_lines():
         bars = np.array([bar[1, 1] for bar in lines.get_segments()])
         level = max(np.asarray(line.get_ydata(), float)[0] for line in axis.get_lines())
         assert len(bars) == 25
-        assert level == pytest.approx(1.96 / math.sqrt(4000))
+        assert level == pytest.approx(HALF_95 / math.sqrt(4000))
         assert least <= np.mean(np.abs(bars) < level) <= most
     one = walk[0][:, 0] - walk[0].mean()
     (axis,) = autocorrelation_figure(AERO2, walk[:1]).axes

@@ -48,6 +48,7 @@ def report_html(
         ValueError: for what cannot be read as one of them.
     """
     every = [_read(path) for path in runs]  # whatever is damaged is said before anything is drawn
+    page = ""
     for points in _NUM_POINTS:
         with _DRAWING, matplotlib.rc_context(PAGE_STYLE), at_most(points):
             page = _drawn(every, runs, progress)

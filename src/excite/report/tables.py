@@ -293,8 +293,10 @@ def residual_cells(result: Mapping[str, Any], output: str) -> list[str]:
     for test, words in (("whiteness", ("yes", "no")), ("structure", ("no", "yes"))):
         # Folders of before the second test do not have it.
         p = result.get(f"{test}_p_value", {}).get(output)
-        is_known = p is not None and math.isfinite(p)
-        cells += [words[p < RARE] if is_known else "–", number(p)]
+        if p is None or not math.isfinite(p):
+            cells += ["–", "–"]
+        else:
+            cells += [words[p < RARE], number(p)]
     return cells
 
 
