@@ -3,6 +3,7 @@
 import csv
 import html
 import json
+import math
 import re
 import shutil
 import subprocess
@@ -12,6 +13,7 @@ from functools import cache
 from html.parser import HTMLParser
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from excite.cli import main
@@ -19,8 +21,11 @@ from excite.report import (
     all_cells,
     differences_cells,
     footnotes,
+    number,
     parameter_cells,
     report_html,
+    residual_cells,
+    residual_in_words,
     table_header,
 )
 
@@ -176,7 +181,8 @@ def test_a_study_makes_one_small_page_with_the_table_of_the_command_line(name, c
     assert_is_self_contained(page)
     assert_has_the_table_of_the_command_line(page, RESULTS / name, capsys)
     assert page.tags["svg"] >= 1
-    assert page.tags["img"] == (RESULTS / name / "episodes.png").is_file()
+    is_old = not (RESULTS / name / "episodes.json").is_file()
+    assert page.tags["img"] == (is_old and (RESULTS / name / "episodes.png").is_file())
 
 
 @pytest.mark.parametrize("name", ["one", "both", "bench", "rig.csv", "chirp.csv"])
@@ -265,13 +271,40 @@ def test_parameters_are_those_of_the_command_line(name, made, capsys, monkeypatc
         assert re.search(r"\s+".join(map(re.escape, row)), shown)
     for sentence in result["verdict"]:
         assert sentence in page.words
-    (output, fit, _, p, white), *held_out = page.table_with("output", "fit")[1:]
-    assert f"{output}: fit {fit}, residual white with p = {p}" in shown
-    assert white == ("white" if result["whiteness_p_value"]["pitch"] >= 0.05 else "not white")
+    (output, fit, _, *tests), *held_out = page.table_with("output", "fit")[1:]
+    assert f"{output}: fit {fit}, {residual_in_words(result, output)}\n" in shown
+    assert tests == residual_cells(result, output)
     assert len(held_out) == len(result["validation"])
     correlation = re.search("largest correlation: (.*)", shown)
     assert correlation
     assert f"Largest correlation: {correlation[1]}." in "".join(page.words)
+
+
+@pytest.mark.parametrize(
+    ("white", "structure", "cells", "words"),
+    [
+        (0.03, 0.04, ["yes", "0.0300", "no", "0.0400"],
+         "residual white (p = 0.0300), does not follow the input (p = 0.0400)"),
+        (1e-9, 0.009, ["no", "1.00e-09", "yes", "0.00900"],
+         "residual not white (p = 1.00e-09), follows the input (p = 0.00900)"),
+        (None, math.nan, ["–", "–", "–", "–"], "residual too small to be tested"),
+    ],
+)  # fmt: skip
+def test_a_residual_is_judged_at_one_percent_everywhere(white, structure, cells, words, here):
+    path = here / "one" / "estimate.json"
+    tests = {"whiteness_p_value": {"pitch": white}, "structure_p_value": {"pitch": structure}}
+    path.write_text(json.dumps({**read(path), **tests}))
+    page = Page(report_html([here / "one"]))
+    header, row = page.table_with("output", "fit")
+    assert header[3:] == ["white", "p", "follows the input", "p"]
+    assert row[3:] == cells
+    assert residual_in_words(tests, "pitch") == words
+
+
+def test_a_folder_from_before_the_second_test_is_read(here):
+    path = here / "one" / "estimate.json"
+    path.write_text(json.dumps({k: v for k, v in read(path).items() if k != "structure_p_value"}))
+    assert Page(report_html([here / "one"])).table_with("output", "fit")[1][-2:] == ["–", "–"]
 
 
 def test_a_simulated_plants_own_parameters_stand_beside_the_estimates(made):
@@ -366,7 +399,7 @@ def test_several_runs_stand_side_by_side(made):
     page = page_of(made / "one", made / "both", made / "bench", made / "one")
     assert_is_self_contained(page)
     header, *rows = page.table_with("", "unit")
-    assert header[2:] == ["1. one", "2. both", "3. one"]
+    assert header[2:] == ["1. one", "2. both", "4. one"]  # as in the contents
     shown = {row[0]: row[2:] for row in rows}
     for name, cells in shown.items():
         assert cells[0] == cells[2], name
@@ -376,6 +409,63 @@ def test_several_runs_stand_side_by_side(made):
             own = parameter_cells(name, p)
             assert shown[name][column] == f"{own[2]} ({own[4]})"
     assert {"run1", "run2", "run3", "run4"} <= page.uses & set(page.ids)
+
+
+def test_several_studies_stand_side_by_side_by_their_common_methods():
+    page = page_of(RESULTS / "table1", RESULTS / "paper", RESULTS / "emps")
+    assert_is_self_contained(page)
+    header, *rows = page.table_with("method", "estimator", "study")
+    shown = {tuple(row[:3]): dict(zip(header[3:], row[3:], strict=True)) for row in rows}
+    assert {title for _, _, title in shown} == {"1. table1", "2. paper"}
+    assert {method for method, _, _ in shown} == {"RL(all)"}
+    for name, title in (("table1", "1. table1"), ("paper", "2. paper")):
+        for row in read(RESULTS / name / "table.json")["rows"]:
+            if row["method"] == "RL(all)" and row["estimator"] in ("arx-rls", "nls"):
+                cells = shown["RL(all)", row["estimator"], title]
+                error = row["relative_error_percent"]["D_p"]
+                assert cells["D_p error %"] == f"{number(error['mean'])} ± {number(error['sd'])}"
+                assert cells["violations (95 %)"].startswith(f"{row['violations']}/")
+    settings = {row[0]: row[1:] for row in page.table_with("", "1. table1", "2. paper")[1:]}
+    assert all(first != second for first, second in settings.values())
+    assert settings["decision: output_scale: pitch"] == ["0.3", "–"]
+
+
+def test_studies_without_a_common_method_say_so_and_other_plants_are_not_compared(here):
+    shutil.copytree("bench", "other")
+    for name in ("random", "chirp"):
+        renamed(here / "other" / "table.json", name, new=f"new {name}")
+    sentence = "1. bench and 2. other have no method and estimator in common."
+    assert sentence in Page(report_html([here / "bench", here / "other"])).words
+    renamed(here / "other" / "table.json", "J_p", new="other")
+    assert "side by side" not in report_html([here / "bench", here / "other"])
+
+
+def test_long_records_make_no_large_page(here, monkeypatch):
+    result, rng = read(here / "one" / "estimate.json"), np.random.default_rng(0)
+    count, length = 6, 7999
+    for i in range(1, count + 1):
+        time, noise = 0.02 * np.arange(length), rng.normal(size=(3, length))
+        for name, columns in (("record", "time,voltage,pitch"), ("simulated", "time,pitch")):
+            values = [time, noise[0], noise[1]] if name == "record" else [time, 0.2 * noise[2]]
+            np.savetxt(here / "one" / f"{name}_{i}.csv", np.transpose(values), delimiter=",",
+                       header=columns, comments="")  # fmt: skip
+    (here / "one" / "estimate.json").write_text(json.dumps({**result, "files": ["a.csv"] * count}))
+    assert_is_self_contained(Page(report_html([here / "one", here / "one"])))
+    monkeypatch.setattr("excite.report.html._NUM_POINTS", (4000,))
+    large = report_html([here / "one", here / "one"])
+    assert len(large) > LIMIT
+    assert "easier to send on several" in large
+
+
+def test_what_scrolls_on_a_screen_is_reached_by_the_keyboard_and_named(made):
+    text = page_of(RESULTS / "table1").text
+    boxes = re.findall('<div class="scroll[^>]*>', text)
+    stops = [box for box in boxes if "tabindex" in box]
+    assert 0 < len(stops) < len(boxes)
+    names = [re.findall('role="region" aria-label="([^"]*)"', box) for box in stops]
+    assert all(len(name) == 1 and len(name[0]) > 15 for name in names)
+    assert "table: Table 1: learned excitation beside the baselines" in [name[0] for name in names]
+    assert "tabindex" not in page_of(made / "one").text  # nothing in it is that wide
 
 
 def test_a_single_run_needs_no_list_of_contents(made):

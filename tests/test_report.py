@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from catalogue import TwoMasses
 
-from excite.description import PlantDescription
+from excite.description import HALF_95, PlantDescription
 from excite.plant import EMPS, Aero2, CartPole
 from excite.records import Record
 from excite.report import (
@@ -33,6 +33,7 @@ from excite.report import (
     footnotes,
     identification_figure,
     information_figure,
+    kept_samples,
     number,
     reference_cells,
     require_plot_path,
@@ -500,12 +501,45 @@ def test_the_autocorrelation_of_white_noise_lies_between_the_dashed_lines():
         bars = np.array([bar[1, 1] for bar in lines.get_segments()])
         level = max(np.asarray(line.get_ydata(), float)[0] for line in axis.get_lines())
         assert len(bars) == 25
-        assert level == pytest.approx(1.96 / math.sqrt(4000))
+        assert level == pytest.approx(HALF_95 / math.sqrt(4000))
         assert least <= np.mean(np.abs(bars) < level) <= most
     one = walk[0][:, 0] - walk[0].mean()
     (axis,) = autocorrelation_figure(AERO2, walk[:1]).axes
     first: Any = axis.collections[0]
     assert first.get_segments()[0][1, 1] == pytest.approx(one[1:] @ one[:-1] / (one @ one))
+
+
+@pytest.mark.parametrize("length", [3, 100, 101, 4001, 7999, 100_000])
+def test_of_a_long_record_every_peak_is_kept_and_no_more_points_than_allowed(length):
+    rng = np.random.default_rng(length)
+    first, second = rng.normal(size=(2, length))
+    at = rng.choice(length, min(12, length), replace=False)
+    first[at] = np.where(np.arange(len(at)) % 2, 50.0, -50.0)
+    second[: length // 2] = np.nan
+    kept = kept_samples([first, second], 100)
+    assert len(kept) <= max(100, 3)
+    assert np.all(np.diff(kept) > 0)
+    assert kept[0] == 0
+    assert kept[-1] == length - 1
+    assert len(kept) == length or len(kept) > 25
+    assert {first[kept].min(), first[kept].max()} == {first.min(), first.max()}
+    assert np.nanmax(second[kept]) == np.nanmax(second)
+    assert np.nanmin(second[kept]) == np.nanmin(second)
+
+
+def test_a_single_sample_beyond_a_critical_level_is_drawn():
+    d, record = AERO2, record_of(AERO2, 9999)
+    outputs = np.zeros_like(record.outputs)
+    outputs[5001] = 2.0  # far beyond it, and no multiple of any step
+    record = dataclasses.replace(record, outputs=outputs)
+    for figure in (
+        episode_figure(d, record),
+        identification_figure(d, result_of(d), record, np.zeros_like(outputs)),
+    ):
+        lines = [line for axes in figure.axes[:2] for line in axes.get_lines()]
+        drawn = [np.asarray(line.get_ydata(), float) for line in lines]
+        highest = [values.max() for values in drawn if len(values) > 2]  # a level has two ends
+        assert max(highest) == pytest.approx(np.degrees(2.0))
 
 
 def test_a_figure_that_cannot_be_written_leaves_nothing(figures, tmp_path):

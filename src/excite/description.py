@@ -24,6 +24,10 @@ FORMAT = 1
 HALF_95 = 1.959964
 """Half of a 95 % interval in standard deviations, wherever one is shown."""
 
+RARE = 0.01
+"""p-value below which a residual is said not to be white, or to follow the input: in sentences,
+in tables, and where intervals are widened for it."""
+
 
 def _require(condition: bool, sentence: str) -> None:
     if not condition:

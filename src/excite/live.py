@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import shlex
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -44,13 +45,14 @@ from .names import (
 from .plant import AbstractPlant, Params, params_from
 from .policy import mismatch, read_policy, shipped_policies
 from .records import Record, columns_in, read_record
-from .report import report_html
+from .report import kept_samples, report_html
 from .safety import critical_levels, is_violation, max_abs_output
 from .simulation import Trajectory, run_episode
 
 Event = dict[str, Any]
 NUM_ESTIMATES = 20
 _FIRST = 40  # samples before the first estimate, the shortest horizon of the estimator
+_RECORD = "record.csv"  # name of a simulated record, here and in the command that makes it
 _MAX_POINTS = 2000  # more cannot be told apart on a screen
 _MAX_COLUMNS, _MAX_NAME = 500, 200  # of an uploaded file, and characters of a column's name
 
@@ -217,7 +219,7 @@ def followed(asked: Mapping[str, Any], folder: str) -> Iterator[Event]:
     yield from _estimates(own, run, information)
     row, result = _outcome(own, run, information[-1])
     if result is not None:
-        write_run(result, Path(folder))
+        write_run(result, Path(folder), command=_experiment_again(asked))
     identification = None if result is None else result.to_dict()
     yield {"kind": "result", "row": row, "identification": identification}
     for name in asked["others"]:
@@ -248,6 +250,35 @@ def _estimates(own: Experiment, run: Trajectory, information: Any) -> Iterator[E
         }
 
 
+def _experiment_again(asked: Mapping[str, Any]) -> str:
+    """The commands that make the same run folder, one a line."""
+    has_amplitude = asked["amplitude"] is not None and asked["excitation"] in EXCITATIONS
+    simulate = [
+        "excite", "simulate", asked["plant"], "--excitation", asked["excitation"],
+        *_given("--set", {"amplitude": asked["amplitude"]} if has_amplitude else {}),
+        "--steps", str(asked["steps"]), *_given("--params", asked["params"]),
+        *_given("--noise", asked["noise"]), "--seed", str(asked["seed"]), "--out", _RECORD,
+    ]  # fmt: skip
+    identify = ["excite", "identify", _RECORD, "--plant", asked["plant"], "--out", "run"]
+    return f"{shlex.join(simulate)}\n{shlex.join(identify)}"
+
+
+def _identification_again(asked: Mapping[str, Any], name: str) -> str:
+    """The command that makes the same run folder of a file."""
+    words = [
+        "excite", "identify", name, "--plant", asked["plant"], "--estimator", asked["estimator"],
+        "--initial-state", asked["initial_state"], *_given("--column", asked["columns"]),
+        *_given("--scale", asked["scales"]), "--out", "run",
+    ]  # fmt: skip
+    return shlex.join(words)
+
+
+def _given(option: str, values: Mapping[str, Any]) -> list[str]:
+    """An option with its assignments, numbers in full; nothing where there are none."""
+    pairs = ",".join(f"{name}={value}" for name, value in values.items())
+    return [option, pairs] if pairs else []
+
+
 def _first(data: Experiments, count: int) -> Experiments:
     """The experiment when so many samples were measured; nothing compiles again."""
     return dataclasses.replace(data, valid=jnp.arange(data.valid.shape[1])[None] < count)
@@ -262,7 +293,7 @@ def _outcome(
     record = simulated_record(run, own.plant, own.params, provenance)
     # The estimator knows the plant as shipped: it is told nothing of this one's noise.
     metadata = {**record.metadata, "plant": d.to_dict(), "plant_hash": d.hash}
-    record = dataclasses.replace(record, metadata=json_ready(metadata), source="record.csv")
+    record = dataclasses.replace(record, metadata=json_ready(metadata), source=_RECORD)
     result, sentence = None, ""
     try:
         result = identify(plant, [record])
@@ -320,17 +351,18 @@ def identified(asked: Mapping[str, Any], source: str, name: str, folder: str) ->
     with contextlib.chdir(source):
         record = read_record(Path(name), plant.description, asked["columns"], asked["scales"])
     result = identify(plant, [record], estimator, initial_state=asked["initial_state"])
-    write_run(result, Path(folder))
+    write_run(result, Path(folder), command=_identification_again(asked, name))
     fitted = result.fitted[0]
-    every = max(1, len(record.time) // _MAX_POINTS)
+    signals = [*record.inputs.T, *record.outputs.T, *fitted.simulated.T]
+    kept = kept_samples(signals, _MAX_POINTS)
     yield {
         "kind": "identified",
         "plant": _shown(result.plant),
         "identification": result.to_dict(),
-        "time": record.time[::every],
-        "inputs": record.inputs[::every],
-        "outputs": record.outputs[::every],
-        "simulated": fitted.simulated[::every],
+        "time": record.time[kept],
+        "inputs": record.inputs[kept],
+        "outputs": record.outputs[kept],
+        "simulated": fitted.simulated[kept],
     }
 
 

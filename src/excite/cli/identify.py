@@ -130,7 +130,13 @@ def identify(
 
 
 def _show(description: Any, data: dict[str, Any], out: Path | None) -> None:
-    from ..report import largest_correlation, number, parameter_cells, parameter_header
+    from ..report import (
+        largest_correlation,
+        number,
+        parameter_cells,
+        parameter_header,
+        residual_in_words,
+    )
 
     show_table(
         f"{data['plant']}, {data['estimator']}, initial state {data['initial_state']}: "
@@ -139,10 +145,7 @@ def _show(description: Any, data: dict[str, Any], out: Path | None) -> None:
         [parameter_cells(name, p) for name, p in data["params"].items()],
     )
     for name, percent in data["fit_percent"].items():
-        whiteness = data["whiteness_p_value"][name]
-        click.echo(
-            f"{name}: fit {number(percent, 4)} %, residual white with p = {number(whiteness)}"
-        )
+        click.echo(f"{name}: fit {number(percent, 4)} %, {residual_in_words(data, name)}")
     for v in data["validation"]:
         for name, percent in v["fit_percent"].items():
             click.echo(f"{v['file']}: held-out {name} fit {number(percent, 4)} %")

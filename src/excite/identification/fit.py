@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..description import PlantDescription, names_of
+from ..description import RARE, PlantDescription, names_of
 from ..estimation import (
     NLS,
     AbstractEstimator,
@@ -37,7 +37,6 @@ from ..records import Record
 from .base import Fitted, Identification
 
 InitialState = Literal["auto", "free", "known"]
-_WHITE = 0.01  # a residual is called coloured when whiteness is less probable
 _NOTHING_SEEN = (
     "no parameter can be seen in the data; are columns, signs and units right, and does the "
     "input move the plant beyond the noise?"
@@ -265,7 +264,7 @@ def _confidence(
     names = names_of(plant.definition.parameters)
     size = np.asarray(relative_size(plant, fit.estimate.params))
     remarks = ()
-    coloured = [name for name, p in whiteness.items() if p < _WHITE]
+    coloured = [name for name, p in whiteness.items() if p < RARE]
     if coloured and isinstance(estimator, NLS):
         S, residual = estimator.sensitivity(plant, experiments, fit.estimate, jnp.asarray(fit.free))
         robust = robust_covariance(np.asarray(S), np.asarray(residual))
@@ -310,7 +309,7 @@ def _dependence(
 
 def _wrong_structure(structure: Mapping[str, float]) -> tuple[str, ...]:
     """A sentence where a residual follows the input."""
-    wrong = [name for name, p in structure.items() if p < _WHITE]
+    wrong = [name for name, p in structure.items() if p < RARE]
     if not wrong:
         return ()
     return (

@@ -7,6 +7,7 @@ line of this room computes an experiment.
 from .base import PLOT_ENDINGS as PLOT_ENDINGS
 from .base import digits_for as digits_for
 from .base import image as image
+from .base import kept_samples as kept_samples
 from .base import number as number
 from .base import require_plot_path as require_plot_path
 from .base import save as save
@@ -35,5 +36,7 @@ from .tables import largest_correlation as largest_correlation
 from .tables import parameter_cells as parameter_cells
 from .tables import parameter_header as parameter_header
 from .tables import reference_cells as reference_cells
+from .tables import residual_cells as residual_cells
+from .tables import residual_in_words as residual_in_words
 from .tables import table_cells as table_cells
 from .tables import table_header as table_header

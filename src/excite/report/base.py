@@ -5,11 +5,13 @@ Degrees and percent live in this room and in the command line only.
 
 from __future__ import annotations
 
+import contextlib
 import io
 import math
 import re
 import textwrap
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +30,9 @@ BLUE, ORANGE, GREEN, RED, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#7
 _COLOURS = (BLUE, ORANGE, GREEN, RED, "#CC79A7", "#56B4E9")
 PLOT_ENDINGS = (".png", ".svg", ".pdf")
 _MIN_WIDTH = 6.4  # inches; a narrower figure cuts its title and its legend
-_MAX_POINTS = 4000  # more cannot be told apart on paper and make files slow to open
+MAX_POINTS = 4000
+"""Of one line: more cannot be told apart on paper and make files slow to open."""
+_POINTS = ContextVar("points", default=MAX_POINTS)
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -186,10 +190,40 @@ def axis_label(part: Input | Output) -> str:
     return f"{part.name} [{display_unit(part.unit)[0]}]"
 
 
-def thin(*arrays: np.ndarray) -> list[np.ndarray]:
-    """Every n-th sample of long arrays."""
-    every = max(1, len(arrays[0]) // _MAX_POINTS)
-    return [a[::every] for a in arrays]
+@contextlib.contextmanager
+def at_most(points: int) -> Iterator[None]:
+    """Figures drawn inside have no longer lines than this."""
+    token = _POINTS.set(points)
+    try:
+        yield
+    finally:
+        _POINTS.reset(token)
+
+
+def thin(time: np.ndarray, *values: np.ndarray) -> list[np.ndarray]:
+    """Long arrays as they look in a picture: every peak of them is kept."""
+    kept = kept_samples(values, _POINTS.get())
+    return [a[kept] for a in (time, *values)]
+
+
+def kept_samples(values: Sequence[np.ndarray], points: int) -> np.ndarray:
+    """At most so many indices: ends, and the smallest and largest of every stretch of samples.
+
+    Args:
+        values: arrays of one length, which share the indices; what is no number is no peak.
+    """
+    length = len(values[0])
+    if length <= points:
+        return np.arange(length)
+    stretches = max(1, (points - 2) // (2 * len(values)))
+    starts = np.unique(np.linspace(0, length, stretches, endpoint=False).astype(int))
+    kept = {0, length - 1}
+    for array in values:
+        parts = list(zip(starts, np.split(array, starts[1:]), strict=True))
+        known = [(start, np.isnan(part), part) for start, part in parts]
+        kept |= {start + int(np.where(gap, np.inf, v).argmin()) for start, gap, v in known}
+        kept |= {start + int(np.where(gap, -np.inf, v).argmax()) for start, gap, v in known}
+    return np.array(sorted(kept))
 
 
 def draw_levels(axis: Any, part: Output, largest: float) -> None:

@@ -42,12 +42,15 @@ def identification_figure(
     for i, part in enumerate(outputs):
         top, below = axes[2 * i, 0], axes[2 * i + 1, 0]
         factor = display_unit(part.unit)[1]
-        time, measured, model = thin(record.time, record.outputs[:, i], simulated[:, i])
+        residual = record.outputs[:, i] - simulated[:, i]
+        time, measured, model, residual = thin(
+            record.time, record.outputs[:, i], simulated[:, i], residual
+        )
         top.plot(time, factor * measured, color=GREY, lw=1.6, label="measured")
         top.plot(time, factor * model, color=BLUE, lw=1, label="simulated")
         fit = result["fit_percent"][part.name]
         top.set(ylabel=axis_label(part), title=f"{part.name}: fit {number(fit, 4)} %")
-        below.plot(time, factor * (measured - model), color=ORANGE, lw=0.8)
+        below.plot(time, factor * residual, color=ORANGE, lw=0.8)
         below.set(ylabel=f"residual [{display_unit(part.unit)[0]}]")
     axes[-2, 0].set(xlabel="time [s]")
     _draw_intervals(axes[-1, 0], result["params"])

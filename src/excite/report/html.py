@@ -11,12 +11,18 @@ import matplotlib
 
 from .. import __version__
 from ..files import read_json
-from .base import PAGE_STYLE
-from .sections.base import Section, text
+from .base import MAX_POINTS, PAGE_STYLE, at_most
+from .sections.base import Section, paragraph, text
 from .sections.experiment import Experiment, comparison, experiment_section, read_experiment
-from .sections.record import read_recorded, record_section
-from .sections.study import read_study_run, study_section
+from .sections.record import Recorded, read_recorded, record_section
+from .sections.study import StudyRun, common_methods, read_study_run, study_section
 
+MAX_BYTES = 3_000_000
+"""Size above which a page is drawn again with shorter lines: it is to be sent by mail."""
+_NUM_POINTS = (MAX_POINTS, 1000, 250)
+_TOO_LARGE = (
+    f"This page is larger than {MAX_BYTES / 1e6:g} MB: its runs are easier to send on several."
+)
 _STYLE = Path(__file__).with_name("page.css")
 _KINDS: dict[str, tuple[Callable[..., Any], Callable[[Any, str], Section]]] = {
     "excite identification": (read_experiment, experiment_section),
@@ -31,6 +37,8 @@ def report_html(
 ) -> str:
     """A report of run folders and records as one HTML document.
 
+    Of long records, its lines show the extremes of every stretch, fewer where the page gets large.
+
     Args:
         runs: folders of `excite identify`, `excite benchmark` and `excite study run`, and
             records (.csv, .mat) with their sidecar.
@@ -40,15 +48,41 @@ def report_html(
         ValueError: for what cannot be read as one of them.
     """
     every = [_read(path) for path in runs]  # whatever is damaged is said before anything is drawn
+    page = ""
+    for points in _NUM_POINTS:
+        with _DRAWING, matplotlib.rc_context(PAGE_STYLE), at_most(points):
+            page = _drawn(every, runs, progress)
+        if len(page.encode()) <= MAX_BYTES:
+            return page
+    return page.replace("<main>\n", f"<main>\n{paragraph(_TOO_LARGE)}", 1)
+
+
+def _drawn(
+    every: Sequence[tuple[Any, Callable[[Any, str], Section]]],
+    runs: Sequence[Path],
+    progress: Callable[[str, int, int], None],
+) -> str:
+    """The page, its lines as long as they may be now."""
     sections = []
-    with _DRAWING, matplotlib.rc_context(PAGE_STYLE):
-        for i, (own, section) in enumerate(every):
-            progress(runs[i].name, i, len(runs))
-            sections.append(section(own, f"run{i + 1}"))
+    for i, (own, section) in enumerate(every):
+        progress(runs[i].name, i, len(runs))
+        sections.append(section(own, f"run{i + 1}"))
     progress("done", len(runs), len(runs))
-    experiments = [own for own, _ in every if isinstance(own, Experiment)]
-    beside = comparison(experiments) if len(experiments) > 1 else ""
-    return _document(sections, beside)
+    return _document(sections, _beside([own for own, _ in every]))
+
+
+def _beside(runs: Sequence[Any]) -> str:
+    """What several experiments, and several studies, have in common; numbers as in the contents."""
+    numbered = {f"{i}. {run.folder.absolute().name}": run for i, run in enumerate(runs, 1)
+                if not isinstance(run, Recorded)}  # fmt: skip
+    experiments = {n: run for n, run in numbered.items() if isinstance(run, Experiment)}
+    studies = {n: run for n, run in numbered.items() if isinstance(run, StudyRun)}
+    parts = []
+    if len(experiments) > 1:
+        parts.append(("Experiments side by side", comparison(experiments)))
+    if len(studies) > 1:
+        parts.append(("Studies side by side", common_methods(studies)))
+    return "".join(f"<section>\n<h2>{h}</h2>\n{b}</section>\n" for h, b in parts if b)
 
 
 def _read(path: Path) -> tuple[Any, Callable[[Any, str], Section]]:
@@ -74,8 +108,6 @@ def _document(sections: Sequence[Section], beside: str) -> str:
     if len(sections) == 1:
         numbered, contents = {"": sections[0]}, _source(sections[0])
         title = sections[0].title
-    if beside:
-        contents += f"<section>\n<h2>Experiments side by side</h2>\n{beside}</section>\n"
     body = "".join(
         f'<section id="run{i}">\n{_head(t, s)}{s.body}</section>\n'
         for i, (t, s) in enumerate(numbered.items(), 1)
@@ -93,7 +125,7 @@ def _document(sections: Sequence[Section], beside: str) -> str:
 <body>
 <header><h1>{text(title)}</h1></header>
 <main>
-{contents}{body}</main>
+{contents}{beside}{body}</main>
 <footer>Made by excite {__version__}.</footer>
 </body>
 </html>

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..description import PlantDescription
 from ..records import Record
-from .base import BLUE, RED, add_legend, add_title, colour_of, draw_episodes, new_figure
+from .base import BLUE, RED, add_legend, add_title, colour_of, draw_episodes, new_figure, thin
 
 Curve = Mapping[str, np.ndarray]
 """Columns of one learning curve by name; `steps` is one of them."""
@@ -106,7 +106,8 @@ def _draw_running(
     """Estimates over true parameters, one axis an experiment."""
     for axis, record, estimates in zip(axes, records, running, strict=True):
         for i, part in enumerate(description.parameters):
-            axis.plot(record.time, estimates[:, i], color=colour_of(i), lw=1, label=part.name)
+            time, values = thin(record.time, estimates[:, i])
+            axis.plot(time, values, color=colour_of(i), lw=1, label=part.name)
         axis.axhline(1, color="black", lw=0.6)
     estimator = records[0].metadata.get("estimator", "estimate")
     axes[0].set(yscale="log", ylim=(0.1, 30), ylabel=f"{estimator} / true")

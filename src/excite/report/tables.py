@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ..description import RARE
 from ..files import csv_text
 from .base import digits_for, mean_sd, number
 
@@ -284,6 +285,31 @@ def parameter_cells(name: str, param: Mapping[str, Any]) -> list[str]:
         f"{number(low, digits)} to {number(high, digits)}",
         relative,
     ]
+
+
+def residual_cells(result: Mapping[str, Any], output: str) -> list[str]:
+    """Whether a residual is white and whether it follows the input, each with its p-value."""
+    cells = []
+    for test, words in (("whiteness", ("yes", "no")), ("structure", ("no", "yes"))):
+        # Folders of before the second test do not have it.
+        p = result.get(f"{test}_p_value", {}).get(output)
+        if p is None or not math.isfinite(p):
+            cells += ["–", "–"]
+        else:
+            cells += [words[p < RARE], number(p)]
+    return cells
+
+
+def residual_in_words(result: Mapping[str, Any], output: str) -> str:
+    """The same tests as a part of a sentence."""
+    white, p_white, follows, p_follows = residual_cells(result, output)
+    parts = []
+    if white != "–":
+        parts.append(f"residual {'white' if white == 'yes' else 'not white'} (p = {p_white})")
+    if follows != "–":
+        word = "follows" if follows == "yes" else "does not follow"
+        parts.append(f"{word} the input (p = {p_follows})")
+    return ", ".join(parts) or "residual too small to be tested"
 
 
 def largest_correlation(result: Mapping[str, Any]) -> str:

@@ -22,6 +22,7 @@ from ..base import inline_svg, number
 
 _NUM_LABELS = 2  # columns of words before those of numbers
 _NARROW = 8  # columns that fit a page that stands upright
+_NARROW_FIGURE = 12.0  # inches that fit a screen
 
 
 @dataclass(frozen=True)
@@ -74,10 +75,16 @@ def heading(value: str) -> str:
     return f"<h3>{text(value)}</h3>\n"
 
 
-def table(header: Sequence[str], rows: Sequence[Sequence[str]], labels: int = _NUM_LABELS) -> str:
+def table(
+    header: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    labels: int = _NUM_LABELS,
+    name: str = "",
+) -> str:
     """A table that scrolls in a box of its own where it is wide.
 
     Args:
+        name: what it is, for those who cannot see it; default the titles of its columns.
         labels: how many columns are words; a line is drawn where the first of them changes,
             and published rows look different.
     """
@@ -91,9 +98,11 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]], labels: int = _N
         classes = ["first"] * (row[0] != before) + ["published"] * ("as published" in row)
         lines.append(f'<tr class="{" ".join(classes)}">{cells("td", row)}</tr>\n')
         before = row[0]
-    wide = " wide" if len(header) > _NARROW else ""
+    box = '<div class="scroll">'
+    if len(header) > _NARROW:
+        box = _reachable(f"table: {name or ', '.join(filter(None, header))}", " wide")
     return (
-        f'<div class="scroll{wide}" tabindex="0" role="region" aria-label="table"><table>\n'
+        f"{box}<table>\n"
         f"<thead><tr>{cells('th', header)}</tr></thead>\n"
         f"<tbody>\n{''.join(lines)}</tbody></table></div>\n"
     )
@@ -115,20 +124,26 @@ def figure(drawn: matplotlib.figure.Figure, name: str, caption: str) -> str:
     """A figure in a box that scrolls; `name` is its own on the page."""
     svg = inline_svg(drawn, name)
     labelled = svg.replace("<svg", f'<svg role="img" aria-label="{text(caption)}"', 1)
-    return _captioned(labelled, caption)
+    is_wide = bool(drawn.get_figwidth() > _NARROW_FIGURE)
+    return _captioned(labelled, caption, is_wide)
 
 
 def picture(path: Path, caption: str) -> str:
     """A PNG file as part of the page."""
     data = base64.b64encode(path.read_bytes()).decode()
-    return _captioned(f'<img alt="{text(caption)}" src="data:image/png;base64,{data}">', caption)
-
-
-def _captioned(content: str, caption: str) -> str:
-    return (
-        f'<figure><div class="scroll" tabindex="0" role="region" aria-label="figure">{content}'
-        f"</div><figcaption>{text(caption)}</figcaption></figure>\n"
+    return _captioned(
+        f'<img alt="{text(caption)}" src="data:image/png;base64,{data}">', caption, True
     )
+
+
+def _captioned(content: str, caption: str, is_wide: bool) -> str:
+    box = _reachable(f"figure: {caption}") if is_wide else '<div class="scroll">'
+    return f"<figure>{box}{content}</div><figcaption>{text(caption)}</figcaption></figure>\n"
+
+
+def _reachable(name: str, also: str = "") -> str:
+    """The beginning of a box that scrolls on a usual screen: by the keyboard, too, and named."""
+    return f'<div class="scroll{also}" tabindex="0" role="region" aria-label="{text(name)}">'
 
 
 def command(kept: str | None, likely: str) -> str:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ...description import PlantDescription, names_of
+from ...description import RARE, PlantDescription, names_of
 from ...files import read_columns, read_json
 from ...records import Record
 from ..base import number
@@ -20,7 +20,7 @@ from ..figures import (
     episode_figure,
     identification_figure,
 )
-from ..tables import largest_correlation, parameter_cells, parameter_header
+from ..tables import largest_correlation, parameter_cells, parameter_header, residual_cells
 from .base import (
     Section,
     bullets,
@@ -39,7 +39,11 @@ from .base import (
 )
 
 _MAX_RECORDS = 6  # drawn of one run
-_WHITE = 0.05
+_TESTS = (
+    "White: without correlation in time (Ljung-Box). Follows the input: correlated with past "
+    "inputs, a sign that the structure of the plant is wrong for the data. Both are judged at "
+    f"p = {RARE:g}."
+)
 _ADVICE = "'excite identify --out' writes it again"
 
 
@@ -101,6 +105,7 @@ def experiment_section(experiment: Experiment, name: str) -> Section:
             _figures(experiment, name),
             heading("Residual"),
             table(*_residuals(experiment), labels=1),
+            paragraph(_TESTS),
             figure(
                 autocorrelation_figure(d, _residual_values(experiment)),
                 f"{name}-white",
@@ -164,16 +169,14 @@ def _residuals(experiment: Experiment) -> tuple[list[str], list[list[str]]]:
     result, rows = experiment.result, []
     residuals = np.concatenate(_residual_values(experiment))
     for i, part in enumerate(experiment.plant.outputs):
-        p = result["whiteness_p_value"][part.name]
         size = f"{number(float(np.sqrt(np.mean(residuals[:, i] ** 2))))} {part.unit}"
-        white = "–" if p is None else "white" if p >= _WHITE else "not white"
         fit = f"{number(result['fit_percent'][part.name], 4)} %"
-        rows.append([part.name, fit, size, number(p), white])
+        rows.append([part.name, fit, size, *residual_cells(result, part.name)])
     for held_out in result["validation"]:
         for output, percent in held_out["fit_percent"].items():
             label = f"{output}, held out: {held_out['file']}"
-            rows.append([label, f"{number(percent, 4)} %", "–", "–", "–"])
-    return ["output", "fit", "RMS residual", "p (Ljung-Box)", "at 5 %"], rows
+            rows.append([label, f"{number(percent, 4)} %", *"–––––"])
+    return ["output", "fit", "RMS residual", "white", "p", "follows the input", "p"], rows
 
 
 def _correlation(result: Mapping[str, Any], name: str) -> str:
@@ -219,13 +222,9 @@ def _likely_command(experiment: Experiment) -> str:
     )
 
 
-def comparison(experiments: Sequence[Experiment]) -> str:
-    """Estimates, with their intervals, and fits of several experiments side by side."""
-    header = [
-        "",
-        "unit",
-        *(f"{i}. {e.folder.absolute().name}" for i, e in enumerate(experiments, 1)),
-    ]
+def comparison(numbered: Mapping[str, Experiment]) -> str:
+    """Estimates, with their intervals, and fits of several experiments side by side, by title."""
+    header, experiments = ["", "unit", *numbered], list(numbered.values())
     names = {n: p["unit"] for e in experiments for n, p in e.result["params"].items()}
     outputs = list(dict.fromkeys(n for e in experiments for n in e.result["fit_percent"]))
     rows = [["status", "", *(e.result["status"] for e in experiments)]]
@@ -235,7 +234,7 @@ def comparison(experiments: Sequence[Experiment]) -> str:
     for output in outputs:
         fits = [number(e.result["fit_percent"].get(output), 4) for e in experiments]
         rows.append([f"fit of {output}", "%", *fits])
-    return table(header, rows)
+    return table(header, rows, name="Experiments side by side")
 
 
 def _interval(name: str, params: Mapping[str, Any]) -> str:

@@ -15,7 +15,14 @@ from ...records import Record
 from ..figures import benchmark_figure
 from ..frontier import frontier_figure, lengths_figure
 from ..study import Curve, agents_figure, curves_figure
-from ..tables import DIFFERENCES, all_cells, differences_cells, footnotes, table_header
+from ..tables import (
+    DIFFERENCES,
+    all_cells,
+    differences_cells,
+    footnotes,
+    table_cells,
+    table_header,
+)
 from .base import (
     Section,
     bullets,
@@ -34,6 +41,8 @@ from .base import (
 
 _BESIDE = 4  # episodes and learning curves in one figure
 _LEARNING = "Policies without exploration noise, while they learn: median and band over the seeds."
+_COMPARED = ("plant", "episodes", "num_steps", "seed", "seeds", "spread", "sensor", "rig",
+             "decision", "training", "gradient")  # fmt: skip
 _UNTRAINED = {"viable_seeds": None, "seeds": None, "train_seconds": None}
 
 
@@ -106,7 +115,8 @@ def _table(run: StudyRun) -> str:
     rows = run.content["rows"]
     if run.about["kind"] == "excite study":
         rows = [{**_UNTRAINED, **row} for row in rows]
-    return table(table_header(rows), all_cells(rows, run.settings.get("reference", {})))
+    cells = all_cells(rows, run.settings.get("reference", {}))
+    return table(table_header(rows), cells, name=run.title)
 
 
 def _comparisons(run: StudyRun, name: str) -> str:
@@ -266,3 +276,69 @@ def _choices(what: str, kind: str, choices: Mapping[str, Mapping[str, Any]]) -> 
         for name, own in choices.items()
     ]
     return [table([what, kind, "options"], rows, 3)] if rows else []
+
+
+def common_methods(numbered: Mapping[str, StudyRun]) -> str:
+    """Methods that stand in several studies side by side, by title; nothing without any.
+
+    Studies whose plants have other parameters or outputs are not compared.
+    """
+    groups: dict[Any, dict[str, StudyRun]] = {}
+    for title, run in numbered.items():
+        with understood(run.folder / "table.json", _advice(run.about)):
+            first = run.content["rows"][0]
+            alike = *first["relative_error_percent"], *_largest(first)
+        groups.setdefault(alike, {})[title] = run
+    return "".join(_compared(group) for group in groups.values() if len(group) > 1)
+
+
+def _largest(row: Mapping[str, Any]) -> tuple[str, str]:
+    """Which output a row tells the largest value of, and its unit."""
+    return row["max_abs_output"]["output"], row["max_abs_output"]["unit"]
+
+
+def _compared(group: Mapping[str, StudyRun]) -> str:
+    """The table of common methods, and how the studies differ."""
+    rows: dict[tuple[str, str], dict[str, Mapping[str, Any]]] = {}
+    for title, run in group.items():
+        for row in run.content["rows"]:
+            rows.setdefault((row["method"], row["estimator"]), {})[title] = row
+    common = {own: by_title for own, by_title in rows.items() if len(by_title) > 1}
+    if not common:
+        return paragraph(f"{' and '.join(group)} have no method and estimator in common.")
+    every = [row for by_title in common.values() for row in by_title.values()]
+    keys = set[str].intersection(*(set(row) for row in every)) - {"on_rig"}
+    cells = []
+    for by_title in common.values():
+        for title, row in by_title.items():
+            method, estimator, *rest = table_cells({k: row[k] for k in keys})
+            cells.append([method, estimator, title, *rest])
+    method, estimator, *rest = table_header([{k: every[0][k] for k in keys}])
+    header = [method, estimator, "study", *rest]
+    beside = table(header, cells, 3, name="methods in several studies")
+    return beside + _settings_beside(group)
+
+
+def _settings_beside(group: Mapping[str, StudyRun]) -> str:
+    """The settings in which studies differ: what a difference in their numbers may come from."""
+    every = [_flat({key: run.settings.get(key) for key in _COMPARED}) for run in group.values()]
+    rows = []
+    for key in dict.fromkeys(key for own in every for key in own):
+        words = [own.get(key, "–") for own in every]
+        if len(set(words)) > 1:
+            rows.append([key, *words])
+    if not rows:
+        return ""
+    differ = table(["", *group], rows, 1 + len(group), name="settings in which they differ")
+    return paragraph("Settings in which they differ; a dash is the default:") + differ
+
+
+def _flat(settings: Mapping[str, Any]) -> dict[str, str]:
+    """Settings in words, those of a group each by its own name."""
+    flat = {}
+    for key, value in settings.items():
+        if isinstance(value, Mapping):
+            flat |= {f"{key}: {name}": words for name, words in _flat(value).items()}
+        elif words := in_words(value):
+            flat[key] = words
+    return flat
