@@ -179,6 +179,13 @@ REFUSALS = {
     "no file of steps": ((*FAST, "--input", "v.csv"), "no such file"),
     "unit": ((*SIGNAL, *FAST, "--rig", "no.fmu"), "no.fmu"),
     "own rig without file": ((*SIGNAL, *FAST, "--rig", "no.py:Still"), "no such file"),
+    "a fault of a real rig": (
+        (*SIGNAL, "--rig", "quanser", "--fault", "dropout=0.1", "--dry-run"),
+        "--fault is of a simulated rig, not of 'quanser'",
+    ),
+    "a real rig in a hurry": (
+        (*SIGNAL, "--rig", "own.py:Still", "--fast", "--dry-run"), "--fast is of a simulated rig",
+    ),
     "own rig without class": ((*SIGNAL, *FAST, "--rig", "own.py:Quick"), "no rig class 'Quick'"),
     "own rig that is none": ((*SIGNAL, *FAST, "--rig", "own.py:Other"), "no rig class 'Other'"),
     "own rig half made": ((*SIGNAL, *FAST, "--rig", "own.py:Half"), "not a complete rig"),

@@ -277,7 +277,7 @@ def _column(
     if name not in table:
         raise ValueError(
             f"{path}: no column {name!r}; the file has {', '.join(table) or 'none'} "
-            f"(map one with --column {meaning}=NAME)"
+            f"(name it so, or where files are identified map one with --column {meaning}=NAME)"
         )
     column = table[name]
     if isinstance(column, np.ndarray):

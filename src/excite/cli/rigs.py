@@ -82,6 +82,7 @@ def job_from(options: dict[str, Any], has_jax: bool) -> Job:
 
     policy, name = (None, "") if options["signal"] else _policy(options)
     plant, rig = _rig(options, policy, has_jax)
+    _require_own(options)
     d = rig.description
     if plant is not None and not _fits(plant.description, d):
         if options["plant"] or options["filtered"]:
@@ -102,7 +103,10 @@ def job_from(options: dict[str, Any], has_jax: bool) -> Job:
     player = make()
     steps = options["steps"] or player.num_steps
     if steps > player.num_steps:
-        raise ValueError(f"{name} was made for {player.num_steps} steps; --steps asks for {steps}")
+        raise ValueError(
+            f"{name or options['signal']} was made for {player.num_steps} steps; "
+            f"--steps asks for {steps}"
+        )
     player.num_steps = steps
     return Job(rig, plant, make, player, name or str(options["signal"]))
 
@@ -151,6 +155,14 @@ def _rig(options: dict[str, Any], policy: Any, has_jax: bool) -> tuple[Any, Abst
             "path/to/file.py:ClassName)"
         )
     return plant, _own_rig(Path(path), word, description)
+
+
+def _require_own(options: dict[str, Any]) -> None:
+    """Raises ValueError for an option that this rig does not have."""
+    is_simulated = options["rig"] == "simulated"
+    for option, is_there in (("fault", False), ("fast", options["rig"].endswith(".fmu"))):
+        if options[option] and not (is_simulated or is_there):
+            raise ValueError(f"--{option} is of a simulated rig, not of {options['rig']!r}")
 
 
 def _plant(options: dict[str, Any], has_jax: bool) -> Any:

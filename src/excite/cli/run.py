@@ -197,4 +197,5 @@ def _show(job: Job, outcome: Any, tracker: Any, out: Path, as_json: bool) -> Non
         told = f"; true {true[name]:.5g}" if name in true else ""
         rows.append([f"{name}, live estimate", f"{value:.5g} ± {half:.2g}{told}"])
     show_table(f"{d.name}, {job.name}", ["", ""], rows)
-    click.echo(f"record: {out}; next: excite identify {out} --plant {d.name}")
+    told = f"; next: excite identify {out} --plant {d.name}" if outcome.num_samples else ""
+    click.echo(f"record: {out}{told}")

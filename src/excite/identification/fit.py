@@ -270,7 +270,7 @@ def _confidence(
         robust = robust_covariance(np.asarray(S), np.asarray(residual))
         robust = np.outer(size, size) * robust[: len(names), : len(names)]
         covariance = widened(covariance, robust)
-        remarks = ("the intervals allow for that; noise or plant differ from the model",)
+        remarks = ("the intervals allow for coloured noise, not for another plant",)
     elif coloured:
         remarks = ("the intervals assume that it is, and are too narrow",)
     remarks = tuple(
