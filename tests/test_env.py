@@ -17,7 +17,7 @@ from plain_env import PlainAero2Env
 from excite import safety
 from excite.description import Input, Output, Parameter, PlantDescription, State
 from excite.env import Env, EnvState, Transition, default_objective, reset_batch, step_batch
-from excite.information import experiment_information
+from excite.information import experiment_information, relative_size
 from excite.objective import (
     EstimationError,
     InformationGain,
@@ -132,7 +132,9 @@ def test_the_sum_of_rewards_is_the_information_gained(plant):
     expected = np.linalg.slogdet(gained)[1] - np.linalg.slogdet(prior)[1]
     assert np.sum(transitions.reward) == pytest.approx(expected, rel=1e-8)
     assert np.all(transitions.reward >= -1e-9)
-    sd = np.sqrt(np.diag(np.linalg.inv(gained)))
+    # Information is relative to the scale of a parameter that may be zero, an error to its value.
+    size = np.asarray(relative_size(plant, first.params)) / np.abs(np.stack(first.params))
+    sd = np.sqrt(np.diag(np.linalg.inv(gained))) * size
     np.testing.assert_allclose(transitions.relative_errors[-1], sd, rtol=1e-6)
     # The trajectory is that of the simulation, the shapes are those of the layout.
     outputs = jax.vmap(lambda state: plant.output(state, first.params))(states.plant_state)
