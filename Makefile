@@ -48,7 +48,7 @@ policies: ## what is shipped in src/excite/policies, from the results of the stu
 
 evaluations: .venv/core ## the shipped policies on plants they have never met, in results/policies
 	mkdir -p results/policies
-	for policy in $(filter-out cart_pole,$(notdir $(basename $(wildcard src/excite/policies/*.safetensors)))); do \
+	for policy in $(filter-out cart_pole aero2 aero2-goals aero2-damping,$(notdir $(basename $(wildcard src/excite/policies/*.safetensors)))); do \
 	  $(BIN)/excite evaluate $$policy --episodes 1000 --seed 7 --json > results/policies/$$policy.json || exit 1; \
 	done
 	$(BIN)/excite evaluate cart_pole --episodes 200 --seed 7 --json > results/policies/cart_pole.json

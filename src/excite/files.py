@@ -118,8 +118,7 @@ def write_bytes(path: Path, content: bytes) -> None:
     Raises:
         ValueError: where the folder does not exist or cannot be written.
     """
-    if not path.parent.is_dir():
-        raise ValueError(f"{path}: the folder {path.parent} does not exist")
+    require_folder(path)
     try:
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     except OSError as error:
@@ -137,10 +136,15 @@ def write_bytes(path: Path, content: bytes) -> None:
         Path(name).unlink(missing_ok=True)
 
 
-def require_new_file(path: Path, overwrite: bool) -> None:
-    """Raises ValueError, before anything is computed, where no such file may be written."""
+def require_folder(path: Path) -> None:
+    """Raises ValueError where a file has no folder to be written into."""
     if not path.parent.is_dir():
         raise ValueError(f"{path}: the folder {path.parent} does not exist")
+
+
+def require_new_file(path: Path, overwrite: bool) -> None:
+    """Raises ValueError, before anything is computed, where no such file may be written."""
+    require_folder(path)
     if path.is_dir():
         raise ValueError(f"{path} is a folder; choose another name")
     if path.exists() and not overwrite:

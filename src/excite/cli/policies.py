@@ -72,42 +72,40 @@ def policies(as_json: bool) -> None:
 def evaluate(policy: str, as_json: bool, **options: Any) -> None:
     """Score POLICY, a file or a shipped name, on plants drawn at random."""
     from ..benchmark import run_benchmark
-    from ..policy import read_policy
 
-    path = _path(policy)
-    chosen = warned(_study(policy, path, options))
+    own = _policy(policy)
+    chosen = warned(_study(policy, own, options))
     with progress_bar(f"evaluating {policy}") as progress:
         rows = run_benchmark(chosen, progress)
     if as_json:
         said = chosen.model_dump(mode="json", exclude_unset=True)
-        show_json({"policy_hash": read_policy(path).hash, "study": said, "rows": rows})
+        show_json({"policy_hash": own.hash, "study": said, "rows": rows})
     else:
         show_comparison(rows, chosen.model_dump(), None)
         click.echo(f"log det of the Fisher information: {rows[0]['log_det_information']:.2f}")
 
 
-def _path(policy: str) -> Path:
+def _policy(policy: str) -> Any:
+    """The policy of a file or a shipped name."""
     from ..names import unknown
-    from ..policy import POLICY_ENDING, policy_path, shipped_policies
+    from ..policy import POLICY_ENDING, policy_path, read_policy, shipped_policies
 
     path = policy_path(policy)
     if path is None and Path(policy).exists():
         raise ValueError(f"{policy}: policy files end in {POLICY_ENDING}")
     if path is None:
         raise unknown("policy", policy, [*shipped_policies(), "path/to/policy.safetensors"])
-    return path
+    return read_policy(path)
 
 
-def _study(policy: str, path: Path, options: dict[str, Any]) -> Any:
+def _study(policy: str, own: Any, options: dict[str, Any]) -> Any:
     """The study of one method that these options mean."""
     from ..names import plant_named
     from ..plant import AbstractARXPlant
-    from ..policy import read_policy
     from ..study import study_from
 
     if options["filtered"] and not options["on_rig"]:
         raise ValueError("--filter is a part of a rig; it needs --rig")
-    own = read_policy(path)
     plant = options["plant"] or own.plant.name
     kinds = ["arx-rls"] * isinstance(plant_named(plant), AbstractARXPlant) + ["nls"]
     study = study_from(

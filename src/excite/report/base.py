@@ -22,7 +22,7 @@ import matplotlib.ticker
 import numpy as np
 
 from ..description import Input, Output, PlantDescription, display_unit
-from ..files import write_bytes
+from ..files import require_folder, write_bytes
 from ..records import Record
 
 # Distinguishable with any colour vision (M. Okabe and K. Ito, 2008).
@@ -61,8 +61,7 @@ def require_plot_path(path: Path) -> None:
     """Raises ValueError, before anything is computed, where a figure cannot be written."""
     if path.suffix.lower() not in PLOT_ENDINGS:
         raise ValueError(f"{path}: figures end in {', '.join(PLOT_ENDINGS)}")
-    if not path.parent.is_dir():
-        raise ValueError(f"{path}: the folder {path.parent} does not exist")
+    require_folder(path)
 
 
 def save(figure: matplotlib.figure.Figure, path: Path) -> None:

@@ -242,7 +242,7 @@ class Agent:
                 # A gradient needs no reward on the way.
                 dense=self.method == "ppo" if chosen.dense is None else chosen.dense,
             )
-        own = self.estimators.get(chosen.estimator, EstimatorSettings(kind=chosen.estimator))
+        own = _estimator(chosen, self.estimators)
         estimator = estimator_named(own.kind, own.options)
         target_mask(plant.definition, list(chosen.goals) or None)  # checks the names
         goals = [chosen.goals.get(p.name, 1.0) for p in plant.definition.parameters]
@@ -314,8 +314,15 @@ _USED = {
 def _kind(form: str, chosen: RewardSettings, estimators: Mapping[str, EstimatorSettings]) -> str:
     if form == "information":
         return "information"
-    own = estimators.get(chosen.estimator, EstimatorSettings(kind=chosen.estimator))
-    return "errors of nls" if own.kind == "nls" else "errors of an ARX estimator"
+    is_nls = _estimator(chosen, estimators).kind == "nls"
+    return "errors of nls" if is_nls else "errors of an ARX estimator"
+
+
+def _estimator(
+    chosen: RewardSettings, estimators: Mapping[str, EstimatorSettings]
+) -> EstimatorSettings:
+    """The estimator of a reward: the study's by that name, or the usual one."""
+    return estimators.get(chosen.estimator, EstimatorSettings(kind=chosen.estimator))
 
 
 def _require_used(kind: str, names: Iterable[str]) -> None:

@@ -56,33 +56,13 @@ def routes(pool: Pool, run_of: Callable[[Request], Path]) -> list[Route]:
         with session.using(request.path_params["name"]) as folder:
             if not (folder / "run").is_dir():
                 raise RefusedError(404, "there is nothing to report of yet")
-            return await _reported(session, folder / "run")
+            return await _reported(pool, session, folder / "run")
 
     async def run_report(request: Request) -> Response:
         run = run_of(request)
         if any(path.is_symlink() for path in run.rglob("*")):
             raise RefusedError(422, "this run holds links, which the page does not follow")
-        return await _reported(request.state.session, run)
-
-    async def _reported(session: Session, run: Path) -> Response:
-        job = session.begin()
-        try:
-            with tempfile.TemporaryDirectory(dir=session.folder) as folder:
-                out = Path(folder) / "report.html"
-                wanted = {"folders": [str(run)], "out": str(out)}
-                await _last(pool, "reported", wanted, False)
-                content = out.read_bytes()
-        finally:
-            session.end(job)
-        return Response(
-            content,
-            media_type="text/html",
-            # It is a file to be kept; shown here, it could not run or load anything.
-            headers={
-                "content-disposition": 'attachment; filename="report.html"',
-                "content-security-policy": "sandbox; default-src 'none'",
-            },
-        )
+        return await _reported(pool, request.state.session, run)
 
     return [
         Route("/api/uploads", upload, methods=["POST"]),
@@ -90,6 +70,28 @@ def routes(pool: Pool, run_of: Callable[[Request], Path]) -> list[Route]:
         Route("/api/results/{name}/{file}", file),
         Route("/api/run/report.html", run_report),
     ]
+
+
+async def _reported(pool: Pool, session: Session, run: Path) -> Response:
+    """The report of a run, made in a folder that goes at once."""
+    job = session.begin()
+    try:
+        with tempfile.TemporaryDirectory(dir=session.folder) as folder:
+            out = Path(folder) / "report.html"
+            wanted = {"folders": [str(run)], "out": str(out)}
+            await _last(pool, "reported", wanted, False)
+            content = out.read_bytes()
+    finally:
+        session.end(job)
+    return Response(
+        content,
+        media_type="text/html",
+        # It is a file to be kept; shown here, it could not run or load anything.
+        headers={
+            "content-disposition": 'attachment; filename="report.html"',
+            "content-security-policy": "sandbox; default-src 'none'",
+        },
+    )
 
 
 def _file_name(name: str) -> str:
