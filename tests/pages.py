@@ -15,22 +15,46 @@ PAGES = [
     *sorted(ROOT.glob("*/README.md")),
     *sorted(ROOT.glob("docs/**/*.md")),
 ]
-_BLOCK = re.compile(r"(?:<!-- not run: (?P<why>[^\n]*?) -->\n+)?```sh\n(?P<lines>.*?)```", re.S)
+_BLOCK = re.compile(
+    r"(?:<!-- (?:not run: (?P<why>[^\n]*?)|shortened: (?P<shorter>[^\n]*?)) -->\n+)?"
+    r"```sh\n(?P<lines>.*?)```",
+    re.S,
+)
 _LINK = re.compile(r"!?\[[^\]]*\]\(([^)#\s]*)(?:#([^)\s]*))?\)")
 
 
 @dataclass(frozen=True)
 class Block:
-    """Commands shown together; `why` they are not run by the tests, if they are not."""
+    """Commands shown together.
+
+    Attributes:
+        why: they are not run by the tests, if they are not.
+        shorter: what tests add to them, so that they do not take minutes: the first words of
+            commands, each with further options, separated by semicolons.
+    """
 
     lines: str
     why: str | None
+    shorter: str | None
 
     @property
     def commands(self) -> list[str]:
         """One a line, comments and continuations taken away."""
         lines = self.lines.replace("\\\n", " ").splitlines()
         return [" ".join(line.split()) for line in lines if line.strip() and line[0] != "#"]
+
+    @property
+    def played(self) -> list[str]:
+        """The commands as tests run them."""
+        added = [part.strip() for part in (self.shorter or "").split(";") if part.strip()]
+        pairs = [(part.split(" --")[0], part[part.index(" --") :]) for part in added]
+        for start, _ in pairs:
+            assert any(command.startswith(start) for command in self.commands), start
+        commands = [command.partition(" #")[0].strip() for command in self.commands]
+        return [
+            command + "".join(more for start, more in pairs if command.startswith(start))
+            for command in commands
+        ]
 
 
 def name(page: Path) -> str:
@@ -39,7 +63,7 @@ def name(page: Path) -> str:
 
 def blocks(page: Path) -> list[Block]:
     """What the page shows as shell, in its order."""
-    return [Block(m["lines"], m["why"]) for m in _BLOCK.finditer(page.read_text())]
+    return [Block(m["lines"], m["why"], m["shorter"]) for m in _BLOCK.finditer(page.read_text())]
 
 
 def mentions(page: Path) -> list[str]:

@@ -31,8 +31,10 @@ async function show(run, button) {
     }
     if (content.rows.length) card.append(rows(content));
     card.append(...content.notes.map((note) => el("p", { class: "hint" }, note)));
-    card.append(el("p", { class: "row downloads" },
-      download(`api/run/report.html?name=${name}`, "Report"), ...content.files.map((file) => download(address(file), file))));
+    const link = (file) => download(address(file), file), isPolicy = (file) => file.endsWith(".safetensors");
+    const policies = content.files.filter(isPolicy), others = content.files.filter((file) => !isPolicy(file));
+    card.append(el("p", { class: "row downloads" }, download(`api/run/report.html?name=${name}`, "Report"), ...others.map(link)));
+    if (policies.length) card.append(el("details", { open: policies.length < 4 }, el("summary", {}, `Policies (${policies.length})`), el("p", { class: "row downloads" }, ...policies.map(link))));
     view.replaceChildren(card);
     if (view.getBoundingClientRect().top > innerHeight / 2) view.scrollIntoView();
     if (Object.keys(content.curves).length) {

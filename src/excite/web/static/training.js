@@ -64,6 +64,7 @@ function newCard(training) {
     card.stop.disabled = true;
     try { show(await remove(`api/trainings/${training.name}`)); } catch (error) { say(form, error.message, true); }
   } }, "Stop");
+  at("trainings").querySelector(":scope > .hint")?.remove();
   at("trainings").prepend(el("section", { class: "card", "aria-label": `Training ${training.folder}` },
     el("h2", {}, training.folder), card.state, card.far, el("p", {}, el("code", {}, training.command)), card.plots, el("p", { class: "row" }, card.stop)));
   return card;
