@@ -86,6 +86,6 @@ def streamed(client: httpx.Client, address: str, asked: dict[str, Any]) -> Told:
             event, now = json.loads(line), time.perf_counter()
             if event["kind"] == "samples":
                 told.gap = max(told.gap, now - last if told.of("samples") else 0.0)
-            last = now
+                last = now
             told.append(event)
     return told

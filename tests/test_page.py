@@ -108,12 +108,13 @@ def test_a_run_from_choosing_to_the_report(address: str, page: Page, tmp_path: P
         with page.expect_download() as waiting:
             page.locator(f"#outcome a[href$='{name}']").click()
         waiting.value.save_as(tmp_path / name)
-    assert "J_p" in (tmp_path / "report.html").read_text()
-    estimate = json.loads((tmp_path / "estimate.json").read_text())["params"]["D_p"]["estimate"]
-    shown = page.locator("#estimates figure").nth(2).inner_text()
-    assert float(re.findall(r"[\d.]+", shown.partition("value")[2])[0]) == pytest.approx(
-        estimate, rel=1e-4
-    )
+    report = (tmp_path / "report.html").read_text()
+    params = json.loads((tmp_path / "estimate.json").read_text())["params"]
+    for i, (name, p) in enumerate(params.items()):
+        shown = page.locator("#estimates figure").nth(i).inner_text().partition("value")[2]
+        reported = re.findall(rf"<td>{name}</td><td>[^<]*</td><td[^>]*>([^<]*)</td>", report)[0]
+        assert float(re.findall(r"[\d.]+", shown)[0]) == pytest.approx(p["estimate"], rel=1e-4)
+        assert float(reported) == pytest.approx(p["estimate"], rel=1e-4)
     assert (tmp_path / "record.csv").read_text().startswith("time,voltage,pitch\n")
     require_no_sideways_scroll(page)
     page.set_viewport_size({"width": 1440, "height": 1000})

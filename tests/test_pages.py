@@ -66,6 +66,18 @@ def test_the_commands_of_a_page_run(page: Path, tmp_path: Path):
         assert "J_p" in run.stdout
 
 
+@pytest.mark.parametrize("script", sorted(ROOT.glob("docs/figures/*.py")), ids=name)
+def test_the_figures_of_the_pages_are_made_by_their_scripts(script: Path, tmp_path: Path):
+    """From the committed results; pixels depend on the fonts of a computer."""
+    (tmp_path / "results").symlink_to(ROOT / "results")
+    copy = tmp_path / script.relative_to(ROOT)
+    copy.parent.mkdir(parents=True)
+    shutil.copy(script, copy)
+    subprocess.run([sys.executable, str(copy)], cwd=tmp_path, check=True, timeout=600)
+    [figure] = [path for path in copy.parent.iterdir() if path != copy]
+    assert (script.parent / figure.name).is_file()
+
+
 @pytest.mark.parametrize("page", PAGES, ids=name)
 def test_every_command_of_a_page_exists(page: Path):
     """Options, choices and files, also of what takes too long to be run."""

@@ -3,10 +3,12 @@
 import asyncio
 import contextlib
 import csv
+import io
 import json
 import os
 import pickle
 import re
+import shlex
 import signal
 import socket
 import subprocess
@@ -21,15 +23,26 @@ import numpy as np
 import pytest
 import scipy.io
 from served import EXPERIMENT, MAX_GAP, Told, browser, served, streamed
+from starlette.requests import Request
 from starlette.testclient import TestClient
 
+from excite.cli.train import Objective
 from excite.files import write_json
 from excite.report import report_html
 from excite.web import Settings, application
-from excite.web.base import MAX_JOBS, MAX_SESSIONS, MAX_UPLOAD, RefusedError, Session, Sessions
+from excite.web.base import (
+    MAX_JOBS,
+    MAX_SESSIONS,
+    MAX_UPLOAD,
+    Place,
+    RefusedError,
+    Session,
+    Sessions,
+)
+from excite.web.places import _file_name, _receive
 from excite.web.runs import found
 from excite.web.security import MAX_TRIES, _source
-from excite.web.trainings import Training
+from excite.web.trainings import OBJECTIVES, Training, _free
 
 HERE = "http://127.0.0.1:8000"
 TRAINING = {
@@ -160,13 +173,31 @@ def test_an_uploaded_file_is_identified_as_at_the_command_line(client, told: Tol
     [event] = streamed(client, "/api/identifications", asked).of("identified")
     own = told.of("result")[0]["identification"]
     assert event["identification"]["params"] == own["params"]
-    assert event["identification"]["files"] == ["my_log.csv"]
+    assert event["identification"]["files"] == ["my log.csv"]
     report = client.get(f"/api/results/{event['result']}/report.html")
     assert "attachment" in report.headers["content-disposition"]
     estimate = client.get(f"/api/results/{event['result']}/estimate.json").content
     files = temporary.glob("*/*/*/run/estimate.json")
     [run] = [file.parent for file in files if file.read_bytes() == estimate]
     assert report.text == report_html([run])
+
+
+@pytest.mark.parametrize("column", ["pitch, rad=1", "it's [x,y] $HOME"])
+def test_the_command_of_an_upload_does_the_same(
+    column: str, client, told: Told, temporary: Path, tmp_path: Path
+):
+    text = io.StringIO()
+    rows = list(csv.reader(told.of("record.csv")[0]["text"].splitlines()))
+    csv.writer(text, lineterminator="\n").writerows([["time", "voltage", column], *rows[1:]])
+    uploaded = client.post("/api/uploads?name=my log.csv", content=text.getvalue()).json()
+    asked = {"upload": uploaded["upload"], "plant": "aero2", "estimator": "nls"}
+    asked |= {"columns": {"pitch": column}, "scales": {"pitch": 1}, "initial_state": "known"}
+    [event] = streamed(client, "/api/identifications", asked).of("identified")
+    run = max(temporary.glob("*/*/*/run"), key=lambda path: path.stat().st_mtime)
+    (tmp_path / "my log.csv").write_text(text.getvalue())
+    words = shlex.split(json.loads((run / "run.json").read_text())["command"])
+    assert words[:3] == ["excite", "identify", "my log.csv"]
+    assert excite(*words[1:], folder=tmp_path)["params"] == event["identification"]["params"]
 
 
 def test_an_uploaded_mat_file_is_identified(client, told: Told, tmp_path: Path):
@@ -205,7 +236,8 @@ def test_ten_clients_at_once(address: str, told: Told):
                 now, kind = time.perf_counter(), json.loads(line)["kind"]
                 if kind == "samples":
                     gap, first = max(gap, now - last if first else 0), first or now - start
-                last, kinds = now, kinds | {kind}
+                    last = now
+                kinds.add(kind)
         return gap, first, kinds
 
     async def all_of_them() -> list[tuple[float, float, set[str]]]:
@@ -224,6 +256,7 @@ def test_ten_clients_at_once(address: str, told: Told):
         if max(gap for gap, _, _ in seen) >= MAX_GAP:
             seen = asyncio.run(all_of_them())
     assert all(kinds >= {"samples", "estimate", "result", "end"} for _, _, kinds in seen)
+    assert max(first for _, first, _ in seen) < 30  # seconds; nobody is forgotten in the queue
     assert max(gap for gap, _, _ in seen) < MAX_GAP
 
 
@@ -263,7 +296,8 @@ def test_what_is_stopped_ends_and_its_worker_is_free(address: str, client, told:
     del told
     before = processes_of(address)
     assert len(before) == 2
-    long = {**EXPERIMENT, "plant": "cart_pole", "params": {}, "steps": 3000, "others": []}
+    steps = 2000 + int(time.time()) % 3000  # no run before has left it in the compiler's cache
+    long = {**EXPERIMENT, "plant": "cart_pole", "params": {}, "steps": steps, "others": []}
     long |= {"amplitude": 1.0, "seconds": 60}
     kinds, job, start = [], "", 0.0
     with client.stream("POST", "/api/experiments", json=long) as answer:
@@ -611,8 +645,62 @@ def test_a_training_takes_names_and_numbers_alone(change: dict, page: TestClient
     assert sorted(p.name for p in runs.iterdir()) == ["elsewhere", "some"]
 
 
-def test_a_training_never_goes_where_something_is(page: TestClient):
+def test_a_training_never_goes_where_something_is(page: TestClient, runs: Path):
     assert page.post("/api/trainings", json={**TRAINING, "name": "some"}).status_code == 409
+    begun = Training("x", runs / "other", ["train", "aero2", "--objective", "D"])
+    with pytest.raises(RefusedError, match="there already"):
+        _free(runs, "other", [begun])  # its folder comes later
+    assert _free(runs, "another", [begun]) == runs / "another"
+
+
+def test_the_page_offers_what_can_be_trained_for(page: TestClient):
+    select = re.findall(r'<select id="objective">(.*?)</select>', page.get("/").text)[0]
+    assert tuple(re.findall(r'value="(\w+)"', select)) == OBJECTIVES
+    for name in OBJECTIVES:
+        assert Objective().convert(name, None, None) == (name, None)
+
+
+def test_a_long_learning_curve_is_thinned(tmp_path: Path):
+    training = Training("x", tmp_path, ["train", "aero2", "--objective", "D"])
+    (tmp_path / "seeds" / "agent" / "0").mkdir(parents=True)
+    for i in range(2000):
+        write_json(tmp_path / "seeds" / "agent" / "0" / "progress.json", {"steps": i})
+        training._look()
+    steps = [row["steps"] for row in training.told()["curve"]]
+    assert len(steps) <= 501
+    assert (steps[0], steps[-1], steps) == (0, 1999, sorted(steps))
+
+
+def test_a_full_store_takes_no_more(page: TestClient, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("excite.web.places.MAX_STORED", -1)
+    answer = page.post("/api/uploads?name=a.csv", content="time,x\n0,1\n")
+    assert answer.status_code == 507
+
+
+def test_a_file_that_stops_coming_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("excite.web.places._SILENCE", 0.05)
+    come = iter([{"type": "http.request", "body": b"time", "more_body": True}])
+
+    async def receive() -> Any:
+        message = next(come, None)
+        await asyncio.sleep(0 if message else 60)
+        return message
+
+    request = Request({"type": "http", "headers": []}, receive)
+    with pytest.raises(RefusedError, match="stopped coming"):
+        asyncio.run(_receive(request, tmp_path / "a.csv", tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("name", "kept"),
+    [
+        ("my log (2), a=1.csv", "my log (2), a=1.csv"), ("../../etc/x.csv", "_.._etc_x.csv"),
+        ("-rf.CSV", "rf.csv"), (".csv", "file.csv"), ("<b>\n&.mat", "_b___.mat"),
+        ("Größe.csv", "Größe.csv"),
+    ],
+)  # fmt: skip
+def test_a_files_name_is_freed_of_what_could_be_mistaken(name: str, kept: str):
+    assert _file_name(name) == kept
 
 
 def test_a_browser_cannot_see_or_stop_what_is_anothers(address: str, client, told: Told):
@@ -680,8 +768,12 @@ def test_what_computes_is_not_idle(tmp_path: Path):
     assert done is not None
     busy.trainings["x"], done.trainings["x"] = (Training("x", tmp_path, []) for _ in range(2))
     done.trainings["x"].state = "finished"
+    sessions.new()
+    assert sessions.get(first) is busy
+    assert sessions.get(second) is done, "what holds nothing goes first"
     for session in (sessions.get(key) for key in list(sessions._all)[2:]):
         assert session is not None
+        session.kept["x"] = Place(tmp_path, "upload")
         session.seen = time.monotonic() + 1
     sessions.new()
     assert sessions.get(first) is busy
@@ -723,6 +815,7 @@ def test_a_token_cannot_be_guessed(runs: Path, scratch: Path):
     [
         ("10.0.0.9", "10.0.0.9/32"),
         ("2001:db8:1:2:3::4", "2001:db8:1:2::/64"),
+        ("::ffff:10.0.0.9", "10.0.0.9/32"),
         ("testclient", "testclient"),
     ],
 )
@@ -782,7 +875,8 @@ def test_without_the_extra_one_sentence_says_what_to_install(tmp_path: Path):
 
 def test_other_computers_need_a_token_that_is_printed(tmp_path: Path):
     words = [sys.executable, "-m", "excite", "serve", "--host", "0.0.0.0", "--port", "0", "--json"]
-    with subprocess.Popen([*words, "--runs", str(tmp_path)], stdout=subprocess.PIPE) as process:
+    words, own = [*words, "--runs", str(tmp_path)], {**os.environ, "TMPDIR": str(tmp_path)}
+    with subprocess.Popen(words, stdout=subprocess.PIPE, env=own) as process:
         try:
             lines = iter(process.stdout.readline, b"}\n") if process.stdout else iter([])
             told = json.loads(b"".join([*lines, b"}"]))

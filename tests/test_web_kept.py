@@ -149,7 +149,7 @@ def test_links_in_a_run_are_not_followed(page: TestClient, run: Path):
         assert shown[-1].status_code == 404
     assert all("SECRET" not in answer.text for answer in shown)
     assert not shown[0].json()["runs"][0]["is_finished"]
-    assert shown[1].json()["curves"] == {}
+    assert shown[1].json()["curves"] == []
 
 
 def test_a_run_with_links_has_no_report(page: TestClient, run: Path):

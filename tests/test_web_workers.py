@@ -37,7 +37,6 @@ def program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     path = tmp_path / "python"
     monkeypatch.setattr("sys.executable", str(path))
     monkeypatch.setattr(module, "_LINE", 2**16)
-    monkeypatch.setattr(module, "_step_back", None)  # JAX warns of forks in this process
     return path
 
 
@@ -75,6 +74,32 @@ def test_a_worker_that_answers_oddly_is_replaced_and_nobody_waits(kind: str, pro
     assert good == 2 * [[{"kind": "started"}, {"kind": "end"}]]
 
 
+def test_what_was_given_up_takes_no_place_in_the_queue(program: Path):
+    """Or one browser could shut the others out, with a worker that is busy."""
+    write(program, HEADER + "    if target != 'busy': print(good, flush=True)\n")
+
+    async def kinds() -> list[str]:
+        workers = Workers(1, None)
+        await workers.open()
+        busy = workers.events("busy", {})
+        try:
+            assert await anext(busy) == {"kind": "started"}
+            for _ in range(2 * module.MAX_WAITING):
+                waits = asyncio.create_task(told(workers, "good"))
+                await asyncio.sleep(0)
+                waits.cancel()
+                await asyncio.gather(waits, return_exceptions=True)
+            last = asyncio.create_task(told(workers, "good"))
+            await asyncio.sleep(0)
+            await busy.aclose()
+            async with asyncio.timeout(30):
+                return [event["kind"] for event in await last]
+        finally:
+            await workers.close()
+
+    assert asyncio.run(kinds()) == ["started", "end"]
+
+
 @pytest.mark.parametrize(
     "text",
     [
@@ -102,7 +127,7 @@ def test_workers_that_do_not_start_are_tried_only_so_often(program: Path, tmp_pa
 @pytest.mark.parametrize(
     ("gib", "num_workers", "limit"), [(64, 2, 6), (16, 2, 4), (16, 4, 2), (4, 4, 2)]
 )
-def test_workers_together_take_half_of_the_memory(
+def test_a_worker_takes_its_part_of_half_of_the_memory(
     gib: int, num_workers: int, limit: int, monkeypatch: pytest.MonkeyPatch
 ):
     sizes = {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": gib * 2**18}

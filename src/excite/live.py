@@ -275,8 +275,8 @@ def _identification_again(asked: Mapping[str, Any], name: str) -> str:
 
 def _given(option: str, values: Mapping[str, Any]) -> list[str]:
     """An option with its assignments, numbers in full; nothing where there are none."""
-    pairs = ",".join(f"{name}={value}" for name, value in values.items())
-    return [option, pairs] if pairs else []
+    pairs = [f"{name}={value}".replace(",", "\\,") for name, value in values.items()]
+    return [option, ",".join(pairs)] if pairs else []
 
 
 def _first(data: Experiments, count: int) -> Experiments:

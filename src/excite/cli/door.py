@@ -38,7 +38,7 @@ def command_line() -> str:
 
 
 class Assignments(click.ParamType):
-    """NAME=VALUE,NAME=VALUE,... as a dictionary."""
+    r"""NAME=VALUE,NAME=VALUE,... as a dictionary; a comma that belongs to a text is written \,."""
 
     name = "NAME=VALUE,..."
 
@@ -51,8 +51,9 @@ class Assignments(click.ParamType):
         if isinstance(value, dict):
             return value
         result = {}
-        for pair in re.split(r",(?![^\[]*\])", value):  # not at the commas of a list
-            name, equals, text = (part.strip() for part in pair.partition("="))
+        for pair in re.split(r"(?<!\\),(?![^\[]*\])", value):  # not at the commas of a list
+            parts = pair.replace("\\,", ",").partition("=")
+            name, equals, text = (part.strip() for part in parts)
             if not (name and equals and text):
                 self.fail(f"{pair!r} is not of the form NAME=VALUE", param, ctx)
             try:

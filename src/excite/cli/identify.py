@@ -64,7 +64,7 @@ from .door import (
     "--column",
     type=NAMES,
     multiple=True,
-    help="Columns of the file that have another name: pitch=qm.",
+    help="Columns of the file that have another name: pitch=qm; a comma in it is written \\,.",
 )
 @click.option(
     "--scale",

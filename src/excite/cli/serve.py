@@ -54,6 +54,7 @@ def serve(
     Bound to this computer alone unless --host says otherwise.
     """
     import secrets
+    from urllib.parse import quote
 
     try:
         from ..web import Settings, is_loopback
@@ -73,7 +74,7 @@ def serve(
     with listening:
         port = listening.getsockname()[1]
         shown = f"[{host}]" if ":" in host else host
-        address = f"http://{shown}:{port}/" + (f"#{token}" if token else "")
+        address = f"http://{shown}:{port}/" + (f"#{quote(token, safe='')}" if token else "")
         told = {"address": address, "token": token, "runs": str(runs)}
         num_workers = workers or min(4, len(os.sched_getaffinity(0)))
         settings = Settings(runs.absolute(), host, token, num_workers, cache_folder())

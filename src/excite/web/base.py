@@ -23,6 +23,8 @@ MAX_BODY = 64 * 2**10
 MAX_JOBS = 4
 """Things a browser may have under way at once."""
 MAX_SESSIONS = 256
+MAX_STORED = 2 * 2**30
+"""Bytes of what is kept for all browsers, beyond which no more is uploaded."""
 MAX_KEPT = 8
 """Results, and likewise uploads, that are kept for a browser; what was used last stays."""
 
@@ -143,6 +145,11 @@ class Session:
         shutil.rmtree(self.kept.pop(name).folder, ignore_errors=True)
 
     @property
+    def is_empty(self) -> bool:
+        """Whether nothing would be lost with it."""
+        return not (self.kept or self.trainings)
+
+    @property
     def is_idle(self) -> bool:
         """Whether nothing of it is under way."""
         return not (self.stops or any(t.is_running for t in self.trainings.values()))
@@ -178,12 +185,15 @@ class Sessions:
         return session
 
     def new(self) -> str:
-        """The secret of a new session; where there are too many, the idlest gives way."""
+        """The secret of a new session; where there are too many, an idle one gives way.
+
+        Empty ones go before those that hold results, and then those that rested for longest.
+        """
         idle = [secret for secret, session in self._all.items() if session.is_idle]
         if len(self._all) >= MAX_SESSIONS:
             if not idle:
                 raise RefusedError(503, "too many browsers are working here")
-            gone = min(idle, key=lambda s: self._all[s].seen)
+            gone = min(idle, key=lambda s: (not self._all[s].is_empty, self._all[s].seen))
             shutil.rmtree(self._all.pop(gone).folder, ignore_errors=True)
         secret = secrets.token_urlsafe(32)
         self._all[secret] = Session(Path(tempfile.mkdtemp(dir=self._folder)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
 import tempfile
 from collections.abc import Callable
@@ -13,8 +14,9 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
 
-from .base import MAX_UPLOAD, Pool, RefusedError, Session
+from .base import MAX_STORED, MAX_UPLOAD, Pool, RefusedError, Session
 
+_SILENCE = 30.0  # seconds without a part of a file
 _DOWNLOADS = {
     "record.csv": "text/csv",
     "record.json": "application/json",
@@ -35,7 +37,7 @@ def routes(pool: Pool, run_of: Callable[[Request], Path]) -> list[Route]:
         job = session.begin()
         try:
             with session.making("upload") as (name, place):
-                (place.folder / file).write_bytes(await _content(request))
+                await _receive(request, place.folder / file, session.folder.parent)
                 wanted = {"folder": str(place.folder), "name": file}
                 told = await _last(pool, "columns", wanted, True)
                 place.is_done = True
@@ -95,26 +97,34 @@ async def _reported(pool: Pool, session: Session, run: Path) -> Response:
 
 
 def _file_name(name: str) -> str:
-    """The name of an uploaded file, freed of everything but letters, digits, dots and dashes."""
+    """The name of an uploaded file, freed of what a path, a page or a command could mistake."""
     stem, dot, ending = name.rpartition(".")
     if not dot or ending.lower() not in ("csv", "mat"):
         raise RefusedError(415, "experiment files end in .csv or .mat")
-    return f"{re.sub(r'[^A-Za-z0-9_-]', '_', stem)[-60:] or 'file'}.{ending.lower()}"
+    plain = re.sub(r"[^\w .,()+=-]", "_", stem)[-60:].lstrip(" .-")
+    return f"{plain or 'file'}.{ending.lower()}"
 
 
-async def _content(request: Request) -> bytes:
-    """The body of a request, which is read no further than it is allowed to be long."""
-    sentence = f"the file is larger than {MAX_UPLOAD >> 20} MiB"
+async def _receive(request: Request, path: Path, scratch: Path) -> None:
+    """Writes the body of a request, which is read no further than it is allowed to be long."""
+    too_large = RefusedError(413, f"the file is larger than {MAX_UPLOAD >> 20} MiB")
     if int(request.headers.get("content-length") or 0) > MAX_UPLOAD:
-        raise RefusedError(413, sentence)
-    content = bytearray()
-    async for part in request.stream():
-        content += part
-        if len(content) > MAX_UPLOAD:
-            raise RefusedError(413, sentence)
-    if not content:
+        raise too_large
+    if sum(file.stat().st_size for file in scratch.rglob("*") if file.is_file()) > MAX_STORED:
+        raise RefusedError(507, "too much is kept here for all browsers; try again later")
+    parts = request.stream()
+    try:
+        with path.open("wb") as file:
+            while part := await asyncio.wait_for(anext(parts, b""), _SILENCE):
+                file.write(part)
+                if file.tell() > MAX_UPLOAD:
+                    raise too_large
+    except TimeoutError:
+        raise RefusedError(408, "the file stopped coming") from None
+    except OSError as error:
+        raise RefusedError(507, f"the file cannot be kept ({error.strerror})") from None
+    if not path.stat().st_size:
         raise RefusedError(400, "the file is empty")
-    return bytes(content)
 
 
 async def _last(pool: Pool, target: str, arguments: dict[str, Any], urgent: bool) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse
 from starlette.routing import Route
 
+from ..files import folder_word
 from .base import RefusedError
 
 _TYPES = {
@@ -28,7 +29,7 @@ _TYPES = {
     ".tex": "text/plain",
     ".safetensors": "application/octet-stream",
 }
-_DEPTH, _MAX_RUNS, _MAX_TEXT = 4, 500, 4 * 2**20
+_DEPTH, _MAX_RUNS, _MAX_CURVES, _MAX_TEXT = 4, 500, 256, 4 * 2**20
 
 
 def routes(folder: Path) -> list[Route]:
@@ -153,13 +154,15 @@ def _table(text: str) -> dict[str, Any]:
     return {"header": cells[0] if cells else [], "rows": cells[2:], "notes": notes}
 
 
-def _curves(run: Path) -> dict[str, dict[str, list[float]]]:
-    """Learning curves of the finished seeds, by agent and seed."""
-    curves = {}
-    for path in sorted(run.glob("seeds/*/*/curve.csv"))[:64]:
+def _curves(run: Path) -> list[dict[str, Any]]:
+    """Learning curves of the finished seeds; those of bounds are told from those of errors."""
+    bounds = _json(run, "table.json").get("bound_curves")
+    words = {folder_word(str(name)) for name in bounds} if isinstance(bounds, list) else set()
+    curves = []
+    for path in sorted(run.glob("seeds/*/*/curve.csv"))[:_MAX_CURVES]:
         if _is_inside(path, run):
-            agent, seed = path.parts[-3:-1]
-            curves[f"{agent} {seed}"] = curve_in(path)
+            agent = path.parts[-3]
+            curves.append({"agent": agent, "is_bound": agent in words, "columns": curve_in(path)})
     return curves
 
 

@@ -162,6 +162,7 @@ def _source(scope: Scope) -> str:
         number = ipaddress.ip_address(address)
     except ValueError:
         return address
+    number = getattr(number, "ipv4_mapped", None) or number  # of version 4, to a socket of 6
     return str(ipaddress.ip_network((number, 64 if number.version == 6 else 32), strict=False))
 
 

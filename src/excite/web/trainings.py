@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import ctypes
 import json
 import os
 import re
 import secrets
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +26,18 @@ from .base import RefusedError, number, whole, without_folders, word
 
 MAX_TRAININGS = 2
 _PATIENCE = 10.0  # seconds for a training to end when it is interrupted
-_LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None
-_WHEN_PARENT_ENDS = 1  # PR_SET_PDEATHSIG of prctl(2)
-_OBJECTIVES = ("D", "A", "E", "relative", "log", "goals", "nls")
+_MAX_ROWS = 500  # of a learning curve; of a longer one every second row is let go
+_STEP_BACK = """
+import ctypes, os, signal, sys
+os.nice(10)  # what is being watched comes first
+if sys.platform == "linux":  # a server that is killed interrupts its trainings
+    PR_SET_PDEATHSIG = 1
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGINT)
+os.execv(sys.executable, [sys.executable, "-m", "excite", *sys.argv[1:]])
+"""
+_INFORMATION = ("D", "A", "E")
+OBJECTIVES = (*_INFORMATION, "goals", "relative", "log", "nls")
+"""What the page offers to train for."""
 
 
 class Training:
@@ -45,10 +53,9 @@ class Training:
     async def start(self) -> None:
         """Starts the process."""
         self._process = await asyncio.create_subprocess_exec(
-            sys.executable, "-m", "excite", *self.words, "--out", str(self.folder),
+            sys.executable, "-c", _STEP_BACK, *self.words, "--out", str(self.folder),
             stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.DEVNULL,
             stderr=asyncio.subprocess.PIPE, start_new_session=True,
-            preexec_fn=_prepared,
         )  # fmt: skip
         self._followed = asyncio.create_task(self._follow(self._process))
 
@@ -95,6 +102,8 @@ class Training:
                 row = json.loads(path.read_text(encoding="utf-8"))
                 if isinstance(row, dict) and row not in self.curve[-1:]:
                     self.curve.append(row)
+                    if len(self.curve) > _MAX_ROWS:
+                        del self.curve[1:-1:2]
                     self.state = "training" if self.state == "starting" else self.state
 
     def told(self) -> dict[str, Any]:
@@ -105,6 +114,7 @@ class Training:
             "state": self.state,
             "sentence": self.sentence,
             "curve": self.curve,
+            "is_bound": self.words[self.words.index("--objective") + 1] in _INFORMATION,
             "command": " ".join(["excite", *self.words, "--out", self.folder.name]),
         }
 
@@ -113,14 +123,15 @@ def routes(folder: Path, body: Callable[[Request], Any], every: list[Training]) 
     """What starts, shows and stops trainings.
 
     Args:
-        every: all trainings of this server, kept up to date.
+        every: all trainings of this server that run, kept up to date.
     """
 
     async def start(request: Request) -> JSONResponse:
         asked = await body(request)
         if sum(t.is_running for t in every) >= MAX_TRAININGS:
             raise RefusedError(429, f"{MAX_TRAININGS} trainings are running already; stop one")
-        words, place = _words(asked), _free(folder, word(asked, "name"))
+        every[:] = [training for training in every if training.is_running]
+        words, place = _words(asked), _free(folder, word(asked, "name"), every)
         training = Training(secrets.token_urlsafe(12), place, words)
         every.append(training)
         request.state.session.trainings[training.name] = training
@@ -151,8 +162,8 @@ def routes(folder: Path, body: Callable[[Request], Any], every: list[Training]) 
 def _words(asked: dict[str, Any]) -> list[str]:
     """The command, of checked words and numbers alone."""
     objective, updates = word(asked, "objective"), whole(asked, "updates", 1, 100_000)
-    if objective not in _OBJECTIVES:
-        raise RefusedError(400, f"objective: one of {', '.join(_OBJECTIVES)} is needed")
+    if objective not in OBJECTIVES:
+        raise RefusedError(400, f"objective: one of {', '.join(OBJECTIVES)} is needed")
     spread = number(asked, "spread", 0, 0.9)
     return [
         "train", word(asked, "plant"), "--objective", objective,
@@ -161,16 +172,9 @@ def _words(asked: dict[str, Any]) -> list[str]:
     ]  # fmt: skip
 
 
-def _free(folder: Path, name: str) -> Path:
+def _free(folder: Path, name: str, running: Sequence[Training]) -> Path:
     """A folder for a training: a new one of this name in the run folder."""
     path = folder / re.sub(r"\W", "_", name)
-    if path.exists() or path.is_symlink():
+    if path.exists() or path.is_symlink() or any(path == training.folder for training in running):
         raise RefusedError(409, f"{path.name} is there already; choose another name")
     return path
-
-
-def _prepared() -> None:
-    """What is being watched comes first; a server that is killed interrupts its trainings."""
-    os.nice(10)
-    if _LIBC is not None:
-        _LIBC.prctl(_WHEN_PARENT_ENDS, signal.SIGINT)

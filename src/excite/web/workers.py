@@ -39,7 +39,7 @@ class Workers:
 
     def __init__(self, num_workers: int, cache: Path | None) -> None:
         self._num_workers, self._environment = num_workers, _environment(cache)
-        self._queue: asyncio.PriorityQueue[tuple[int, int, _Job]] = asyncio.PriorityQueue()
+        self._waiting, self._come = list[_Job](), asyncio.Semaphore(0)
         self._numbers, self._lanes = itertools.count(), list[asyncio.Task]()
         self._jobs, self._num_broken = set[_Job](), 0
 
@@ -63,10 +63,11 @@ class Workers:
         Args:
             urgent: before all that is not: somebody waits for the first sign of life.
         """
-        if self._queue.qsize() >= MAX_WAITING:
+        if len(self._waiting) >= MAX_WAITING:
             raise RefusedError(503, "too much is waiting for the workers; try again later")
-        job = _Job(next(self._numbers), target, arguments)
-        self._queue.put_nowait((0 if urgent else 1, job.number, job))
+        job = _Job(next(self._numbers), target, arguments, urgent)
+        self._waiting.append(job)
+        self._come.release()
         self._jobs.add(job)
         try:
             while True:
@@ -77,6 +78,17 @@ class Workers:
         finally:
             self._jobs.discard(job)
             job.stop.set()
+            if job in self._waiting:  # it takes nobody's place any longer
+                self._waiting.remove(job)
+
+    async def _next(self) -> _Job:
+        """The call that is first in the queue, once there is one; an urgent one before others."""
+        while True:
+            await self._come.acquire()
+            if self._waiting:  # what was announced may have left again
+                job = min(self._waiting, key=lambda job: (not job.urgent, job.number))
+                self._waiting.remove(job)
+                return job
 
     async def _lane(self) -> None:
         """One worker and its successors; where none starts, the last lane tells everybody."""
@@ -86,7 +98,7 @@ class Workers:
             num_failures = 0 if is_good else num_failures + 1
         self._num_broken += 1
         while self._num_broken == self._num_workers:
-            _, _, job = await self._queue.get()
+            job = await self._next()
             job.events.put_nowait(_failure("the workers do not start; the terminal says why"))
 
     async def _worked(self) -> bool:
@@ -96,15 +108,13 @@ class Workers:
             return False
         try:
             while process.returncode is None:
-                if not is_warm and self._queue.empty():  # otherwise somebody waits already
+                if not is_warm and not self._waiting:  # otherwise somebody waits already
                     await _served(process, _Job(next(self._numbers), "warm_up", {}))
                     is_warm = process.returncode is None
                     if not is_warm:
                         return False
                     continue
-                _, _, job = await self._queue.get()
-                if not job.stop.is_set():
-                    await _served(process, job)
+                await _served(process, await self._next())
         finally:
             await _ended(process)
         return True
@@ -118,7 +128,6 @@ class Workers:
             process = await asyncio.create_subprocess_exec(
                 *command, stdin=pipe, stdout=pipe, env=self._environment, limit=_LINE,
                 start_new_session=True,  # Ctrl-C is the server's
-                preexec_fn=_step_back,
             )  # fmt: skip
         except OSError as error:
             _LOG.error("no worker can be started: %s", error)
@@ -137,8 +146,10 @@ class Workers:
 class _Job:
     """A call in the queue or under way, and its events."""
 
-    def __init__(self, number: int, target: str, arguments: Mapping[str, Any]) -> None:
-        self.number, self.stop = number, asyncio.Event()
+    def __init__(
+        self, number: int, target: str, arguments: Mapping[str, Any], urgent: bool = False
+    ) -> None:
+        self.number, self.urgent, self.stop = number, urgent, asyncio.Event()
         call = {"number": number, "target": target, "arguments": dict(arguments)}
         self.call = json.dumps(call)
         self.events: asyncio.Queue[dict[str, Any]] = asyncio.Queue()
@@ -185,7 +196,7 @@ async def _pass_on(process: asyncio.subprocess.Process, job: _Job) -> bool:
 
 
 def _memory(num_workers: int) -> int:
-    """Bytes a worker may take: all of them together half of what this computer has."""
+    """Bytes a worker may take: its part of half of what this computer has, within limits."""
     half = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
     least, most = _MEMORY
     return max(least, min(most, half // num_workers))
@@ -210,11 +221,6 @@ async def _ended(process: asyncio.subprocess.Process) -> None:
 
 def _failure(sentence: str) -> dict[str, Any]:
     return {"kind": "failed", "sentence": sentence}
-
-
-def _step_back() -> None:
-    """The server comes first: a stream has to flow while others compute."""
-    os.nice(5)
 
 
 def _environment(cache: Path | None) -> dict[str, str]:

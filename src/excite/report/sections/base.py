@@ -5,7 +5,6 @@ Everything that comes from a file passes `text`, so that it is shown and never o
 
 from __future__ import annotations
 
-import base64
 import contextlib
 import html
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -125,20 +124,8 @@ def figure(drawn: matplotlib.figure.Figure, name: str, caption: str) -> str:
     svg = inline_svg(drawn, name)
     labelled = svg.replace("<svg", f'<svg role="img" aria-label="{text(caption)}"', 1)
     is_wide = bool(drawn.get_figwidth() > _NARROW_FIGURE)
-    return _captioned(labelled, caption, is_wide)
-
-
-def picture(path: Path, caption: str) -> str:
-    """A PNG file as part of the page."""
-    data = base64.b64encode(path.read_bytes()).decode()
-    return _captioned(
-        f'<img alt="{text(caption)}" src="data:image/png;base64,{data}">', caption, True
-    )
-
-
-def _captioned(content: str, caption: str, is_wide: bool) -> str:
     box = _reachable(f"figure: {caption}") if is_wide else '<div class="scroll">'
-    return f"<figure>{box}{content}</div><figcaption>{text(caption)}</figcaption></figure>\n"
+    return f"<figure>{box}{labelled}</div><figcaption>{text(caption)}</figcaption></figure>\n"
 
 
 def _reachable(name: str, also: str = "") -> str:
@@ -236,6 +223,6 @@ def _reached(part: Any, size: float) -> str:
     for word in ("critical", "warning"):
         level = getattr(part, f"{word}_level", None)
         if level is not None and size >= level:
-            return f"{word} level reached"
+            return f"{word} level reached, as measured"
     has_levels = getattr(part, "critical_level", None) or getattr(part, "warning_level", None)
     return "below both" if has_levels else "–"

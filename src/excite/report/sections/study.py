@@ -33,7 +33,6 @@ from .base import (
     heading,
     in_words,
     paragraph,
-    picture,
     plant_facts,
     table,
     understood,
@@ -153,13 +152,13 @@ def _comparisons(run: StudyRun, name: str) -> str:
 
 
 def _learning(run: StudyRun, paths: Mapping[str, Sequence[Path]], name: str) -> str:
-    """Learning curves of all agents; the folder's own figure where they are not kept.
+    """Learning curves of all agents; nothing where they are not kept.
 
     Args:
         paths: of the curves, by agent, one a seed.
     """
     if not all(path.is_file() for files in paths.values() for path in files):
-        return _kept(run.folder / "curves.png", "Learning", _LEARNING)
+        return ""
     names = ("steps", "violation_rate", *(f"relative_error_{p.name}" for p in run.plant.parameters))
     advice = "delete its folder: 'excite study run' trains that seed again"
     curves: dict[str, Sequence[Curve]] = {
@@ -186,17 +185,12 @@ def _is_for_information(run: StudyRun, agent: str) -> bool:
     return {**run.settings.get("decision", {}), **own}.get("reward") == "information"
 
 
-def _kept(path: Path, title: str, caption: str) -> str:
-    """A figure that the run left, under its title; nothing where there is none."""
-    return heading(title) + picture(path, caption) if path.is_file() else ""
-
-
 def _episodes(run: StudyRun, name: str) -> str:
-    """One episode of each method and agent; that of agents alone in older folders."""
-    path, title = run.folder / "episodes.json", "One episode each"
+    """One episode of each method and agent; nothing where none is kept."""
+    path = run.folder / "episodes.json"
     caption = "Inputs, outputs with their safety levels, and estimates while data come in."
     if not path.is_file():
-        return _kept(run.folder / "episodes.png", title, caption)
+        return ""
     content = numbers_of(read_json(path, advice=_advice(run.about)))
     figures = []
     with understood(path, _advice(run.about)):
@@ -204,7 +198,7 @@ def _episodes(run: StudyRun, name: str) -> str:
         for i, part in enumerate(_groups(list(episodes)), 1):
             drawn = agents_figure(run.plant, {n: episodes[n] for n in part}, run.title)
             figures.append(figure(drawn, f"{name}-episodes{i}", caption))
-    return heading(title) + "".join(figures)
+    return heading("One episode each") + "".join(figures)
 
 
 def _episode(d: PlantDescription, own: Mapping[str, Any]) -> tuple[Record, np.ndarray]:

@@ -68,17 +68,23 @@ export async function stream(address, content, onEvent) {
 
 /** Something long behind the buttons of a form: one at a time, stopped by its stop button. */
 export class Task {
-  constructor(form) {
-    this.form = form;
-    this.start = form.querySelector(".primary");
+  constructor(form, isReady = () => true) {
+    Object.assign(this, { form, isReady, isBusy: false, job: null });
     this.halt = form.querySelector(".stop");
-    this.job = null;
     this.halt.addEventListener("click", () => this.stop());
+    this.refresh();
+  }
+
+  /** Which of the two buttons can be pressed now. */
+  refresh() {
+    this.form.querySelector(".primary").disabled = this.isBusy || !this.isReady();
+    this.halt.disabled = !this.isBusy;
   }
 
   async run(address, content, onEvent) {
-    this.start.disabled = true;
-    this.halt.disabled = false;
+    if (this.isBusy) return;
+    this.isBusy = true;
+    this.refresh();
     let ending = "the stream ended too early; run it again";
     try {
       await stream(address, content, (event) => {
@@ -94,8 +100,8 @@ export class Task {
     } finally {
       tell(this.form, "");
       this.job = null;
-      this.start.disabled = false;
-      this.halt.disabled = true;
+      this.isBusy = false;
+      this.refresh();
     }
   }
 

@@ -7,10 +7,12 @@ import * as runs from "./runs.js";
 import * as training from "./training.js";
 
 const parts = { experiment: null, record: null, runs, training };
+const isPart = (word) => Object.hasOwn(parts, word);
 const door = document.getElementById("door");
 
 function turn() {
-  const name = location.hash.slice(1) in parts ? location.hash.slice(1) : "experiment";
+  if (location.hash === "#main") return; // the link that skips the header
+  const name = isPart(location.hash.slice(1)) ? location.hash.slice(1) : "experiment";
   for (const part of Object.keys(parts)) document.getElementById(part).hidden = part !== name;
   document.querySelectorAll("nav a").forEach((link) => {
     if (link.hash === `#${name}`) link.setAttribute("aria-current", "page");
@@ -51,9 +53,9 @@ door.addEventListener("submit", (event) => { event.preventDefault(); show(docume
 
 try {
   const { is_known: isKnown } = await post("api/session", {});
-  const brought = location.hash.slice(1);
+  const brought = new URLSearchParams(`token=${location.hash.slice(1)}`).get("token");
   if (isKnown) await enter();
-  else if (brought && !(brought in parts)) {
+  else if (brought && !isPart(brought)) {
     history.replaceState(null, "", location.pathname); // the token stays out of the history
     await show(brought);
   } else knock();

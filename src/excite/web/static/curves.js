@@ -1,31 +1,44 @@
-// Learning curves: return, relative errors, violations over the steps of a training.
+// Learning curves: return, errors or bounds of the parameters, violations over the steps of a training.
 
 import { el, symbol } from "./api.js";
 import { Plot, range, shown } from "./plot.js";
 
-const COLOURS = ["output", "input", "simulated", "warning", "critical", "soft"];
+const COLOURS = ["output", "input", "simulated", "critical", "warning", "soft"];
 
-/** Draws curves, each an object of columns, one line a seed; returns a function that draws anew. */
+/** An agent rewarded with information shows the bounds of its experiments, not errors. */
+const wordOf = (every) => {
+  const words = new Set(every.map((curve) => (curve.is_bound ? "bound" : "error")));
+  return [...words].sort().reverse().join(" or ");
+};
+
+const legend = (every, agents) => {
+  const name = (agent) => (every.find((curve) => curve.agent === agent).is_bound ? `${agent}, bound` : agent);
+  return el("p", { class: "legend" }, ...agents.map((agent, i) => el("span", { class: `key ${COLOURS[i % COLOURS.length]}` }, name(agent))));
+};
+
+/** Draws curves {agent, is_bound, columns}, one line a seed, one colour an agent; returns a function that draws anew. */
 export function curves(parent, every) {
-  const names = Object.keys(every[0] ?? {}).filter((name) => name.startsWith("relative_error_"));
+  const agents = [...new Set(every.map((curve) => curve.agent))];
+  if (agents.length > 1) parent.before(legend(every, agents));
+  const names = Object.keys(every[0]?.columns ?? {}).filter((name) => name.startsWith("relative_error_"));
   const plots = ["return", "violation_rate", ...names].map((name) => {
     const word = name.replace("relative_error_", "");
-    const title = name === word ? name.replace("_", " ") : el("span", {}, "error of ", symbol(word), " %");
-    return [name, new Plot(parent, title, `${name.replaceAll("_", " ")} over the steps of the training`)];
+    const title = name === word ? name.replace("_", " ") : el("span", {}, `${wordOf(every)} of `, symbol(word), " %");
+    return [name, new Plot(parent, title, `${name === word ? name.replace("_", " ") : `${wordOf(every)} of ${word}`} over the steps of the training`)];
   });
   const draw = (now) => {
-    const last = Math.max(1, ...now.map((c) => c.steps?.at(-1) ?? 1));
+    const last = Math.max(1, ...now.map(({ columns }) => columns.steps?.at(-1) ?? 1));
     for (const [name, plot] of plots) {
-      const isError = name.startsWith("relative_error_");
-      const lines = now.map((c, i) => ({
-        x: c.steps ?? [], color: COLOURS[i % COLOURS.length], dots: now.length === 1, width: now.length > 1 ? 1 : 1.6,
-        y: (c[name] ?? []).map((v) => (isError ? Math.log10(Math.max(100 * v, 1e-9)) : v)),
+      const isPercent = name.startsWith("relative_error_");
+      const lines = now.map(({ agent, columns }) => ({
+        x: columns.steps ?? [], color: COLOURS[agents.indexOf(agent) % COLOURS.length], dots: now.length === 1, width: now.length > 1 ? 1 : 1.6,
+        y: (columns[name] ?? []).map((v) => (isPercent ? Math.log10(Math.max(100 * v, 1e-9)) : v)),
       }));
       const values = lines.flatMap((line) => line.y);
-      const base = isError ? [Math.floor(Math.min(...values, 9)), Math.ceil(Math.max(...values, -9))] : name === "return" ? [values[0] ?? 0] : [0, 0.05];
-      plot.show({ x: [0, last], y: range(values, ...base), lines, log: isError });
-      const newest = now.length === 1 ? now[0][name]?.at(-1) : null;
-      plot.note.textContent = newest === null || newest === undefined ? "" : shown(isError ? 100 * newest : newest);
+      const base = isPercent ? [Math.floor(Math.min(...values, 9)), Math.ceil(Math.max(...values, -9))] : name === "return" ? [values[0] ?? 0] : [0, 0.05];
+      plot.show({ x: [0, last], y: range(values, ...base), lines, log: isPercent });
+      const newest = now.length === 1 ? now[0].columns[name]?.at(-1) : null;
+      plot.note.textContent = newest === null || newest === undefined ? "" : shown(isPercent ? 100 * newest : newest);
     }
   };
   draw(every);

@@ -5,11 +5,11 @@ import { Plot, range, shown } from "./plot.js";
 
 const section = document.getElementById("record"), form = section.querySelector("form");
 const at = (id) => document.getElementById(id);
-let catalogue, task, file = null;
+let catalogue, task, file = null, reading = 0;
 
 export function begin(known) {
   catalogue = known;
-  task = new Task(form);
+  task = new Task(form, () => file !== null);
   options(at("record-plant"), Object.keys(catalogue.plants), "aero2");
   options(at("estimator"), catalogue.estimators, "nls");
   at("record-plant").addEventListener("change", showMapping);
@@ -24,14 +24,17 @@ export function begin(known) {
 
 async function take(chosen) {
   if (!chosen) return;
+  const own = (reading += 1);
   file = null;
-  task.start.disabled = true;
+  task.refresh();
   at("mapping").hidden = true;
   say(form, `Reading ${chosen.name}…`);
   try {
-    file = await upload(`api/uploads?name=${encodeURIComponent(chosen.name)}`, chosen);
+    const taken = await upload(`api/uploads?name=${encodeURIComponent(chosen.name)}`, chosen);
+    if (own !== reading) return; // another was chosen while this one was read
+    file = taken;
     showMapping();
-    task.start.disabled = false;
+    task.refresh();
     const counts = Object.values(file.columns);
     say(form, `${chosen.name}: ${counts.length} columns, ${Math.max(...counts)} samples. Map them, then identify.`);
   } catch (error) {

@@ -5,6 +5,7 @@ import { curves } from "./curves.js";
 import { table } from "./record.js";
 
 const section = document.getElementById("runs"), view = document.getElementById("run-view");
+let chosen = "";
 
 export async function open() {
   try {
@@ -20,9 +21,11 @@ export async function open() {
 
 async function show(run, button) {
   section.querySelectorAll("button").forEach((b) => b.setAttribute("aria-pressed", String(b === button)));
+  chosen = run.name;
   const name = encodeURIComponent(run.name), address = (file) => `api/run/file?name=${name}&file=${encodeURIComponent(file)}`;
   try {
     const content = await get(`api/run?name=${name}`);
+    if (chosen !== run.name) return; // another was chosen while this one came
     const card = el("section", { class: "card" }, el("h2", {}, content.title || run.name));
     if (content.estimate.params) {
       const estimate = el("table");
@@ -37,10 +40,10 @@ async function show(run, button) {
     if (policies.length) card.append(el("details", { open: policies.length < 4 }, el("summary", {}, `Policies (${policies.length})`), el("p", { class: "row downloads" }, ...policies.map(link))));
     view.replaceChildren(card);
     if (view.getBoundingClientRect().top > innerHeight / 2) view.scrollIntoView();
-    if (Object.keys(content.curves).length) {
+    if (content.curves.length) {
       const learnt = el("section", { class: "card" }, el("h2", {}, "Learning curves"), el("div", { class: "plots small" }));
       view.append(learnt);
-      curves(learnt.querySelector(".plots"), Object.values(content.curves));
+      curves(learnt.querySelector(".plots"), content.curves);
     }
     for (const figure of content.figures) {
       view.append(el("section", { class: "card" }, el("h2", {}, figure.replace(/\.png$/, "")), el("img", { src: address(figure), alt: `figure ${figure} of ${run.name}`, loading: "lazy" })));

@@ -54,8 +54,9 @@ function show(training) {
   card.stop.disabled = !isRunning(training);
   if (!rows.length) return;
   const columns = Object.fromEntries(Object.keys(rows[0]).map((name) => [name, rows.map((row) => row[name])]));
-  if (card.draw) card.draw([columns]);
-  else card.draw = curves(card.plots, [columns]);
+  const curve = { agent: training.folder, is_bound: training.is_bound, columns };
+  if (card.draw) card.draw([curve]);
+  else card.draw = curves(card.plots, [curve]);
 }
 
 function newCard(training) {
