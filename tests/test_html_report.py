@@ -331,7 +331,7 @@ def test_a_page_says_how_to_do_it_again(made, tmp_path):
                        ("bench", "excite benchmark two.toml --out bench")):  # fmt: skip
         assert read(made / name / "run.json")["command"] == line
         assert line in page_of(made / name).words
-    assert "excite study run studies/half.toml" in page_of(RESULTS / "half").words
+    assert "excite study run studies/half.toml --out runs/half" in page_of(RESULTS / "half").words
     shutil.copytree(RESULTS / "half", tmp_path / "half")
     marker = read(tmp_path / "half" / "run.json")
     (tmp_path / "half" / "run.json").write_text(json.dumps({**marker, "command": ""}))
@@ -356,9 +356,12 @@ def test_a_record_that_was_cut_off_says_so(here):
 
 def test_levels_that_were_reached_are_named(here):
     sidecar = read(here / "chirp.json")
-    for warning, critical, said in ((None, None, "–"), (8, 9, "below both"),
-                                    (0.1, 9, "warning level reached, as measured"),
-                                    (0.05, 0.1, "critical level reached, as measured")):  # fmt: skip
+    for warning, critical, said in (
+        (None, None, "–"),
+        (8, 9, "below both"),
+        (0.1, 9, "warning level reached, as measured"),
+        (0.05, 0.1, "critical level reached, as measured"),
+    ):
         output = sidecar["plant"]["outputs"][0]
         output |= {"warning_level": warning, "critical_level": critical}
         (here / "chirp.json").write_text(json.dumps(sidecar))

@@ -61,6 +61,15 @@ def result(chirp, foreign) -> Identification:
     return identify(PLANT, [chirp], validation=[foreign])
 
 
+def test_parameters_that_only_a_detour_hides_are_found():
+    """Far from where the search begins, the data seem to say nothing of D_p and K_pu."""
+    far = {"J_p": 0.3, "K_pu": 0.0125, "D_p": 0.00104}
+    record = record_of(PLANT, Chirp(), params=PLANT.Params(**far), num_steps=500)
+    result = identify(PLANT, [record])
+    assert result.status == "successful"
+    assert_within_sd(result, far)
+
+
 # A good record
 
 

@@ -97,7 +97,7 @@ def require_no_sideways_scroll(page: Page) -> None:
 
 def test_a_run_from_choosing_to_the_report(address: str, page: Page, tmp_path: Path):
     ready(page, address)
-    page.get_by_label("Seed of the noise").fill("7")
+    page.get_by_label("Seed").fill("7")
     page.get_by_role("button", name="Run", exact=True).click()
     expect(status(page)).to_have_text("Done.", timeout=WAIT)
     rows = page.locator("#comparison tbody tr")

@@ -55,6 +55,10 @@ def test_the_commands_of_a_page_run(page: Path, tmp_path: Path):
     assert run.returncode == 0, run.stdout[-2000:] + run.stderr[-2000:]
     for file in MADE.findall("\n".join(play(page))):
         assert (tmp_path / file).exists(), file
+    for shown in re.findall(r"```text\n( .*?)```", page.read_text(), re.S):  # a printed table
+        printed = " ".join(run.stdout.split())
+        for line in shown.splitlines():
+            assert " ".join(line.split()) in printed, line
     if page == README:
         assert "successful" in run.stdout
         [python] = re.findall(r"```python\n(.*?)```", page.read_text(), re.S)

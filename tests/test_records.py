@@ -103,6 +103,27 @@ def test_other_delimiters_and_a_byte_order_mark_are_understood(delimiter, start,
     np.testing.assert_array_equal(read_record(path, AERO2).outputs, drawn(AERO2).outputs)
 
 
+def test_decimal_commas_between_semicolons_are_understood(tmp_path):
+    text = (tmp_path / "a.csv").write_text
+    text("time;voltage;pitch\n0,0;1,5;-0,25\n0,1;2e-1;1,0\n")
+    record = read_record(tmp_path / "a.csv", AERO2)
+    np.testing.assert_array_equal(record.time, [0, 0.1])
+    np.testing.assert_array_equal(record.inputs[:, 0], [1.5, 0.2])
+    np.testing.assert_array_equal(record.outputs[:, 0], [-0.25, 1])
+
+
+def test_a_column_without_a_name_has_its_number(tmp_path):
+    (tmp_path / "a.csv").write_text(",voltage,pitch\n0,1,2\n0.1,1,2\n")
+    record = read_record(tmp_path / "a.csv", AERO2, {"time": "column 1"}, {"pitch": 1})
+    np.testing.assert_array_equal(record.time, [0, 0.1])
+
+
+def test_one_column_is_not_taken_for_two_things(tmp_path):
+    (tmp_path / "a.csv").write_text("t,u,y\n0,1,2\n0.1,1,2\n")
+    with pytest.raises(ValueError, match="'time' and 'pitch' cannot be the same column"):
+        read_record(tmp_path / "a.csv", AERO2, {"time": "t", "voltage": "u", "pitch": "t"})
+
+
 def test_columns_may_stand_in_any_order_beside_others(tmp_path):
     columns = {"note": ["nan"] * 30, **dict(reversed(table().items()))}
     (tmp_path / "r.csv").write_text(text_of(columns))

@@ -160,6 +160,16 @@ def test_two_others_are_compared_on_the_same_plant(told: Told):
     assert all(row["params"]["J_p"]["true"] == 0.025 for row in others)
 
 
+def test_another_excitation_that_does_not_fit_is_left_out(client, told: Told):
+    """The policy was made for 500 samples; the experiment asked for stands without it."""
+    del told
+    asked = {**EXPERIMENT, "steps": 600, "others": ["aero2"], "seconds": 0}
+    events = streamed(client, "/api/experiments", asked)
+    [left] = events.of("left_out")
+    assert (left["excitation"], events[-1]["kind"]) == ("aero2", "end")
+    assert "made for 500 steps" in left["sentence"]
+
+
 def test_a_stream_has_no_gaps(told: Told):
     assert told.gap < MAX_GAP
 
@@ -212,6 +222,15 @@ def test_an_uploaded_mat_file_is_identified(client, told: Told, tmp_path: Path):
     [event] = streamed(client, "/api/identifications", asked).of("identified")
     own = told.of("result")[0]["identification"]
     assert event["identification"]["params"] == own["params"]
+
+
+def test_an_initial_state_that_does_not_exist_is_refused(client, told: Told):
+    text = told.of("record.csv")[0]["text"]
+    uploaded = client.post("/api/uploads?name=a.csv", content=text).json()
+    asked = {"upload": uploaded["upload"], "plant": "aero2", "estimator": "nls"}
+    asked |= {"columns": {}, "scales": {}, "initial_state": "maybe"}
+    [failed] = streamed(client, "/api/identifications", asked).of("failed")
+    assert "known, free, auto" in failed["sentence"]
 
 
 def test_a_mat_file_that_unpacks_to_very_much_is_refused(client, told: Told, tmp_path: Path):
@@ -367,6 +386,20 @@ def test_nothing_outlives_the_server(number: int, code: int, tmp_path: Path):
         time.sleep(0.1)
     assert not trainings_in(runs)
     assert not [pid for pid in workers if is_running(pid)]
+
+
+def test_an_experiment_that_is_played_ends_with_the_server(tmp_path: Path):
+    """In a sentence, and without a word in the terminal; `served` sees to that."""
+    with contextlib.ExitStack() as opened:
+        with served(tmp_path, "--workers", "1") as where:
+            client = opened.enter_context(browser(where))
+            long = {**EXPERIMENT, "others": [], "seconds": 60}
+            answer = opened.enter_context(client.stream("POST", "/api/experiments", json=long))
+            lines = answer.iter_lines()
+            while json.loads(next(lines))["kind"] != "samples":
+                pass
+        last = json.loads(list(lines)[-1])
+    assert last == {"kind": "failed", "sentence": "the server has ended"}
 
 
 def is_running(process: int) -> bool:

@@ -223,8 +223,12 @@ def followed(asked: Mapping[str, Any], folder: str) -> Iterator[Event]:
     identification = None if result is None else result.to_dict()
     yield {"kind": "result", "row": row, "identification": identification}
     for name in asked["others"]:
-        other = Experiment.of(asked, name)
-        its_run = other.run()
+        try:
+            other = Experiment.of(asked, name)
+            its_run = other.run()
+        except ValueError as error:  # the experiment asked for stands without it
+            yield {"kind": "left_out", "excitation": name, "sentence": str(error)}
+            continue
         its = running_information(other.plant, other.params, its_run.inputs)[-1]
         yield {"kind": "other", "row": _outcome(other, its_run, its)[0]}
 

@@ -113,6 +113,11 @@ def read_record(
     for name, factor in scales.items():
         if not (np.isfinite(factor) and factor != 0):
             raise ValueError(f"scale {factor:g} of {name!r} is not allowed: finite and not zero")
+    needed = ["time", *names_of(description.inputs)]
+    needed += [] if inputs_only else names_of(description.outputs)
+    given = [columns.get(name, name) for name in needed]
+    if twice := [name for name in needed if given.count(columns.get(name, name)) > 1]:
+        raise ValueError(f"{path}: {' and '.join(map(repr, twice))} cannot be the same column")
     table = columns_in(path)
 
     def read(name: str) -> np.ndarray:
@@ -208,7 +213,8 @@ def _read_csv(path: Path) -> dict[str, np.ndarray | list[str]]:
     if not lines:
         raise ValueError(f"{path}: the file is empty")
     try:
-        rows = list(csv.reader(lines, delimiter=_delimiter(lines[0])))
+        delimiter = next((d for d in (",", ";", "\t") if d in lines[0]), ",")
+        rows = list(csv.reader(lines, delimiter=delimiter))
     except csv.Error as error:
         raise ValueError(f"{path}: cannot be read as CSV text ({error})") from None
     if not text.endswith(("\n", "\r")):
@@ -217,7 +223,7 @@ def _read_csv(path: Path) -> dict[str, np.ndarray | list[str]]:
             f"{path}: line {len(lines)} does not end with a line break; is the file truncated? "
             "(add one if it is complete)"
         )
-    header = [name.strip() for name in rows[0]]
+    header = [name.strip() or f"column {i}" for i, name in enumerate(rows[0], 1)]
     if len(set(header)) < len(header):
         raise ValueError(f"{path}: the header names a column twice: {', '.join(header)}")
     body = [(number, row) for number, row in enumerate(rows[1:], 2) if row]
@@ -227,11 +233,9 @@ def _read_csv(path: Path) -> dict[str, np.ndarray | list[str]]:
                 f"{path}: line {number} has {len(row)} values where the header names "
                 f"{len(header)}; is the file truncated?"
             )
-    return {name: [row[i].strip() for _, row in body] for i, name in enumerate(header)}
-
-
-def _delimiter(header: str) -> str:
-    return next((d for d in (",", ";", "\t") if d in header), ",")
+    point = "," if delimiter == ";" else "."  # of a German or French table
+    cells = [[cell.strip().replace(point, ".") for cell in row] for _, row in body]
+    return {name: [row[i] for row in cells] for i, name in enumerate(header)}
 
 
 def _require_matlab(path: Path) -> Any:
@@ -245,7 +249,7 @@ def _require_matlab(path: Path) -> Any:
 def _read_mat(path: Path) -> dict[str, np.ndarray | list[str]]:
     reader = _require_matlab(path)
     try:
-        names, size = _vectors_in(reader.whosmat(path))
+        names, size = _vectors_in(listed := reader.whosmat(path))
         is_small = size <= _MAX_UNPACKED
         content = reader.loadmat(path, variable_names=names) if names and is_small else {}
     except NotImplementedError:
@@ -257,6 +261,11 @@ def _read_mat(path: Path) -> dict[str, np.ndarray | list[str]]:
     if not is_small:
         sizes = f"{size / 2**20:.0f} MiB unpacked, more than {_MAX_UNPACKED >> 20}"
         raise ValueError(f"{path}: its columns take {sizes}; save it with fewer of them")
+    if not names:
+        found = [f"{name} ({'x'.join(map(str, shape))} {kind})" for name, shape, kind in listed]
+        raise ValueError(
+            f"{path}: columns are vectors of numbers, and it holds {', '.join(found) or 'nothing'}"
+        )
     vectors = {name: content[name] for name in names if name in content}
     return {n: np.asarray(v, float).ravel() for n, v in vectors.items() if v.dtype.kind in "fiu"}
 
@@ -288,6 +297,7 @@ def _column(
             values[row] = float(text)
         except ValueError:
             found = f"is {text!r}, not a number" if text else "is missing"
+            found += "; below the names there are only numbers" * (row == 0)
             raise ValueError(f"{path}: sample {row + 1} of {name!r} {found}") from None
     return values
 
@@ -369,18 +379,11 @@ def write_record(
     """
     path = Path(path)
     require_record_path(path, overwrite=True)
-    columns = dict(
-        zip(
-            description.columns,
-            np.column_stack([record.time, record.inputs, record.outputs]).T,
-            strict=True,
-        )
-    )
+    values = np.column_stack([record.time, record.inputs, record.outputs]).T
+    columns = dict(zip(description.columns, values, strict=True))
     buffer = io.BytesIO()
     if path.suffix.lower() == ".mat":
-        _require_matlab(path).savemat(
-            buffer, {name: values[:, None] for name, values in columns.items()}
-        )
+        _require_matlab(path).savemat(buffer, {n: v[:, None] for n, v in columns.items()})
     else:
         buffer.write(csv_text(columns).encode())
     # What an earlier sidecar says of the record's origin outlives later uses of it.
@@ -391,8 +394,6 @@ def write_record(
         "kind": RECORD_KIND,
         "dt": record.dt,
     }
-    if path.is_dir():
-        raise ValueError(f"{path} is a folder; choose another name")
     # The sidecar first: a record without one would be read as one of unknown start.
     write_json(path.with_suffix(".json"), sidecar)
     write_bytes(path, buffer.getvalue())

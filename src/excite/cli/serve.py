@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
 from .door import OUT_FILE, WholeNumber, cache_folder, json_option, show_json
 
@@ -66,6 +67,9 @@ def serve(
 
     if token is not None and len(token) < 8:
         raise ValueError("a token needs eight characters or more")
+    source = click.get_current_context().get_parameter_source("runs")
+    if source is ParameterSource.DEFAULT and not runs.exists():
+        runs.mkdir()  # nobody has left a run here yet
     if not runs.is_dir():
         raise ValueError(f"{runs}: no such folder; --runs names the run folder to be shown")
     if token is None and not is_loopback(host):
@@ -73,8 +77,7 @@ def serve(
     listening = _bound(host, port)
     with listening:
         port = listening.getsockname()[1]
-        shown = f"[{host}]" if ":" in host else host
-        address = f"http://{shown}:{port}/" + (f"#{quote(token, safe='')}" if token else "")
+        address = f"http://{_name(host)}:{port}/" + (f"#{quote(token, safe='')}" if token else "")
         told = {"address": address, "token": token, "runs": str(runs)}
         num_workers = workers or min(4, len(os.sched_getaffinity(0)))
         settings = Settings(runs.absolute(), host, token, num_workers, cache_folder())
@@ -105,6 +108,15 @@ def _bound(host: str, port: int) -> Any:
             "the address another computer's? (--port 0 takes a free port)"
         ) from None
     return listening
+
+
+def _name(host: str) -> str:
+    """What others type: where all addresses are bound, the computer's own name."""
+    import socket
+
+    if host in ("0.0.0.0", "::"):
+        return socket.gethostname().lower()
+    return f"[{host}]" if ":" in host else host
 
 
 def _tell(told: dict[str, Any], as_json: bool) -> None:

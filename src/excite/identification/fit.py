@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import jax.numpy as jnp
 import numpy as np
@@ -69,6 +69,8 @@ def identify(
             parameter can be seen, and for a start or a held value that is not allowed.
     """
     estimator = NLS() if estimator is None else estimator
+    if initial_state not in get_args(InitialState):
+        raise ValueError(f"initial state {initial_state!r} is not one of: known, free, auto")
     known = initial_state == "known" or (
         initial_state == "auto" and all(_starts_at(record, plant) for record in records)
     )
@@ -188,6 +190,23 @@ class _Fit:
 
 
 def _fit(
+    plant: AbstractPlant,
+    experiments: Experiments,
+    estimator: AbstractEstimator,
+    start: Params,
+) -> _Fit:
+    """Fits; what could not be seen on the way is looked at again from where the search ended.
+
+    Far from the truth a search can get stuck where the data seem to say nothing.
+    """
+    fit = _fit_seen(plant, experiments, estimator, start)
+    if not (fit.reasons and fit.is_successful):
+        return fit
+    again = _fit_seen(plant, experiments, estimator, fit.estimate.params)
+    return again if again.is_successful and again.free.sum() > fit.free.sum() else fit
+
+
+def _fit_seen(
     plant: AbstractPlant,
     experiments: Experiments,
     estimator: AbstractEstimator,

@@ -228,12 +228,11 @@ def kept_samples(values: Sequence[np.ndarray], points: int) -> np.ndarray:
 def draw_levels(axis: Any, part: Output, largest: float) -> None:
     """Both safety levels, where the output comes near enough for them to fit the picture."""
     factor = display_unit(part.unit)[1]
-    for level, colour, word in (
-        (part.warning_level, ORANGE, "warning"),
-        (part.critical_level, RED, "critical"),
-    ):
-        if level is None or largest < 0.25 * level:
-            continue
+    words = ((part.warning_level, ORANGE, "warning"), (part.critical_level, RED, "critical"))
+    levels = [(level, *shown) for level, *shown in words if level is not None]
+    if not levels or largest < 0.25 * levels[0][0]:
+        return
+    for level, colour, word in levels:
         for sign in (1, -1):
             label = f"{word} level" if sign == 1 else None
             axis.axhline(sign * level * factor, color=colour, ls="--", lw=1, label=label)

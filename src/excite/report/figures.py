@@ -47,7 +47,7 @@ def identification_figure(
             record.time, record.outputs[:, i], simulated[:, i], residual
         )
         top.plot(time, factor * measured, color=GREY, lw=1.6, label="measured")
-        top.plot(time, factor * model, color=BLUE, lw=1, label="simulated")
+        top.plot(time, factor * model, color=BLUE, lw=1, ls="--", label="simulated")
         fit = result["fit_percent"][part.name]
         top.set(ylabel=axis_label(part), title=f"{part.name}: fit {number(fit, 4)} %")
         below.plot(time, factor * residual, color=ORANGE, lw=0.8)

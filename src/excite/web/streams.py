@@ -203,6 +203,8 @@ async def _mixed(player: _Player, waiting: asyncio.Queue[Event], stop: asyncio.E
     while not stop.is_set():
         while not waiting.empty():
             early.append(waiting.get_nowait())
+            if early[-1]["kind"] == "failed":  # nothing is to be waited for
+                player.hurry()
         if (frame := player.frame()) is not None:
             yield frame
         while early and player.allows(early[0]):
@@ -239,6 +241,10 @@ class _Player:
     def allows(self, event: Event) -> bool:
         """Whether an event may be shown: not before the sample it was made at, or the last."""
         return self.is_over or event.get("k", math.inf) <= self._sent - 1
+
+    def hurry(self) -> None:
+        """Shows the rest at once."""
+        self._seconds = 0.0
 
     def frame(self) -> Event | None:
         """The samples that are due."""

@@ -10,7 +10,6 @@ import asyncio
 import contextlib
 import json
 import os
-import re
 import secrets
 import signal
 import sys
@@ -174,7 +173,7 @@ def _words(asked: dict[str, Any]) -> list[str]:
 
 def _free(folder: Path, name: str, running: Sequence[Training]) -> Path:
     """A folder for a training: a new one of this name in the run folder."""
-    path = folder / re.sub(r"\W", "_", name)
+    path = folder / name
     if path.exists() or path.is_symlink() or any(path == training.folder for training in running):
         raise RefusedError(409, f"{path.name} is there already; choose another name")
     return path

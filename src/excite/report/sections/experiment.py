@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ...description import RARE, PlantDescription, names_of
+from ...description import RARE, PlantDescription, display_unit, names_of
 from ...files import read_columns, read_json
 from ...records import Record
 from ..base import number
@@ -169,7 +169,8 @@ def _residuals(experiment: Experiment) -> tuple[list[str], list[list[str]]]:
     result, rows = experiment.result, []
     residuals = np.concatenate(_residual_values(experiment))
     for i, part in enumerate(experiment.plant.outputs):
-        size = f"{number(float(np.sqrt(np.mean(residuals[:, i] ** 2))))} {part.unit}"
+        unit, factor = display_unit(part.unit)
+        size = f"{number(factor * float(np.sqrt(np.mean(residuals[:, i] ** 2))))} {unit}"
         fit = f"{number(result['fit_percent'][part.name], 4)} %"
         rows.append([part.name, fit, size, *residual_cells(result, part.name)])
     for held_out in result["validation"]:

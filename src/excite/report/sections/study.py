@@ -81,7 +81,8 @@ def read_study_run(folder: Path, about: Mapping[str, Any]) -> StudyRun:
     settings = read_json(folder / "study.json", "name", "title", "estimators", advice=advice)
     if not (folder / "table.json").is_file():
         raise ValueError(
-            f"{folder}: the study is not finished; {_command(about)!r} goes on with it"
+            f"{folder}: the study is not finished; {about.get('command') or _command(about)!r} "
+            "goes on with it"
         )
     content = read_json(folder / "table.json", "rows", advice=advice)
     return StudyRun(folder, plant, settings, about, content)

@@ -1,7 +1,7 @@
 // Choose a plant and an excitation, press run, watch what is identified.
 
 import { download, el, options, say, symbol, Task, tell } from "./api.js";
-import { Plot, range, shown } from "./plot.js";
+import { digits, Plot, range, shown } from "./plot.js";
 
 const section = document.getElementById("experiment"), form = section.querySelector("form");
 const at = (id) => document.getElementById(id);
@@ -99,10 +99,9 @@ function run() {
   const wanted = asked();
   let live = null, rows = [];
   at("outcome").hidden = true;
-  if (matchMedia("(max-width: 60rem)").matches) section.querySelector(".view").scrollIntoView();
   say(form, "Waiting for a worker…");
   task.run("api/experiments", wanted, (event) => {
-    if (event.kind === "started") say(form, "Preparing; a plant, length or excitation met for the first time takes some seconds…");
+    if (event.kind === "started") say(form, "Preparing; a plant, length or excitation met for the first time takes up to half a minute…");
     else if (event.kind === "plan") live = new Live(event);
     else if (event.kind === "samples") {
       live.samples(event);
@@ -111,8 +110,8 @@ function run() {
     } else if (event.kind === "estimate") {
       live.estimate(event);
       if (live.isFull) say(form, waiting(live));
-    } else if (event.kind === "result" || event.kind === "other") {
-      rows.push(event.row);
+    } else if (["result", "other", "left_out"].includes(event.kind)) {
+      rows.push(event.row ?? event);
       compare(live, rows, wanted.others.length + 1);
       if (event.kind === "result") conclude(event);
       if (rows.length === wanted.others.length + 1) say(form, "Done.");
@@ -125,6 +124,7 @@ class Live {
   constructor(plan) {
     Object.assign(this, { plan, time: [], inputs: [], outputs: [], found: [] });
     this.end = (plan.num_samples - 1) * plan.plant.dt;
+    if (matchMedia("(max-width: 60rem)").matches) section.querySelector(".view").scrollIntoView();
     if (plan.warning) say(form, plan.warning, true);
     at("signals").replaceChildren();
     at("estimates").replaceChildren();
@@ -171,7 +171,7 @@ class Live {
       });
       const last = event.estimate[name];
       this.tracks[i].note.textContent = last === null ? "no estimate yet"
-        : `${shown(last, 5)} ± ${shown(event.half[name], 2)} ${unit}`;
+        : `${shown(last, digits(last, event.half[name]))} ± ${shown(event.half[name], 2)} ${unit}`;
     });
   }
 
@@ -198,21 +198,24 @@ class Live {
 
 function compare(live, rows, total) {
   const { parameters, outputs } = live.plan.plant;
-  const best = (name) => Math.min(...rows.map((r) => r.params[name].error_percent ?? Infinity));
+  const found = rows.filter((row) => row.params);
+  const best = (name) => Math.min(...found.map((r) => r.params[name].error_percent ?? Infinity));
   const head = ["excitation", "safe", ...outputs.map((o) => `largest ${o.name} [${o.shown_unit}]`)];
+  at("outcome").querySelector("h2").textContent = `Comparison: ${live.plan.plant.name}, ${live.plan.num_samples - 1} samples`;
   at("comparison").replaceChildren(
     el("thead", {}, el("tr", {}, ...head.map((text) => el("th", { scope: "col" }, text)),
       ...parameters.map((p) => el("th", { scope: "col" }, symbol(p.name), " error (bound) %")), el("th", { scope: "col" }, "log det M"))),
-    el("tbody", {}, ...rows.map((row) => el("tr", {},
+    el("tbody", {}, ...rows.map((row) => (row.sentence ? el("tr", {}, el("th", { scope: "row" }, row.excitation),
+      el("td", { class: "said", colspan: 2 + outputs.length + parameters.length }, row.sentence)) : el("tr", {},
       el("th", { scope: "row" }, row.excitation),
       el("td", { class: row.is_violation ? "bad" : "good" }, row.is_violation ? "violation" : "yes"),
       ...outputs.map((o) => el("td", {}, shown(row.max_abs_output[o.name] * o.factor))),
       ...parameters.map(({ name }) => {
         const p = row.params[name];
-        return el("td", { class: rows.length > 1 && p.error_percent === best(name) ? "best" : "" },
+        return el("td", { class: found.length > 1 && p.error_percent === best(name) ? "best" : "" },
           shown(p.error_percent), " ", el("small", {}, `(${shown(p.cramer_rao_percent, 2)})`));
       }),
-      el("td", {}, shown(row.log_det_information, 4))))));
+      el("td", {}, shown(row.log_det_information, 4)))))));
   at("outcome").hidden = false;
   if (rows.length < total) say(form, "Comparing…");
 }

@@ -25,6 +25,12 @@ export function shown(value, digits = 3) {
   return value.toFixed(Math.max(0, digits - 1 - Math.floor(Math.log10(size))));
 }
 
+/** So many digits that the uncertainty of a value has two of its own. */
+export function digits(value, uncertainty) {
+  const count = Math.ceil(Math.log10(Math.abs(value / uncertainty))) + 2;
+  return Number.isFinite(count) ? Math.min(12, Math.max(3, count)) : 5;
+}
+
 const label = (value) => String(+value.toPrecision(6)).replace("-", "−");
 
 export class Plot {

@@ -1,7 +1,7 @@
 // A recorded experiment: drop a file, map its columns, identify.
 
 import { download, el, options, say, symbol, Task, tell, upload } from "./api.js";
-import { Plot, range, shown } from "./plot.js";
+import { digits, Plot, range, shown } from "./plot.js";
 
 const section = document.getElementById("record"), form = section.querySelector("form");
 const at = (id) => document.getElementById(id);
@@ -9,7 +9,7 @@ let catalogue, task, file = null, reading = 0;
 
 export function begin(known) {
   catalogue = known;
-  task = new Task(form, () => file !== null);
+  task = new Task(form, () => file !== null && needed().every((name) => at(`column-${name}`)?.value));
   options(at("record-plant"), Object.keys(catalogue.plants), "aero2");
   options(at("estimator"), catalogue.estimators, "nls");
   at("record-plant").addEventListener("change", showMapping);
@@ -27,6 +27,7 @@ async function take(chosen) {
   const own = (reading += 1);
   file = null;
   task.refresh();
+  if (!task.isBusy) hideResults();
   at("mapping").hidden = true;
   say(form, `Reading ${chosen.name}…`);
   try {
@@ -52,12 +53,16 @@ function showMapping() {
   at("mapping").hidden = false;
   at("mapping").querySelector("div").replaceChildren(...needed().map((name) => {
     const select = el("select", { id: `column-${name}` });
-    options(select, there, found(name) ?? (name === "time" ? there.find((c) => /^t/i.test(c)) : null));
+    const likely = found(name) ?? (name === "time" ? there.find((c) => /^t/i.test(c)) : undefined);
+    options(select, there, likely);
+    if (likely === undefined) select.prepend(el("option", { value: "", selected: true }, "choose…"));
+    select.addEventListener("change", () => task.refresh());
     return el("div", { class: "map" },
       el("div", { class: "field" }, el("label", { for: select.id }, `${name} `, el("span", { class: "unit" }, unitOf(name))), select),
       el("div", { class: "field" }, el("label", { for: `scale-${name}` }, "factor"),
         el("input", { id: `scale-${name}`, type: "number", step: "any", placeholder: "none" })));
   }));
+  task.refresh();
 }
 
 function identify() {
@@ -71,7 +76,7 @@ function identify() {
     estimator: at("estimator").value,
     initial_state: at("initial").value,
   };
-  section.querySelectorAll(".view > section").forEach((part) => { part.hidden = true; });
+  hideResults();
   say(form, "Waiting for a worker…");
   const start = Date.now();
   task.run("api/identifications", wanted, (event) => {
@@ -81,11 +86,14 @@ function identify() {
   });
 }
 
+const hideResults = () => section.querySelectorAll(".view > section").forEach((part) => { part.hidden = true; });
+
 function show({ identification, plant: fitted, result, time, inputs, outputs, simulated }) {
   section.querySelectorAll(".view > section").forEach((part) => { part.hidden = false; });
   say(form, `Done: ${identification.status}.`);
+  section.querySelector(".view h2").textContent = `Identified: ${identification.files.join(", ")}, ${fitted.name}`;
   table(at("identified"), identification);
-  const fits = Object.entries(identification.fit_percent).map(([name, value]) => `${name}: fit ${shown(value, 4)} %`);
+  const fits = Object.entries(identification.fit_percent).filter(([, value]) => value !== null).map(([name, value]) => `${name}: fit ${shown(value, 4)} %${tests(identification, name)}`);
   at("record-verdict").replaceChildren(...[...fits, ...identification.verdict].map((text) => el("li", {}, text)));
   section.querySelector(".downloads").replaceChildren(
     download(`api/results/${result}/report.html`, "Report"),
@@ -112,14 +120,23 @@ function show({ identification, plant: fitted, result, time, inputs, outputs, si
   });
 }
 
+/** What the tests of a residual say; the verdict says what follows from a small p. */
+function tests({ whiteness_p_value: white, structure_p_value: follows }, name) {
+  if (!Number.isFinite(white?.[name]) || !Number.isFinite(follows?.[name])) return "";
+  return `; residual white with p = ${shown(white[name])}, independent of the input with p = ${shown(follows[name])}`;
+}
+
+const interval = ({ estimate, std_error: sd, ci95 }) => (Number.isFinite(ci95?.[0])
+  ? ci95.map((end) => shown(end, digits(estimate, sd))).join(" to ") : "–");
+
 /** The parameters of an identification as a table. */
 export function table(element, { params }) {
   element.replaceChildren(
     el("thead", {}, el("tr", {}, ...["", "estimate", "95 % interval", "standard error", "unit"].map((text) => el("th", { scope: "col" }, text)))),
     el("tbody", {}, ...Object.entries(params).map(([name, p]) => el("tr", {},
       el("th", { scope: "row" }, symbol(name)),
-      el("td", {}, shown(p.estimate, 6) + (p.held ? " (held)" : "")),
-      el("td", {}, p.held ? "–" : `${shown(p.ci95?.[0], 5)} to ${shown(p.ci95?.[1], 5)}`),
+      el("td", {}, shown(p.estimate, digits(p.estimate, p.std_error)) + (p.held ? " (held)" : "")),
+      el("td", {}, interval(p)),
       el("td", {}, shown(p.std_error)),
       el("td", {}, p.unit)))));
 }
