@@ -183,6 +183,44 @@ def test_it_is_used_by_the_keyboard_alone(address: str, page: Page):
     expect(status(page)).to_have_text("Stopped.", timeout=WAIT)
 
 
+def test_the_header_is_skipped_to_the_part_that_is_shown(address: str, page: Page):
+    page.goto(f"{address}/#runs")
+    expect(page.get_by_role("button", name="a_study")).to_be_visible()
+    page.locator(".skip").focus()
+    page.keyboard.press("Enter")
+    expect(page).to_have_url(f"{address}/#main")
+    expect(page.locator("#runs")).to_be_visible()
+    page.keyboard.press("Tab")
+    expect(page.get_by_role("button", name="a_study")).to_be_focused()
+
+
+def test_columns_are_chosen_before_anything_is_identified(address: str, page: Page):
+    page.goto(f"{address}/#record")
+    expect(page.locator("#record-plant option").first).to_be_attached(timeout=WAIT)
+    content = b"t,u,y\n" + b"".join(b"%g,1,%g\n" % (0.1 * k, 0.01 * k) for k in range(60))
+    log: Any = {"name": "log.csv", "mimeType": "", "buffer": content}
+    page.locator("#file").set_input_files(log)
+    expect(status(page, "record")).to_contain_text("3 columns, 60 samples", timeout=WAIT)
+    identify = page.get_by_role("button", name="Identify")
+    for name, column in (("time", "t"), ("voltage", ""), ("pitch", "")):
+        expect(page.locator(f"#column-{name}")).to_have_value(column)
+    page.locator("#column-voltage").select_option("u")
+    expect(identify).to_be_disabled()
+    page.locator("#column-pitch").select_option("u")
+    expect(identify).to_be_enabled()
+    identify.click()
+    expect(status(page, "record")).to_contain_text("cannot be the same column", timeout=WAIT)
+    # Another file while one is identified: one after the other.
+    page.locator("#column-pitch").select_option("y")
+    page.route("**/api/identifications", lambda route: None)  # takes for ever
+    identify.click()
+    page.locator("#file").set_input_files({**log, "name": "other.csv"})
+    expect(status(page, "record")).to_contain_text("other.csv: 3 columns", timeout=WAIT)
+    page.locator("#column-voltage").select_option("u")
+    page.locator("#column-pitch").select_option("y")
+    expect(identify).to_be_disabled()
+
+
 def test_every_field_has_a_label(address: str, page: Page):
     ready(page, address)
     bare = "[...document.querySelectorAll('input, select')].filter((e) => !e.labels.length).length"
@@ -252,6 +290,9 @@ def test_a_training_is_started_and_stopped(address: str, page: Page):
     card = page.locator("#trainings section")
     expect(card.get_by_role("status")).to_contain_text("starting", timeout=WAIT)
     expect(card.locator("code")).to_contain_text("excite train aero2 --objective D")
+    expect(card.get_by_role("status")).to_have_text("training", timeout=3 * WAIT)
+    expect(card.locator("canvas")).to_have_count(5)  # what the curve is drawn on
+    expect(card.locator("figcaption").nth(2)).to_have_text(re.compile(r"^bound of Jp %[\d.]+$"))
     card.get_by_role("button", name="Stop").click()
     expect(card.get_by_role("status")).to_contain_text("stopped", timeout=WAIT)
     require_no_sideways_scroll(page)
@@ -284,7 +325,7 @@ def test_a_download_that_is_refused_says_why(address: str, page: Page):
 
 
 def test_a_token_lets_the_browser_in_and_leaves_the_address(chromium: Browser, tmp_path: Path):
-    with served(tmp_path, "--token", "a-good-token", "--workers", "1") as where:
+    with served(tmp_path, "--token", "schlüssel + 100%", "--workers", "1") as where:
         root = where.partition("#")[0].rstrip("/")
         stranger = chromium.new_page()
         stranger.goto(root)
