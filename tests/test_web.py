@@ -13,6 +13,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -400,6 +401,34 @@ def test_an_experiment_that_is_played_ends_with_the_server(tmp_path: Path):
                 pass
         last = json.loads(list(lines)[-1])
     assert last == {"kind": "failed", "sentence": "the server has ended"}
+
+
+SLOW = """
+import signal, sys, time
+if "train" in sys.orig_argv:
+    signal.signal(signal.SIGINT, lambda *_: (time.sleep(3), sys.exit(130)))
+    time.sleep(60)
+"""
+
+
+def test_a_training_that_ends_slowly_ends_with_the_server(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """And whoever stopped it gets an answer; `served` sees that the terminal stays silent."""
+    (tmp_path / "sitecustomize.py").write_text(SLOW)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    answers = []
+    with contextlib.ExitStack() as opened:
+        with served(tmp_path, "--workers", "1") as where:
+            client = opened.enter_context(browser(where))
+            begun = client.post("/api/trainings", json=TRAINING).json()
+            time.sleep(1)  # until it listens to signals
+            place = f"/api/trainings/{begun['name']}"
+            stopping = threading.Thread(target=lambda: answers.append(client.delete(place)))
+            stopping.start()
+            time.sleep(0.5)
+        stopping.join()
+    assert answers[0].json()["state"] == "stopped"
 
 
 def is_running(process: int) -> bool:

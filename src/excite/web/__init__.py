@@ -54,16 +54,18 @@ def application(
     workers, trainings = Workers(settings.num_workers, settings.cache), list[Training]()
     known: list[dict[str, Any]] = []
 
+    async def end_work() -> None:
+        await asyncio.gather(workers.close(), *(training.stop() for training in trainings))
+
     @contextlib.asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
-        app.state.close_workers = workers.close
+        app.state.end_work = end_work
         await workers.open()
         ready()
         try:
             yield
         finally:
-            await asyncio.gather(*(training.stop() for training in trainings))
-            await workers.close()
+            await end_work()
 
     async def catalogue(request: Request) -> JSONResponse:
         del request
@@ -124,7 +126,7 @@ def _refused(request: Request, error: RefusedError) -> JSONResponse:
 
 
 class _Server(uvicorn.Server):
-    """A server that a signal ends; its workers end first, so that no request waits for them."""
+    """A server that a signal ends; what computes ends first, so that no request waits for it."""
 
     def __init__(self, config: uvicorn.Config, came: list[int]) -> None:
         super().__init__(config)
@@ -142,7 +144,7 @@ class _Server(uvicorn.Server):
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Ends what computes, then what serves."""
         app: Any = self.config.app
-        await app.state.close_workers()
+        await app.state.end_work()
         await super().shutdown(sockets)
 
 
