@@ -214,7 +214,8 @@ def test_columns_are_chosen_before_anything_is_identified(address: str, page: Pa
     page.locator("#column-pitch").select_option("y")
     page.route("**/api/identifications", lambda route: None)  # takes for ever
     identify.click()
-    page.locator("#file").set_input_files({**log, "name": "other.csv"})
+    other: Any = {**log, "name": "other.csv"}
+    page.locator("#file").set_input_files(other)
     expect(status(page, "record")).to_contain_text("other.csv: 3 columns", timeout=WAIT)
     page.locator("#column-voltage").select_option("u")
     page.locator("#column-pitch").select_option("y")
