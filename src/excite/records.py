@@ -116,7 +116,7 @@ def read_record(
     needed = ["time", *names_of(description.inputs)]
     needed += [] if inputs_only else names_of(description.outputs)
     given = [columns.get(name, name) for name in needed]
-    if twice := [name for name in needed if given.count(columns.get(name, name)) > 1]:
+    if twice := [n for n, column in zip(needed, given, strict=True) if given.count(column) > 1]:
         raise ValueError(f"{path}: {' and '.join(map(repr, twice))} cannot be the same column")
     table = columns_in(path)
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import re
 import tempfile
 from collections.abc import Callable
-from contextlib import aclosing
 from pathlib import Path
 from typing import Any
 
@@ -105,12 +105,21 @@ def _file_name(name: str) -> str:
     return f"{plain or 'file'}.{ending.lower()}"
 
 
+def _stored(scratch: Path) -> int:
+    """Bytes that are kept for all browsers."""
+    size = 0
+    for file in scratch.rglob("*"):
+        with contextlib.suppress(OSError):  # another worker's, gone by now
+            size += file.stat().st_size
+    return size
+
+
 async def _receive(request: Request, path: Path, scratch: Path) -> None:
     """Writes the body of a request, which is read no further than it is allowed to be long."""
     too_large = RefusedError(413, f"the file is larger than {MAX_UPLOAD >> 20} MiB")
     if int(request.headers.get("content-length") or 0) > MAX_UPLOAD:
         raise too_large
-    if sum(file.stat().st_size for file in scratch.rglob("*") if file.is_file()) > MAX_STORED:
+    if _stored(scratch) > MAX_STORED:
         raise RefusedError(507, "too much is kept here for all browsers; try again later")
     parts = request.stream()
     try:
@@ -130,7 +139,7 @@ async def _receive(request: Request, path: Path, scratch: Path) -> None:
 async def _last(pool: Pool, target: str, arguments: dict[str, Any], urgent: bool) -> dict[str, Any]:
     """The last event of a call before its end."""
     told: dict[str, Any] = {}
-    async with aclosing(pool.events(target, arguments, urgent)) as events:
+    async with contextlib.aclosing(pool.events(target, arguments, urgent)) as events:
         async for event in events:
             if event["kind"] == "failed":
                 raise RefusedError(422, event["sentence"])

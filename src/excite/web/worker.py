@@ -33,8 +33,8 @@ def main() -> None:
 def _answer() -> None:
     with os.fdopen(os.dup(1), "w", encoding="utf-8", errors="replace") as out:
         os.dup2(2, 1)  # whatever a library prints is no event
-        live = importlib.import_module("excite.live")
         os.nice(5)  # the server comes first: a stream has to flow while others compute
+        live = importlib.import_module("excite.live")
         limit = int(sys.argv[1])
         resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
         _write(out, {"kind": "ready"})
