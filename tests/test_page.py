@@ -199,7 +199,15 @@ def test_columns_are_chosen_before_anything_is_identified(address: str, page: Pa
     expect(page.locator("#record-plant option").first).to_be_attached(timeout=WAIT)
     content = b"t,u,y\n" + b"".join(b"%g,1,%g\n" % (0.1 * k, 0.01 * k) for k in range(60))
     log: Any = {"name": "log.csv", "mimeType": "", "buffer": content}
-    page.locator("#file").set_input_files(log)
+    carried = page.evaluate_handle(
+        """(text) => {
+          const carried = new DataTransfer();
+          carried.items.add(new File([text], "log.csv"));
+          return carried;
+        }""",
+        content.decode(),
+    )
+    page.locator("#record .drop").dispatch_event("drop", {"dataTransfer": carried})
     expect(status(page, "record")).to_contain_text("3 columns, 60 samples", timeout=WAIT)
     identify = page.get_by_role("button", name="Identify")
     for name, column in (("time", "t"), ("voltage", ""), ("pitch", "")):
