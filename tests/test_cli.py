@@ -1,3 +1,4 @@
+import contextlib
 import csv
 import json
 import math
@@ -20,6 +21,7 @@ from documented import documented, documented_words
 from experiments import NUM_STEPS
 
 from excite.cli import cli, main
+from excite.cli.door import progress_bar
 from excite.names import EXCITATIONS, PLANTS
 from excite.plant import Aero2
 from excite.policy import Layout, Policy, read_policy
@@ -824,6 +826,20 @@ def test_a_cache_that_cannot_be_written_is_no_remark(here):
 
 
 @pytest.mark.slow
+def test_an_interrupt_that_a_library_has_swallowed_is_not_lost():
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with progress_bar("working") as report:
+            report("on", 0, 2)
+            with contextlib.suppress(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGINT)
+            with pytest.raises(KeyboardInterrupt):
+                report("on", 1, 2)
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def test_an_interrupted_benchmark_ends_with_130_and_leaves_nothing(here, tmp_path):
     before, cache = contents(here), tmp_path / "cache"
     program = subprocess.Popen(

@@ -8,6 +8,7 @@ import json
 import os
 import re
 import shlex
+import signal
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -160,15 +161,36 @@ def progress_bar(what: str) -> Iterator[Callable[[str, int, int], None]]:
 
     console = Console(stderr=True)
     columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()
-    with Progress(
-        *columns, console=console, transient=True, disable=not console.is_terminal
-    ) as bar:
+    bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+    with bar, _interrupts() as came:
         task = bar.add_task(what, total=None)
 
         def report(text: str, done: int, total: int) -> None:
+            if came:
+                raise KeyboardInterrupt
             bar.update(task, description=f"{what}: {text}", completed=done, total=total)
 
         yield report
+
+
+@contextlib.contextmanager
+def _interrupts() -> Iterator[list[int]]:
+    """Every Ctrl-C, as it comes; one that is raised in a library's callback would be lost."""
+    came, usual = list[int](), signal.getsignal(signal.SIGINT)
+
+    def remember(number: int, frame: Any) -> None:
+        del frame
+        came.append(number)
+        raise KeyboardInterrupt
+
+    if usual is not signal.default_int_handler:  # somebody else's, or ignored
+        yield came
+        return
+    signal.signal(signal.SIGINT, remember)
+    try:
+        yield came
+    finally:
+        signal.signal(signal.SIGINT, usual)
 
 
 def show_json(value: Any) -> None:
