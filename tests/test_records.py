@@ -118,6 +118,22 @@ def test_a_column_without_a_name_has_its_number(tmp_path):
     np.testing.assert_array_equal(record.time, [0, 0.1])
 
 
+@pytest.mark.parametrize("quote", ["", '"'])
+def test_names_may_hold_commas_between_semicolons(quote, tmp_path):
+    names = [f"{quote}{name}{quote}" for name in ("Zeit, s", "Spannung, V", "Winkel, rad")]
+    (tmp_path / "a.csv").write_text(f"{';'.join(names)}\n0,0;1,5;-0,25\n0,1;2;1\n")
+    columns = {"time": "Zeit, s", "voltage": "Spannung, V", "pitch": "Winkel, rad"}
+    record = read_record(tmp_path / "a.csv", AERO2, columns)
+    np.testing.assert_array_equal(record.outputs[:, 0], [-0.25, 1])
+
+
+@pytest.mark.parametrize("first", ["0.1,0.2,-3e-4", "0.0,0.0,0.1"])
+def test_a_file_without_names_is_refused(first, tmp_path):
+    (tmp_path / "a.csv").write_text(f"{first}\n0.2,1,2\n0.3,1,2\n")
+    with pytest.raises(ValueError, match="the first line holds numbers"):
+        read_record(tmp_path / "a.csv", AERO2)
+
+
 def test_one_column_is_not_taken_for_two_things(tmp_path):
     (tmp_path / "a.csv").write_text("t,u,y\n0,1,2\n0.1,1,2\n")
     with pytest.raises(ValueError, match="'time' and 'pitch' cannot be the same column"):
@@ -602,7 +618,7 @@ def test_json_has_no_number_that_is_not_finite():
 def test_time_in_another_unit_is_refused_unless_said_to_be_right(tmp_path):
     path = tmp_path / "r.csv"
     path.write_text(text_of(table()))
-    with pytest.raises(ValueError, match=r"'time' in another unit\? \(--scale time=FACTOR"):
+    with pytest.raises(ValueError, match=r"Give a factor \(--scale time=FACTOR"):
         read_record(path, AERO2, scales={"time": 1000.0})
     slow = dataclasses.replace(AERO2, dt=1e-3, band=(1.0, 100.0))
     assert read_record(path, slow, scales={"time": 1.0}).dt == pytest.approx(0.1)

@@ -11,7 +11,7 @@ import pytest
 
 from excite.live import columns
 from excite.web import workers as module
-from excite.web.base import without_folders
+from excite.web.base import RefusedError, without_folders
 from excite.web.workers import Workers
 
 HEADER = f"""#!{sys.executable}
@@ -72,6 +72,20 @@ def test_a_worker_that_answers_oddly_is_replaced_and_nobody_waits(kind: str, pro
     assert [event["kind"] for event in bad] == ["started", "failed"]
     assert "cannot be used" in bad[-1]["sentence"]
     assert good == 2 * [[{"kind": "started"}, {"kind": "end"}]]
+
+
+def test_what_comes_after_the_end_is_refused(program: Path):
+    write(program, HEADER)
+
+    async def late() -> None:
+        workers = Workers(1, None)
+        await workers.open()
+        await workers.close()
+        async with asyncio.timeout(5):
+            await told(workers, "good")
+
+    with pytest.raises(RefusedError, match="the server has ended"):
+        asyncio.run(late())
 
 
 def test_what_was_given_up_takes_no_place_in_the_queue(program: Path):

@@ -241,15 +241,16 @@ def _estimates(own: Experiment, run: Trajectory, information: Any) -> Iterator[E
     counts = np.linspace(min(_FIRST, own.num_steps + 1), own.num_steps + 1, NUM_ESTIMATES)
     for count in np.unique(counts.astype(int)):
         estimate = NLS()(plant, _first(data, int(count)), plant.nominal, free)
-        half = HALF_95 * np.sqrt(np.diag(np.asarray(estimate.covariance)))
         is_good = int(estimate.status) == Status.SUCCESSFUL
+        variance = np.diag(np.asarray(estimate.covariance))
+        half = HALF_95 * np.sqrt(np.where(is_good, variance, np.nan))
         bound = HALF_95 * np.asarray(cramer_rao_bound(information[count - 2]) * size)
         parts = plant.definition.parameters
         yield {
             "kind": "estimate",
             "k": int(count) - 1,
             "estimate": _by_name(parts, estimate.params if is_good else bound * np.nan),
-            "half": _by_name(parts, half if is_good else half * np.nan),
+            "half": _by_name(parts, half),
             "bound": _by_name(parts, bound),
         }
 
@@ -270,7 +271,8 @@ def _experiment_again(asked: Mapping[str, Any]) -> str:
 def _identification_again(asked: Mapping[str, Any], name: str) -> str:
     """The command that makes the same run folder of a file."""
     words = [
-        "excite", "identify", name, "--plant", asked["plant"], "--estimator", asked["estimator"],
+        "excite", "identify", f"./{name}" if name[0] == "-" else name,
+        "--plant", asked["plant"], "--estimator", asked["estimator"],
         "--initial-state", asked["initial_state"], *_given("--column", asked["columns"]),
         *_given("--scale", asked["scales"]), "--out", "run",
     ]  # fmt: skip

@@ -8,7 +8,6 @@ plant it was, which parameters, and how the experiment began.
 
 from __future__ import annotations
 
-import csv
 import io
 import json
 import math
@@ -27,7 +26,7 @@ except ImportError:
     matlab = None
 
 from .description import Input, Output, PlantDescription, names_of
-from .files import csv_text, require_new_file, write_bytes, write_json
+from .files import csv_text, require_new_file, text_columns, write_bytes, write_json
 
 RECORD_KIND = "excite record"
 _UNEVEN = 0.05  # of the sampling time: more than printing it with few digits explains
@@ -129,8 +128,8 @@ def read_record(
     if dt > _TIMES_DT * description.dt and scales.get("time") != 1:
         raise ValueError(
             f"{path}: sampled every {dt:g} s, where {description.name!r} is every "
-            f"{description.dt:g} s; is 'time' in another unit? (--scale time=FACTOR; 1 says that "
-            "the unit is right)"
+            f"{description.dt:g} s; is 'time' in another unit? Give a factor (--scale "
+            "time=FACTOR; 1 says that the unit is right)"
         )
     outputs = () if inputs_only else description.outputs
     parts = {part.name: read(part.name) for part in (*description.inputs, *outputs)}
@@ -187,7 +186,7 @@ def columns_in(path: Path) -> dict[str, np.ndarray | list[str]]:
     _require_record_ending(path)
     if not path.is_file():
         raise ValueError(f"{path}: no such file")
-    return _read_mat(path) if path.suffix.lower() == ".mat" else _read_csv(path)
+    return _read_mat(path) if path.suffix.lower() == ".mat" else {**text_columns(path)}
 
 
 def _require_record_ending(path: Path) -> None:
@@ -202,40 +201,6 @@ def require_record_path(path: Path, overwrite: bool) -> None:
     if sidecar.is_file() and not _read_sidecar(path):
         raise ValueError(f"{sidecar} is no sidecar of a record and would be lost; rename one")
     require_new_file(path, overwrite)
-
-
-def _read_csv(path: Path) -> dict[str, np.ndarray | list[str]]:
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (UnicodeDecodeError, OSError) as error:
-        raise ValueError(f"{path}: cannot be read as CSV text ({error})") from None
-    lines = text.splitlines()
-    if not lines:
-        raise ValueError(f"{path}: the file is empty")
-    try:
-        delimiter = next((d for d in (",", ";", "\t") if d in lines[0]), ",")
-        rows = list(csv.reader(lines, delimiter=delimiter))
-    except csv.Error as error:
-        raise ValueError(f"{path}: cannot be read as CSV text ({error})") from None
-    if not text.endswith(("\n", "\r")):
-        # A number cut in half is still a number: only the line's end shows that it is whole.
-        raise ValueError(
-            f"{path}: line {len(lines)} does not end with a line break; is the file truncated? "
-            "(add one if it is complete)"
-        )
-    header = [name.strip() or f"column {i}" for i, name in enumerate(rows[0], 1)]
-    if len(set(header)) < len(header):
-        raise ValueError(f"{path}: the header names a column twice: {', '.join(header)}")
-    body = [(number, row) for number, row in enumerate(rows[1:], 2) if row]
-    for number, row in body:
-        if len(row) != len(header):
-            raise ValueError(
-                f"{path}: line {number} has {len(row)} values where the header names "
-                f"{len(header)}; is the file truncated?"
-            )
-    point = "," if delimiter == ";" else "."  # of a German or French table
-    cells = [[cell.strip().replace(point, ".") for cell in row] for _, row in body]
-    return {name: [row[i] for row in cells] for i, name in enumerate(header)}
 
 
 def _require_matlab(path: Path) -> Any:
@@ -264,7 +229,8 @@ def _read_mat(path: Path) -> dict[str, np.ndarray | list[str]]:
     if not names:
         found = [f"{name} ({'x'.join(map(str, shape))} {kind})" for name, shape, kind in listed]
         raise ValueError(
-            f"{path}: columns are vectors of numbers, and it holds {', '.join(found) or 'nothing'}"
+            f"{path}: columns are vectors of numbers, each a variable of its own, and it holds "
+            f"{', '.join(found) or 'nothing'}"
         )
     vectors = {name: content[name] for name in names if name in content}
     return {n: np.asarray(v, float).ravel() for n, v in vectors.items() if v.dtype.kind in "fiu"}
@@ -343,7 +309,8 @@ def _check_size(values: np.ndarray, part: Input | Output, path: Path) -> None:
     if excess > allowed:
         raise ValueError(
             f"{path}: {part.name!r} reaches {worst:g} {part.unit}, {expected}; "
-            f"is it in another unit? (--scale {part.name}=FACTOR; 1 says that the unit is right)"
+            f"is it in another unit? Give a factor (--scale {part.name}=FACTOR; 1 says that the "
+            "unit is right)"
         )
 
 

@@ -32,4 +32,4 @@ def report(runs: tuple[Path, ...], out: Path, overwrite: bool, as_json: bool) ->
     if as_json:
         show_json({"file": str(out), "runs": [str(run) for run in runs], "bytes": len(page)})
     else:
-        click.echo(f"report: {out}, {len(page) / 1e6:.1f} MB")
+        click.echo(f"report: {out}, {len(page) / 1e6:.2g} MB")

@@ -39,7 +39,8 @@ from .base import Fitted, Identification
 InitialState = Literal["auto", "free", "known"]
 _NOTHING_SEEN = (
     "no parameter can be seen in the data; are columns, signs and units right, and does the "
-    "input move the plant beyond the noise?"
+    "input move the plant beyond the noise? or has the search begun too far from the truth "
+    "(--start)?"
 )
 _BY_CHANCE = 1e-3  # a fit that chance would reach more often explains nothing
 
@@ -91,7 +92,8 @@ def identify(
         for i, name in enumerate(whiteness)
     }
     covariance, verdict = _confidence(plant, experiments, estimator, fit, whiteness)
-    verdict = (*(_wrong_structure(structure) if fit.is_successful else ()), *verdict)
+    wrong = _wrong_structure(structure, estimator) if fit.is_successful else ()
+    verdict = (*wrong, *verdict)
     verdict += tuple(s for record in [*records, *validation] for s in _other_plant(record, plant))
     names, d = names_of(plant.definition.parameters), plant.description
     sd = np.where(fit.free, np.sqrt(np.maximum(np.diag(covariance), 0.0)), np.nan)
@@ -326,15 +328,18 @@ def _dependence(
     return input_dependence([r for r, _ in pairs], [inputs for _, inputs in pairs])
 
 
-def _wrong_structure(structure: Mapping[str, float]) -> tuple[str, ...]:
+def _wrong_structure(
+    structure: Mapping[str, float], estimator: AbstractEstimator
+) -> tuple[str, ...]:
     """A sentence where a residual follows the input."""
     wrong = [name for name, p in structure.items() if p < RARE]
     if not wrong:
         return ()
+    or_biased = "" if isinstance(estimator, NLS) else "; or the estimator is biased: try nls"
     return (
         f"the residual of {' and '.join(wrong)} follows the input: the structure of this plant is "
         "wrong for these data, or time, input or sensor are not what it takes them for; no "
-        "interval covers that",
+        f"interval covers that{or_biased}",
     )
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import re
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -16,6 +15,7 @@ from starlette.routing import Route
 
 from .base import MAX_STORED, MAX_UPLOAD, Pool, RefusedError, Session
 
+_MAX_NAME = 200  # bytes of a file's name
 _SILENCE = 30.0  # seconds without a part of a file
 _DOWNLOADS = {
     "record.csv": "text/csv",
@@ -97,12 +97,11 @@ async def _reported(pool: Pool, session: Session, run: Path) -> Response:
 
 
 def _file_name(name: str) -> str:
-    """The name of an uploaded file, freed of what a path, a page or a command could mistake."""
-    stem, dot, ending = name.rpartition(".")
-    if not dot or ending.lower() not in ("csv", "mat"):
+    """The name of an uploaded file as its owner knows it, freed of what is no part of a name."""
+    if not name.lower().endswith((".csv", ".mat")):
         raise RefusedError(415, "experiment files end in .csv or .mat")
-    plain = re.sub(r"[^\w .,()+=-]", "_", stem)[-60:].lstrip(" .-")
-    return f"{plain or 'file'}.{ending.lower()}"
+    plain = "".join(c if c.isprintable() and c not in "/\\" else "_" for c in name)
+    return plain if len(plain.encode()) <= _MAX_NAME else f"file{plain[-4:]}"
 
 
 def _stored(scratch: Path) -> int:

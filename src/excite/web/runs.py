@@ -19,7 +19,7 @@ from starlette.responses import FileResponse, JSONResponse
 from starlette.routing import Route
 
 from ..files import folder_word
-from .base import RefusedError
+from .base import RefusedError, without_folders
 
 _TYPES = {
     ".png": "image/png",
@@ -134,8 +134,10 @@ def _summary(name: str, run: Path) -> dict[str, Any]:
 def _content(run: Path) -> dict[str, Any]:
     """What a run shows: its table as it was written, or its estimate, and its files."""
     files = _files(run)
+    command = _json(run, "run.json").get("command")
     return {
         **_summary(run.name, run),
+        "command": without_folders(command) if isinstance(command, str) else "",
         **_table(_text(run, "table.md")),
         "estimate": _json(run, "estimate.json"),
         "curves": _curves(run),
@@ -157,12 +159,14 @@ def _table(text: str) -> dict[str, Any]:
 def _curves(run: Path) -> list[dict[str, Any]]:
     """Learning curves of the finished seeds; those of bounds are told from those of errors."""
     bounds = _json(run, "table.json").get("bound_curves")
-    words = {folder_word(str(name)) for name in bounds} if isinstance(bounds, list) else set()
+    bounds = bounds if isinstance(bounds, list) else []
+    agents = _json(run, "study.json").get("agents")
+    names = {folder_word(name): name for name in agents} if isinstance(agents, dict) else {}
     curves = []
     for path in sorted(run.glob("seeds/*/*/curve.csv"))[:_MAX_CURVES]:
         if _is_inside(path, run):
-            agent = path.parts[-3]
-            curves.append({"agent": agent, "is_bound": agent in words, "columns": curve_in(path)})
+            agent = names.get(path.parts[-3], path.parts[-3])
+            curves.append({"agent": agent, "is_bound": agent in bounds, "columns": curve_in(path)})
     return curves
 
 

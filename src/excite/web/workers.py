@@ -41,14 +41,15 @@ class Workers:
         self._num_workers, self._environment = num_workers, _environment(cache)
         self._waiting, self._come = list[_Job](), asyncio.Semaphore(0)
         self._numbers, self._lanes = itertools.count(), list[asyncio.Task]()
-        self._jobs, self._num_broken = set[_Job](), 0
+        self._jobs, self._num_broken, self._is_closed = set[_Job](), 0, False
 
     async def open(self) -> None:
         """Starts the processes; they warm up while the page is served."""
         self._lanes = [asyncio.create_task(self._lane()) for _ in range(self._num_workers)]
 
     async def close(self) -> None:
-        """Ends them all, and tells everybody who waits for one."""
+        """Ends them all, and tells everybody who waits for one, or comes too late."""
+        self._is_closed = True
         for job in self._jobs:
             job.events.put_nowait(_failure("the server has ended"))
         for lane in self._lanes:
@@ -63,6 +64,8 @@ class Workers:
         Args:
             urgent: before all that is not: somebody waits for the first sign of life.
         """
+        if self._is_closed:
+            raise RefusedError(503, "the server has ended")
         if len(self._waiting) >= MAX_WAITING:
             raise RefusedError(503, "too much is waiting for the workers; try again later")
         job = _Job(next(self._numbers), target, arguments, urgent)

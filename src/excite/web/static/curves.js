@@ -28,15 +28,16 @@ export function curves(parent, every) {
   });
   const draw = (now) => {
     const last = Math.max(1, ...now.map(({ columns }) => columns.steps?.at(-1) ?? 1));
+    const [part, unit] = last >= 1e6 ? [1e6, "million steps"] : last >= 1e3 ? [1e3, "thousand steps"] : [1, "steps"];
     for (const [name, plot] of plots) {
       const isPercent = name.startsWith("relative_error_");
       const lines = now.map(({ agent, columns }) => ({
-        x: columns.steps ?? [], color: COLOURS[agents.indexOf(agent) % COLOURS.length], dots: now.length === 1, width: now.length > 1 ? 1 : 1.6,
+        x: (columns.steps ?? []).map((steps) => steps / part), color: COLOURS[agents.indexOf(agent) % COLOURS.length], dots: now.length === 1, width: now.length > 1 ? 1 : 1.6,
         y: (columns[name] ?? []).map((v) => (isPercent ? Math.log10(Math.max(100 * v, 1e-9)) : v)),
       }));
       const values = lines.flatMap((line) => line.y);
       const base = isPercent ? [Math.floor(Math.min(...values, 9)), Math.ceil(Math.max(...values, -9))] : name === "return" ? [values[0] ?? 0] : [0, 0.05];
-      plot.show({ x: [0, last], y: range(values, ...base), lines, log: isPercent });
+      plot.show({ x: [0, last / part], unit, y: range(values, ...base), lines, log: isPercent });
       const newest = now.length === 1 ? now[0].columns[name]?.at(-1) : null;
       plot.note.textContent = newest === null || newest === undefined ? "" : shown(isPercent ? 100 * newest : newest);
     }

@@ -200,7 +200,7 @@ function compare(live, rows, total) {
   const { parameters, outputs } = live.plan.plant;
   const found = rows.filter((row) => row.params);
   const best = (name) => Math.min(...found.map((r) => r.params[name].error_percent ?? Infinity));
-  const head = ["excitation", "safe", ...outputs.map((o) => `largest ${o.name} [${o.shown_unit}]`)];
+  const head = ["excitation", "safe", ...outputs.map((o) => `largest true ${o.name} [${o.shown_unit}]`)];
   at("outcome").querySelector("h2").textContent = `Comparison: ${live.plan.plant.name}, ${live.plan.num_samples - 1} samples`;
   at("comparison").replaceChildren(
     el("thead", {}, el("tr", {}, ...head.map((text) => el("th", { scope: "col" }, text)),

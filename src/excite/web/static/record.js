@@ -37,7 +37,7 @@ async function take(chosen) {
     showMapping();
     task.refresh();
     const counts = Object.values(file.columns);
-    say(form, `${chosen.name}: ${counts.length} columns, ${Math.max(...counts)} samples. Map them, then identify.`);
+    say(form, `${chosen.name}: ${counts.length} columns, ${Math.max(...counts)} samples. ${task.isBusy ? "Another file is still being identified; wait, or stop it." : "Map them, then identify."}`);
   } catch (error) {
     say(form, error.message, true);
   }
@@ -49,7 +49,7 @@ const unitOf = (name) => [...plant().inputs, ...plant().outputs].find((p) => p.n
 
 function showMapping() {
   if (file === null) return;
-  const there = Object.keys(file.columns), found = (name) => there.find((c) => c.toLowerCase() === name.toLowerCase());
+  const there = Object.keys(file.columns), found = (name) => there.find((c) => c.toLowerCase() === name.toLowerCase()) ?? there.find((c) => c.toLowerCase().split(/[\s([]/)[0] === name.toLowerCase());
   at("mapping").hidden = false;
   at("mapping").querySelector("div").replaceChildren(...needed().map((name) => {
     const select = el("select", { id: `column-${name}` });

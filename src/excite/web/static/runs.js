@@ -22,6 +22,7 @@ export async function open() {
 async function show(run, button) {
   section.querySelectorAll("button").forEach((b) => b.setAttribute("aria-pressed", String(b === button)));
   chosen = run.name;
+  say(section, "");
   const name = encodeURIComponent(run.name), address = (file) => `api/run/file?name=${name}&file=${encodeURIComponent(file)}`;
   try {
     const content = await get(`api/run?name=${name}`);
@@ -36,7 +37,9 @@ async function show(run, button) {
     card.append(...content.notes.map((note) => el("p", { class: "hint" }, note)));
     const link = (file) => download(address(file), file), isPolicy = (file) => file.endsWith(".safetensors");
     const policies = content.files.filter(isPolicy), others = content.files.filter((file) => !isPolicy(file));
-    card.append(el("p", { class: "row downloads" }, download(`api/run/report.html?name=${name}`, "Report"), ...others.map(link)));
+    const report = content.is_finished ? [download(`api/run/report.html?name=${name}`, "Report")] : [];
+    if (!content.is_finished) card.append(el("p", {}, "Not finished. Typed where it was begun, this goes on with it: ", el("code", {}, content.command || "the same command")));
+    card.append(el("p", { class: "row downloads" }, ...report, ...others.map(link)));
     if (policies.length) card.append(el("details", { open: policies.length < 4 }, el("summary", {}, `Policies (${policies.length})`), el("p", { class: "row downloads" }, ...policies.map(link))));
     view.replaceChildren(card);
     if (view.getBoundingClientRect().top > innerHeight / 2) view.scrollIntoView();
