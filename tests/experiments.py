@@ -1,5 +1,8 @@
 """Simulated experiments for tests that read, fit or draw records."""
 
+import os
+from pathlib import Path
+
 import jax
 import numpy as np
 import scipy.signal
@@ -10,8 +13,15 @@ from excite.plant import AbstractPlant, Params
 from excite.records import Record
 from excite.simulation import run_episode
 
+ROOT = Path(__file__).parent.parent
 NUM_STEPS = 200
 """One length for all: another one would be compiled anew."""
+
+
+def recording(name: str) -> Path | None:
+    """A real recording, which is not shipped, where this computer has it."""
+    folder = Path(os.environ.get("EXCITE_DATA") or ROOT.parent / "shared" / "data")
+    return next(folder.rglob(name), None)
 
 
 def record_of(

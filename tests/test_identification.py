@@ -1,7 +1,6 @@
 import contextlib
 import dataclasses
 import json
-import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ import numpy as np
 import pytest
 import scipy.io
 from documented import documented
-from experiments import NUM_STEPS, autoregressive, record_of, spread_params
+from experiments import NUM_STEPS, autoregressive, record_of, recording, spread_params
 
 from excite.description import Input, Output, Parameter, PlantDescription, State
 from excite.estimation import ARX, NLS
@@ -541,10 +540,8 @@ PUBLISHED_FIT = {"M": 96.04, "F_v": 218.0, "F_c": 19.05, "offset": -3.275}
 @pytest.fixture(scope="module")
 def emps_record() -> Record:
     """The public EMPS record, where the data are present."""
-    own = os.environ.get("EXCITE_DATA")
-    folder = Path(own) if own else ROOT.parent / "shared" / "data" / "emps"
-    path = folder / "DATA_EMPS.mat"
-    if not path.is_file():
+    path = recording("DATA_EMPS.mat")
+    if path is None:
         pytest.skip("DATA_EMPS.mat is not here; EXCITE_DATA names the folder that has it")
     gain = float(scipy.io.loadmat(path)["gtau"].item())
     columns = {"time": "t", "force": "vir", "position": "qm"}

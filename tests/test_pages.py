@@ -12,6 +12,7 @@ from pathlib import Path
 
 import click
 import pytest
+from experiments import recording
 from pages import PAGES, ROOT, Block, anchors, blocks, links, mentions, name, parsed
 
 README = ROOT / "README.md"
@@ -47,16 +48,15 @@ def play(page: Path) -> list[str]:
 def not_shipped(block: Block) -> Path | None:
     """The recording that a block needs and that is not shipped, where this computer has it."""
     name = (block.why or "").partition("the record is not shipped: ")[2]
-    folder = Path(os.environ.get("EXCITE_DATA") or ROOT.parent / "shared" / "data")
-    return next(folder.rglob(name), None) if name else None
+    return recording(name) if name else None
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if play(page)], ids=name)
 def test_the_commands_of_a_page_run(page: Path, tmp_path: Path):
     for folder in ("examples", "studies", "results", "docs"):  # copies: some are made anew
         shutil.copytree(ROOT / folder, tmp_path / folder)
-    for recording in filter(None, map(not_shipped, blocks(page))):
-        shutil.copy(recording, tmp_path)
+    for file in filter(None, map(not_shipped, blocks(page))):
+        shutil.copy(file, tmp_path)
     run = subprocess.run(
         [sys.executable, "-c", PLAYER], input="\n".join(play(page)), cwd=tmp_path,
         env={**os.environ, "PATH": f"{HERE}{os.pathsep}{os.environ['PATH']}"},

@@ -134,6 +134,12 @@ def test_a_file_without_names_is_refused(first, tmp_path):
         read_record(tmp_path / "a.csv", AERO2)
 
 
+def test_an_empty_first_line_names_no_column(tmp_path):
+    (tmp_path / "a.csv").write_text("\n0.1,1,2\n")
+    with pytest.raises(ValueError, match="line 2 has 3 values where the header names 0"):
+        read_record(tmp_path / "a.csv", AERO2)
+
+
 def test_one_column_is_not_taken_for_two_things(tmp_path):
     (tmp_path / "a.csv").write_text("t,u,y\n0,1,2\n0.1,1,2\n")
     with pytest.raises(ValueError, match="'time' and 'pitch' cannot be the same column"):

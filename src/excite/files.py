@@ -223,6 +223,26 @@ def text_columns(path: Path) -> dict[str, list[str]]:
     Raises:
         ValueError: one sentence for a file that is no such table, or may be truncated.
     """
+    delimiter, (first, *rest) = _rows(path)
+    header = [name.strip() or f"column {i}" for i, name in enumerate(first, 1)]
+    if first and all(map(_is_number, first)):
+        raise ValueError(f"{path}: the first line holds numbers; the columns' names are needed")
+    if len(set(header)) < len(header):
+        raise ValueError(f"{path}: the header names a column twice: {', '.join(header)}")
+    body = [(number, row) for number, row in enumerate(rest, 2) if row]
+    for number, row in body:
+        if len(row) != len(header):
+            raise ValueError(
+                f"{path}: line {number} has {len(row)} values where the header names "
+                f"{len(header)}; is the file truncated?"
+            )
+    point = "," if delimiter == ";" else "."  # of a German or French table
+    cells = [[cell.strip().replace(point, ".") for cell in row] for _, row in body]
+    return {name: [row[i] for row in cells] for i, name in enumerate(header)}
+
+
+def _rows(path: Path) -> tuple[str, list[list[str]]]:
+    """The delimiter of a CSV file, and its rows, one or more, as they are written."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (UnicodeDecodeError, OSError) as error:
@@ -243,21 +263,7 @@ def text_columns(path: Path) -> dict[str, list[str]]:
             f"{path}: line {len(lines)} does not end with a line break; is the file truncated? "
             "(add one if it is complete)"
         )
-    header = [name.strip() or f"column {i}" for i, name in enumerate(rows[0], 1)]
-    if all(map(_is_number, rows[0])):
-        raise ValueError(f"{path}: the first line holds numbers; the columns' names are needed")
-    if len(set(header)) < len(header):
-        raise ValueError(f"{path}: the header names a column twice: {', '.join(header)}")
-    body = [(number, row) for number, row in enumerate(rows[1:], 2) if row]
-    for number, row in body:
-        if len(row) != len(header):
-            raise ValueError(
-                f"{path}: line {number} has {len(row)} values where the header names "
-                f"{len(header)}; is the file truncated?"
-            )
-    point = "," if delimiter == ";" else "."  # of a German or French table
-    cells = [[cell.strip().replace(point, ".") for cell in row] for _, row in body]
-    return {name: [row[i] for row in cells] for i, name in enumerate(header)}
+    return delimiter, rows
 
 
 def _delimiter(first: list[str]) -> str:

@@ -112,8 +112,9 @@ def read_record(
     for name, factor in scales.items():
         if not (np.isfinite(factor) and factor != 0):
             raise ValueError(f"scale {factor:g} of {name!r} is not allowed: finite and not zero")
-    needed = ["time", *names_of(description.inputs)]
-    needed += [] if inputs_only else names_of(description.outputs)
+    outputs = () if inputs_only else description.outputs
+    quantities = (*description.inputs, *outputs)
+    needed = ["time", *names_of(quantities)]
     given = [columns.get(name, name) for name in needed]
     if twice := [n for n, column in zip(needed, given, strict=True) if given.count(column) > 1]:
         raise ValueError(f"{path}: {' and '.join(map(repr, twice))} cannot be the same column")
@@ -131,9 +132,8 @@ def read_record(
             f"{description.dt:g} s; is 'time' in another unit? Give a factor (--scale "
             "time=FACTOR; 1 says that the unit is right)"
         )
-    outputs = () if inputs_only else description.outputs
-    parts = {part.name: read(part.name) for part in (*description.inputs, *outputs)}
-    for part in (*description.inputs, *outputs):
+    parts = {part.name: read(part.name) for part in quantities}
+    for part in quantities:
         if len(parts[part.name]) != len(time):
             raise ValueError(
                 f"{path}: {part.name!r} has {len(parts[part.name])} samples, 'time' {len(time)}"

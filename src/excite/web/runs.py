@@ -126,6 +126,7 @@ def _summary(name: str, run: Path) -> dict[str, Any]:
         "name": name,
         "kind": str(marker.get("kind", "")).removeprefix("excite "),
         "plant": str(plant.get("name", "")) if isinstance(plant, dict) else "",
+        "command": without_folders(str(marker.get("command") or "")),
         "title": str(study.get("title") or study.get("name") or ""),
         "is_finished": any(_is_inside(run / f, run) for f in ("table.json", "estimate.json")),
     }
@@ -134,10 +135,8 @@ def _summary(name: str, run: Path) -> dict[str, Any]:
 def _content(run: Path) -> dict[str, Any]:
     """What a run shows: its table as it was written, or its estimate, and its files."""
     files = _files(run)
-    command = _json(run, "run.json").get("command")
     return {
         **_summary(run.name, run),
-        "command": without_folders(command) if isinstance(command, str) else "",
         **_table(_text(run, "table.md")),
         "estimate": _json(run, "estimate.json"),
         "curves": _curves(run),
