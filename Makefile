@@ -32,23 +32,23 @@ agents: .venv/dev ## the trained agents of the studies, afresh (hours; goes on w
 	  $(BIN)/excite study run studies/$$study.toml --out runs/$$study || exit 1; \
 	done
 
-policies: ## what is shipped in src/excite/policies, from the results of the studies
-	cp results/frontier/seeds/gradient_D/0/policy.safetensors src/excite/policies/aero2.safetensors
-	cp results/frontier/seeds/gradient_goals/0/policy.safetensors src/excite/policies/aero2-goals.safetensors
-	cp results/frontier/seeds/gradient_D_p/0/policy.safetensors src/excite/policies/aero2-damping.safetensors
-	cp results/table1/seeds/RL_all/2/policy.safetensors src/excite/policies/aero2-ppo-all.safetensors
-	cp results/table1/seeds/RL_J_p/7/policy.safetensors src/excite/policies/aero2-ppo-J_p.safetensors
-	cp results/table1/seeds/RL_K_pu/1/policy.safetensors src/excite/policies/aero2-ppo-K_pu.safetensors
-	cp results/table1/seeds/RL_D_p/5/policy.safetensors src/excite/policies/aero2-ppo-D_p.safetensors
-	cp results/emps/seeds/gradient_D/0/policy.safetensors src/excite/policies/emps.safetensors
-	cp results/dc_motor/seeds/gradient_D/0/policy.safetensors src/excite/policies/dc_motor.safetensors
-	cp results/aero2_lag/seeds/gradient_D/0/policy.safetensors src/excite/policies/aero2_lag.safetensors
-	cp results/cart_pole/seeds/gradient_D/0/policy.safetensors src/excite/policies/cart_pole.safetensors
-	cp results/sim_to_real/seeds/gradient_robust/0/policy.safetensors src/excite/policies/aero2_detailed.safetensors
+policies: ## what is shipped in src/excite/policy/shipped, from the results of the studies
+	cp results/frontier/seeds/gradient_D/0/policy.safetensors src/excite/policy/shipped/aero2.safetensors
+	cp results/frontier/seeds/gradient_goals/0/policy.safetensors src/excite/policy/shipped/aero2-goals.safetensors
+	cp results/frontier/seeds/gradient_D_p/0/policy.safetensors src/excite/policy/shipped/aero2-damping.safetensors
+	cp results/table1/seeds/RL_all/2/policy.safetensors src/excite/policy/shipped/aero2-ppo-all.safetensors
+	cp results/table1/seeds/RL_J_p/7/policy.safetensors src/excite/policy/shipped/aero2-ppo-J_p.safetensors
+	cp results/table1/seeds/RL_K_pu/1/policy.safetensors src/excite/policy/shipped/aero2-ppo-K_pu.safetensors
+	cp results/table1/seeds/RL_D_p/5/policy.safetensors src/excite/policy/shipped/aero2-ppo-D_p.safetensors
+	cp results/emps/seeds/gradient_D/0/policy.safetensors src/excite/policy/shipped/emps.safetensors
+	cp results/dc_motor/seeds/gradient_D/0/policy.safetensors src/excite/policy/shipped/dc_motor.safetensors
+	cp results/aero2_lag/seeds/gradient_D/0/policy.safetensors src/excite/policy/shipped/aero2_lag.safetensors
+	cp results/cart_pole/seeds/gradient_D/0/policy.safetensors src/excite/policy/shipped/cart_pole.safetensors
+	cp results/sim_to_real/seeds/gradient_robust/0/policy.safetensors src/excite/policy/shipped/aero2_detailed.safetensors
 
 evaluations: .venv/core ## the shipped policies on plants they have never met, in results/policies
 	mkdir -p results/policies
-	for policy in $(filter-out cart_pole aero2 aero2-goals aero2-damping,$(notdir $(basename $(wildcard src/excite/policies/*.safetensors)))); do \
+	for policy in $(filter-out cart_pole aero2 aero2-goals aero2-damping,$(notdir $(basename $(wildcard src/excite/policy/shipped/*.safetensors)))); do \
 	  $(BIN)/excite evaluate $$policy --episodes 1000 --seed 7 --json > results/policies/$$policy.json || exit 1; \
 	done
 	$(BIN)/excite evaluate cart_pole --episodes 200 --seed 7 --json > results/policies/cart_pole.json

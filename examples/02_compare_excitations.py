@@ -2,13 +2,12 @@
 
 import jax
 
-jax.config.update("jax_enable_x64", True)
-
-from excite.excitation import PRBS, Chirp, Multisine, Square  # noqa: E402
-from excite.identification import best_possible, identify  # noqa: E402
-from excite.plant import DCMotor, params_from  # noqa: E402
-from excite.records import Record  # noqa: E402
-from excite.simulation import run_episode  # noqa: E402
+from excite.estimation.identify import identify
+from excite.excitation import PRBS, Chirp, Multisine, Square
+from excite.information import best_possible
+from excite.plant import DCMotor, params_from
+from excite.record import Record
+from excite.simulation import run_episode
 
 
 def main() -> None:

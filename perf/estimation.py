@@ -7,18 +7,16 @@ default tolerances; whether it finds the right minimum is printed, not asked for
 from __future__ import annotations
 
 import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.optimize
+from peers import pitch_by_samples, pitch_in_one_call, seconds
 
-jax.config.update("jax_enable_x64", True)
-
-import jax.numpy as jnp  # noqa: E402
-import numpy as np  # noqa: E402
-import scipy.optimize  # noqa: E402
-from peers import pitch_by_samples, pitch_in_one_call, seconds  # noqa: E402
-
-from excite.benchmark import estimate_all, evaluate  # noqa: E402
-from excite.estimation import NLS  # noqa: E402
-from excite.excitation import Chirp  # noqa: E402
-from excite.plant import Aero2, Sensor  # noqa: E402
+from excite.environment.episodes import run_episodes
+from excite.estimation import NLS
+from excite.excitation import Chirp
+from excite.plant import Aero2, Sensor
+from excite.study.evaluation import estimate_all
 
 BATCH, STEPS, PEER_FITS = 200, 500, 3
 
@@ -26,7 +24,7 @@ BATCH, STEPS, PEER_FITS = 200, 500, 3
 def main() -> None:
     plant = Aero2(sensor=Sensor(jnp.array([0.00063]), jnp.array([0.0])))
     keys = jax.random.split(jax.random.key(0), BATCH)
-    episodes = evaluate(plant, Chirp(), STEPS, 0.3, keys)
+    episodes = run_episodes(plant, Chirp(), STEPS, 0.3, keys)
     true = np.stack(episodes.params, axis=1)
 
     def fit() -> np.ndarray:

@@ -14,18 +14,14 @@ import sys
 import time
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 
-jax.config.update("jax_enable_x64", True)
-
-import jax.numpy as jnp  # noqa: E402
-import numpy as np  # noqa: E402
-
-from excite.env import Env  # noqa: E402
-from excite.objective import InformationGain, prior_sd_of  # noqa: E402
-from excite.plant import Aero2  # noqa: E402
-from excite.policy import Layout  # noqa: E402
-from excite.training import gradient, ppo  # noqa: E402
-from excite.training.base import PPOSettings  # noqa: E402
+from excite.environment import Env, InformationGain, prior_sd_of
+from excite.plant import Aero2
+from excite.policy import Layout
+from excite.training import gradient, ppo
+from excite.training.settings import PPOSettings
 
 KEYS = jax.random.split(jax.random.key(2**40), 1000)
 PPO = PPOSettings(

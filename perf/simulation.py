@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import jax
+import jax.numpy as jnp
+import numpy as np
+from peers import pitch_by_samples, pitch_in_one_call, seconds
 
-jax.config.update("jax_enable_x64", True)
-
-import jax.numpy as jnp  # noqa: E402
-import numpy as np  # noqa: E402
-from peers import pitch_by_samples, pitch_in_one_call, seconds  # noqa: E402
-
-from excite.excitation import PRBS  # noqa: E402
-from excite.plant import Aero2, draw_params  # noqa: E402
-from excite.simulation import simulate  # noqa: E402
+from excite.excitation import PRBS
+from excite.plant import Aero2, draw_params
+from excite.simulation import response
 
 BATCH, STEPS = 1000, 500
 
@@ -22,7 +19,7 @@ def main() -> None:
     keys = jax.random.split(jax.random.key(0), BATCH)
     params = jax.vmap(lambda key: draw_params(plant, key, 0.3))(keys)
     inputs = jax.vmap(lambda key: PRBS().sequence(plant, STEPS, key))(keys)
-    batched = jax.jit(jax.vmap(lambda p, u: simulate(plant, p, u)))
+    batched = jax.jit(jax.vmap(lambda p, u: response(plant, p, u)))
     outputs = np.asarray(batched(params, inputs))[..., 0]
     ours = BATCH * STEPS / seconds(lambda: jax.block_until_ready(batched(params, inputs)), 20)
 

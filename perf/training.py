@@ -8,26 +8,22 @@ environment steps per second, rollouts and updates included.
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 import time
 from pathlib import Path
 
-import jax
+from stable_baselines3 import PPO
 
-jax.config.update("jax_enable_x64", True)
+from excite.environment import Env
+from excite.plant import Aero2
+from excite.training.ppo import train
+from excite.training.settings import PPOSettings
 
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT / "tests"))
 
-import dataclasses  # noqa: E402
-
-from plain_env import PlainAero2Env  # noqa: E402
-from stable_baselines3 import PPO  # noqa: E402
-
-from excite.env import Env  # noqa: E402
-from excite.plant import Aero2  # noqa: E402
-from excite.training.base import PPOSettings  # noqa: E402
-from excite.training.ppo import train  # noqa: E402
+from plain_env import PlainAero2Env  # noqa: E402 - it stands beside the tests
 
 PEER_ROLLOUTS, OUR_ROLLOUTS = 8, 8
 NUM_ENVS, NUM_STEPS, BATCH_SIZE = 64, 500, 2000

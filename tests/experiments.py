@@ -10,7 +10,7 @@ import scipy.signal
 from excite.excitation import AbstractExcitation, Chirp
 from excite.files import json_ready
 from excite.plant import AbstractPlant, Params
-from excite.records import Record
+from excite.record import Record
 from excite.simulation import run_episode
 
 ROOT = Path(__file__).parent.parent

@@ -1,7 +1,6 @@
-"""The rules of the house, kept by a walk over the syntax trees of the sources.
+"""The rules of `docs/architecture.md`, kept by a walk over the syntax trees of the sources.
 
-Rooms stand in one order, and a module imports only what stands left of its own cell.
-Rooms that are not built yet have their place already; a new room must take one.
+Packages stand in one order, and a module imports only what stands above its own package.
 """
 
 import ast
@@ -19,49 +18,44 @@ ROOT = Path(excite.__file__).parent
 MODULES = sorted(path.relative_to(ROOT).with_suffix("").as_posix() for path in ROOT.rglob("*.py"))
 modules = pytest.mark.parametrize("module", MODULES)
 
-CELLS = [
-    {"__init__"},
-    {"description", "files"},
-    {"policy", "records", "safety"},
-    {"plant"},
-    {"excitation"},
-    {"simulation"},
-    {"information"},
-    {"estimation"},
-    {"evaluation"},
-    {"objective"},
-    {"env"},
-    {"gymnasium_env"},
-    {"training"},
-    {"names"},
-    {"design"},
-    {"study"},
-    {"engine"},
-    {"rig", "identification"},
-    {"benchmark"},
-    {"report", "export"},
-    {"live"},
-    {"web"},
-    {"cli"},
-    {"__main__"},
-]
-PLACE = {room: i for i, rooms in enumerate(CELLS) for room in rooms}
-PURE = CELLS[PLACE["plant"] : PLACE["training"] + 1]
+ORDER = (
+    "__init__",
+    "description",
+    "files",
+    "record",
+    "plant",
+    "policy",
+    "safety",
+    "excitation",
+    "simulation",
+    "information",
+    "estimation",
+    "environment",
+    "training",
+    "rig",
+    "study",
+    "report",
+    "web",
+    "cli",
+    "__main__",
+)
+PLACE = {room: i for i, room in enumerate(ORDER)}
+PURE = ORDER[PLACE["plant"] : PLACE["training"] + 1]
 
 DOORS = {
-    "gymnasium": ["gymnasium_env"],
+    "gymnasium": ["environment/gymnasium"],
     "stable_baselines3": ["training/ppo"],
     "torch": ["training/ppo"],
-    "optax": ["training/gradient", "design"],
+    "optax": ["training/gradient"],
     "optimistix": ["estimation/nls"],
-    "optuna": ["design"],
-    "safetensors": ["policy"],
-    "scipy.io": ["records"],
+    "optuna": ["training/tuning"],
+    "safetensors": ["files"],
+    "scipy.io": ["record/record"],
     "pydantic": ["study"],
     "tomlkit": ["study"],
-    "dask": ["engine"],
-    "distributed": ["engine"],
-    "onnx": ["export"],
+    "dask": ["study/workers"],
+    "distributed": ["study/workers"],
+    "onnx": ["policy/onnx"],
     "fmpy": ["rig/fmu"],
     "quanser": ["rig/quanser"],
     "matplotlib": ["report"],
@@ -76,13 +70,19 @@ WITHOUT_JAX = (
     "description",
     "files",
     "policy",
-    "records",
+    "record",
     "safety",
-    "rig/base",
+    "rig/contract",
+    "rig/player",
+    "rig/recorder",
+    "rig/loop",
     "rig/quanser",
     "report",
     "web",
 )
+WORKERS = ("web/jobs",)
+"""What runs in a worker of the page, and may load JAX there."""
+
 INHERITED = {"derivative", "output", "from_transfer_function"}  # documented by the contract
 
 
@@ -152,9 +152,9 @@ def behind(module: str) -> set[str]:
 
 
 def test_the_walk_finds_the_imports_it_is_to_judge():
-    assert "plant/base" in inner_imports("plant/aero2")
+    assert "plant/contract" in inner_imports("plant/aero2")
     assert "description" in inner_imports("plant/aero2")
-    assert "estimation/base" in behind("estimation/arx")
+    assert "estimation/contract" in behind("estimation/arx")
     assert "jax" in set(outer_imports("simulation"))
 
 
@@ -170,16 +170,6 @@ def test_a_module_imports_only_rooms_left_of_its_own(module):
             assert "/" in module, f"{module} imports {target} of its own cell"
         else:
             assert PLACE[room_of(target)] < PLACE[own], f"{module} imports {target}"
-
-
-@pytest.mark.parametrize("module", [m for m in MODULES if "/" in m and room_of(m) != "cli"])
-def test_inside_a_folder_base_comes_first_and_init_last(module):
-    folder = module.rpartition("/")[0]
-    siblings = {t for t in inner_imports(module) if t.rpartition("/")[0] == folder}
-    if module.endswith("/base"):
-        assert not siblings
-    elif not module.endswith("/__init__"):
-        assert siblings <= {f"{folder}/base"}
 
 
 @modules
@@ -215,7 +205,9 @@ def test_third_parties_have_one_door_each(module):
                 assert belongs(module, doors), f"{module} imports {name}"
 
 
-@pytest.mark.parametrize("module", [m for m in MODULES if belongs(m, WITHOUT_JAX)])
+@pytest.mark.parametrize(
+    "module", [m for m in MODULES if belongs(m, WITHOUT_JAX) and m not in WORKERS]
+)
 def test_what_shows_and_runs_needs_no_jax(module):
     for loaded in behind(module):
         for name in outer_imports(loaded):
@@ -224,17 +216,19 @@ def test_what_shows_and_runs_needs_no_jax(module):
 
 
 def test_jax_is_not_loaded_through_third_parties_either():
-    rooms = [m for m in MODULES if belongs(m, WITHOUT_JAX) and m != "rig/quanser"]
+    rooms = [m for m in MODULES if belongs(m, WITHOUT_JAX) and m not in ("rig/quanser", *WORKERS)]
     names = ", ".join("excite." + m.replace("/", ".").removesuffix(".__init__") for m in rooms)
     code = f"import sys, {names}; print(*sorted({{'jax', 'jaxlib', 'equinox'}} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == ""
 
 
-def test_the_rig_uses_only_the_first_two_cells():
-    allowed = CELLS[0] | CELLS[1] | CELLS[2] | {"rig"}
+def test_the_rig_of_a_laboratory_computer_uses_only_what_needs_no_jax():
+    allowed = {"__init__", "description", "files", "record", "policy", "safety", "rig"}
     for module in MODULES:
-        if belongs(module, ("rig/base", "rig/quanser")):
+        if belongs(
+            module, ("rig/contract", "rig/player", "rig/recorder", "rig/loop", "rig/quanser")
+        ):
             assert {room_of(m) for m in behind(module)} <= allowed, module
 
 
@@ -253,31 +247,41 @@ def test_there_is_no_assert_outside_tests(module):
     assert not [n.lineno for n in ast.walk(tree_of(module)) if isinstance(n, ast.Assert)]
 
 
-@pytest.mark.parametrize("module", [m for m in MODULES if any(room_of(m) in c for c in PURE)])
+READS = (
+    "policy",
+    "plant/catalogue",
+    "excitation/catalogue",
+    "estimation/identify",
+    "estimation/result",
+)
+"""Modules of the pure packages that take a file's name from their caller."""
+
+
+@pytest.mark.parametrize("module", [m for m in MODULES if room_of(m) in PURE])
 def test_from_plant_to_training_there_is_no_file_clock_log_or_global_state(module):
     forbidden = ("logging", "time", "datetime", "random", "os", "io", "pathlib", "numpy.random")
     for name in outer_imports(module):
+        if name == "pathlib.Path" and belongs(module, READS):
+            continue
         assert not any(is_outer(name, package) for package in forbidden), name
     for node in ast.walk(tree_of(module)):
         text = ast.unparse(node) if isinstance(node, ast.Attribute | ast.Call) else ""
         # Stable-Baselines3 shuffles with NumPy's global state, which checkpoints must keep.
         if module == "training/ppo" and text.startswith(("np.random.get", "np.random.set")):
             continue
+        if module == "plant/contract" and text.startswith("jax.config.update"):
+            continue  # double precision, switched in this one place
         assert not text.startswith(("np.random.", "open(", "jax.config.update"))
 
 
-# ------------------------------------------------------------- names, sizes, words
+# -------------------------------------------------------------------- names, words
 
 
 @modules
 def test_no_room_is_named_after_no_subject(module):
-    assert not {"utils", "helpers", "common", "core", "misc", "types"} & set(module.split("/"))
-
-
-@modules
-def test_files_are_short(module):
-    num_lines = len((ROOT / f"{module}.py").read_text(encoding="utf-8").splitlines())
-    assert num_lines <= 400
+    assert not {"utils", "helpers", "common", "core", "misc", "types", "base"} & set(
+        module.split("/")
+    )
 
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
@@ -285,26 +289,6 @@ Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 def functions(module: str) -> list[Function]:
     return [n for n in ast.walk(tree_of(module)) if isinstance(n, Function)]
-
-
-def code_lines(function: Function, lines: list[str]) -> int:
-    """Lines of a function without decorators, docstring, blank lines and comments."""
-    numbers = set(range(function.lineno, (function.end_lineno or 0) + 1))
-    first = function.body[0]
-    if ast.get_docstring(function) is not None:
-        numbers -= set(range(first.lineno, (first.end_lineno or 0) + 1))
-    texts = [lines[n - 1].strip() for n in numbers]
-    return sum(bool(text) and not text.startswith("#") for text in texts)
-
-
-@modules
-def test_functions_are_short_and_take_at_most_six_arguments(module):
-    lines = (ROOT / f"{module}.py").read_text(encoding="utf-8").splitlines()
-    for function in functions(module):
-        where = f"{module}.{function.name}"
-        num_lines, num_arguments = code_lines(function, lines), len(arguments(function))
-        assert num_lines <= 60, where
-        assert num_arguments <= 6, where
 
 
 def arguments(function: Function) -> list[ast.arg]:
@@ -322,7 +306,7 @@ def public(module: str) -> Iterator[ast.ClassDef | Function]:
             yield node
             waiting.extend(node.body)
         elif isinstance(node, Function):
-            inherited = room_of(module) == "plant" and module != "plant/base"
+            inherited = room_of(module) == "plant" and module != "plant/contract"
             special = node.name.startswith("__") and node.name != "__call__"
             private = node.name.startswith("_") and not node.name.startswith("__")
             if not (private or special or (inherited and node.name in INHERITED)):

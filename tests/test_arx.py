@@ -17,7 +17,7 @@ from excite.estimation import ARX, Status, stack_experiments
 from excite.estimation.arx import physical_params, regressor, transfer_function
 from excite.excitation import PRBS, Chirp, Random
 from excite.plant import AbstractARXPlant, Aero2
-from excite.simulation import run_episode, simulate
+from excite.simulation import response, run_episode
 
 KEY = jax.random.key(11)
 DT = 0.1
@@ -55,7 +55,7 @@ def discrete(c_0: float, c_1: float, d_0: float, dt: float = DT) -> np.ndarray:
     return np.concatenate([denominator[1:], numerator[0, 1:]])
 
 
-def response(coefficients: np.ndarray, inputs: np.ndarray) -> np.ndarray:
+def discrete_response(coefficients: np.ndarray, inputs: np.ndarray) -> np.ndarray:
     """Outputs of the discrete system from rest, one more than inputs."""
     a_1, a_2, b_1, b_2 = coefficients
     return np.asarray(scipy.signal.lfilter([0, b_1, b_2], [1, a_1, a_2], np.append(inputs, 0.0)))
@@ -122,7 +122,7 @@ def test_samples_that_are_not_valid_change_nothing():
 def test_noise_free_data_of_a_discrete_system_give_its_coefficients():
     coefficients = np.array([-1.5, 0.7, 1.0, 0.5])  # Ljung's example
     inputs = np.random.default_rng(2).normal(size=100)
-    rows, outputs = regression(inputs, response(coefficients, inputs))
+    rows, outputs = regression(inputs, discrete_response(coefficients, inputs))
     for weak in (ARX(start_covariance=1e12), ARX(start_covariance=1e12, forgetting_factor=0.9)):
         ours = weak.batch(jnp.asarray(rows), jnp.asarray(outputs), jnp.ones(99, bool))
         np.testing.assert_allclose(ours.coefficients, coefficients, rtol=1e-9)
@@ -131,7 +131,7 @@ def test_noise_free_data_of_a_discrete_system_give_its_coefficients():
 def test_the_regressor_has_the_order_of_the_coefficients():
     inputs = np.random.default_rng(2).normal(size=20)
     coefficients = np.array([-1.5, 0.7, 1.0, 0.5])
-    y = response(coefficients, inputs)
+    y = discrete_response(coefficients, inputs)
     row = regressor(*(jnp.asarray(v) for v in (y[9], y[8], inputs[9], inputs[8])))
     assert row @ coefficients == pytest.approx(y[10])
 
@@ -206,7 +206,7 @@ def test_a_status_says_itself_in_words():
 
 def spring_data(inputs: np.ndarray) -> np.ndarray:
     p = Spring().nominal
-    return response(discrete(float(p.k), float(p.c), float(p.b)), inputs)
+    return discrete_response(discrete(float(p.k), float(p.c), float(p.b)), inputs)
 
 
 def experiments_of(plant, *pairs):
@@ -265,7 +265,7 @@ def test_two_experiments_do_not_straddle():
     expected, _ = physical_params(Spring(), jnp.asarray(np.linalg.solve(M, rows.T @ right)))
     np.testing.assert_allclose(estimate.params, expected, rtol=1e-7)
     np.testing.assert_array_equal(estimate.residual[1, 31:], 0.0)
-    simulated = simulate(Spring(), estimate.params, jnp.asarray(inputs[1])[:, None])
+    simulated = response(Spring(), estimate.params, jnp.asarray(inputs[1])[:, None])
     np.testing.assert_allclose(
         estimate.residual[1, :31, 0], outputs[1] - simulated[:, 0], atol=1e-12
     )
@@ -274,7 +274,7 @@ def test_two_experiments_do_not_straddle():
 def test_zero_input_is_ill_conditioned():
     # A free decay shows the poles but not the gain; two samples of a ramp not even those.
     plant = Aero2(initial_state=jnp.array([0.3, 0.0]))
-    decay = simulate(plant, plant.nominal, jnp.zeros((60, 1)))[:, 0]
+    decay = response(plant, plant.nominal, jnp.zeros((60, 1)))[:, 0]
     for outputs in (decay, jnp.zeros(61)):
         estimate = ARX()(plant, experiments_of(plant, (np.zeros(60), outputs)))
         assert estimate.status == Status.ILL_CONDITIONED
@@ -282,7 +282,7 @@ def test_zero_input_is_ill_conditioned():
 
 def test_an_input_that_only_repeats_the_output_is_ill_conditioned():
     plant = Aero2(initial_state=jnp.array([0.3, 0.0]))
-    y = np.asarray(simulate(plant, plant.nominal, jnp.zeros((60, 1)))[:, 0])
+    y = np.asarray(response(plant, plant.nominal, jnp.zeros((60, 1)))[:, 0])
     estimate = ARX()(plant, experiments_of(plant, (-3 * y[:-1], y)))
     assert estimate.status == Status.ILL_CONDITIONED
 

@@ -10,22 +10,16 @@ import pytest
 import scipy.stats
 from documented import documented
 
-from excite.benchmark import (
-    Episodes,
-    evaluate,
-    run_benchmark,
-    wilson,
-    write_benchmark,
-)
-from excite.benchmark import (
-    base as benchmark,
-)
+from excite.environment.episodes import Episodes, run_episodes
 from excite.estimation import Status
 from excite.excitation import PRBS, Chirp, Random
 from excite.files import json_ready
-from excite.identification import best_possible
+from excite.information import best_possible
 from excite.plant import EMPS, Aero2, draw_params
 from excite.study import Study, read_study, study_from
+from excite.study import evaluation as benchmark
+from excite.study.statistics import wilson
+from excite.study.tasks import run_benchmark, write_benchmark
 
 ROOT = Path(__file__).parent.parent
 PARAMETERS = ("J_p", "K_pu", "D_p")
@@ -167,7 +161,7 @@ def episodes() -> dict[str, Episodes]:
     """The same keys under three excitations."""
     keys = jax.random.split(jax.random.key(5), 8)
     methods = {"random": Random(), "prbs": PRBS(clock=5), "chirp": Chirp()}
-    return {name: evaluate(PLANT, m, 60, 0.3, keys) for name, m in methods.items()}
+    return {name: run_episodes(PLANT, m, 60, 0.3, keys) for name, m in methods.items()}
 
 
 @pytest.mark.parametrize("other", ["prbs", "chirp"])

@@ -21,11 +21,12 @@ from documented import documented, documented_words
 from experiments import NUM_STEPS
 
 from excite.cli import cli, main
-from excite.cli.door import progress_bar
-from excite.names import EXCITATIONS, PLANTS
+from excite.cli.options import progress_bar
+from excite.excitation.catalogue import EXCITATIONS
 from excite.plant import Aero2
+from excite.plant.catalogue import PLANTS
 from excite.policy import Layout, Policy, read_policy
-from excite.records import read_record
+from excite.record import read_record
 from excite.report import number
 
 TESTS = Path(__file__).parent
@@ -364,7 +365,7 @@ def test_plants_lists_what_is_shipped(run):
 
 def test_plants_tells_all_of_one(run, here, monkeypatch):
     chosen = {name: EXCITATIONS[name] for name in ("chirp", "square")}  # to save time
-    monkeypatch.setattr("excite.names.EXCITATIONS", chosen)
+    monkeypatch.setattr("excite.excitation.catalogue.EXCITATIONS", chosen)
     answer = run("plants", "aero2", "--plot", here / "p.png")
     for word in ("J_p", "0.0232", "kg m²", "-24 to 24", "40 deg", "30 deg", "Langschwert"):
         assert word in answer.out

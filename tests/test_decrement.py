@@ -12,7 +12,7 @@ from excite.description import Constant, Input, Output, Parameter, PlantDescript
 from excite.estimation import Decrement, Status, stack_experiments
 from excite.excitation import Decay, Random
 from excite.plant import Aero2
-from excite.plant.base import AbstractARXPlant
+from excite.plant.contract import AbstractARXPlant
 from excite.simulation import run_episode
 
 

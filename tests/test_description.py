@@ -10,15 +10,7 @@ import sys
 import pytest
 from catalogue import PLANTS
 
-from excite.description import (
-    Constant,
-    Input,
-    Output,
-    Parameter,
-    PlantDescription,
-    State,
-    names_of,
-)
+from excite.description import Constant, Input, Output, Parameter, PlantDescription, State, names_of
 
 PARTS = ("states", "inputs", "outputs", "parameters", "constants")
 

@@ -9,14 +9,18 @@ import pytest
 from catalogue import PLANTS
 
 from excite.description import Input, Output, Parameter, PlantDescription, State
-from excite.design import clairvoyant_signals, robust_signal, signal_env
-from excite.design.optimal import CLAIRVOYANT, ROBUST
-from excite.design.tuned import tuned_signal
-from excite.evaluation import evaluate
+from excite.environment import prior_sd_of, run_episodes
 from excite.excitation import Chirp, Replay
-from excite.names import EXCITATIONS, LOOP
-from excite.objective import prior_sd_of
+from excite.excitation.catalogue import EXCITATIONS, LOOP
 from excite.plant import AbstractPlant, Aero2
+from excite.training.signals import (
+    CLAIRVOYANT,
+    ROBUST,
+    clairvoyant_signals,
+    robust_signal,
+    signal_env,
+)
+from excite.training.tuning import tuned_signal
 
 STEPS = 100
 KEYS = jax.random.split(jax.random.key(5), 2)
@@ -24,7 +28,7 @@ QUICK = dataclasses.replace(CLAIRVOYANT, num_updates=150)
 
 
 def log_det(plant, signal, keys, spread=0.3):
-    episodes = evaluate(plant, signal, STEPS, spread, keys)
+    episodes = run_episodes(plant, signal, STEPS, spread, keys)
     return np.linalg.slogdet(np.asarray(episodes.information))[1], episodes
 
 

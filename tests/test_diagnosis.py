@@ -4,16 +4,14 @@ import scipy.stats
 from experiments import autoregressive
 
 from excite.estimation.diagnosis import (
-    UNSEEN_SD,
     chance_of_fit,
     correlation,
     fit_percent,
-    identifiability,
     ljung_box,
     robust_covariance,
     widened,
-    worst_seen,
 )
+from excite.information import UNSEEN_SD, identifiability, worst_seen
 
 # Fit
 

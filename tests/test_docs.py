@@ -16,7 +16,9 @@ import pytest
 
 import excite
 from excite.cli import cli
-from excite.names import ESTIMATORS, EXCITATIONS, PLANTS
+from excite.estimation.catalogue import ESTIMATORS
+from excite.excitation.catalogue import EXCITATIONS
+from excite.plant.catalogue import PLANTS
 from excite.study import read_study
 
 ROOT = Path(__file__).parent.parent

@@ -14,7 +14,8 @@ from typing import Any
 import pytest
 from cluster import Cluster, wait_for
 
-from excite import __version__, engine
+from excite import __version__
+from excite.study import workers as engine
 
 TESTS = Path(__file__).parent
 MIXED = "tasks:any_of_them"
@@ -64,7 +65,9 @@ def is_alive(pid: int) -> bool:
 
 
 def test_importing_the_engine_loads_no_jax():
-    code = "import sys, excite.engine; print(*{'jax', 'torch', 'equinox'} & set(sys.modules))"
+    code = (
+        "import sys, excite.study.workers; print(*{'jax', 'torch', 'equinox'} & set(sys.modules))"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == ""
 

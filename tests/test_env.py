@@ -16,18 +16,23 @@ from plain_env import PlainAero2Env
 
 from excite import safety
 from excite.description import Input, Output, Parameter, PlantDescription, State
-from excite.env import Env, EnvState, Transition, default_objective, reset_batch, step_batch
-from excite.information import experiment_information, relative_size
-from excite.objective import (
+from excite.environment import (
+    Env,
+    EnvState,
     EstimationError,
     InformationGain,
     Sample,
+    Transition,
+    default_objective,
+    reset_batch,
+    step_batch,
     target_mask,
 )
+from excite.information import experiment_information, relative_size
 from excite.plant import AbstractPlant, Aero2
-from excite.plant.base import Sensor
+from excite.plant.contract import Sensor
 from excite.policy import Layout
-from excite.simulation import measure, simulate
+from excite.simulation import measure, response
 
 KEY = jax.random.key(5)
 AERO2 = Aero2()
@@ -138,7 +143,7 @@ def test_the_sum_of_rewards_is_the_information_gained(plant):
     np.testing.assert_allclose(transitions.relative_errors[-1], sd, rtol=1e-6)
     # The trajectory is that of the simulation, the shapes are those of the layout.
     outputs = jax.vmap(lambda state: plant.output(state, first.params))(states.plant_state)
-    np.testing.assert_allclose(outputs, simulate(plant, first.params, inputs)[1:], rtol=1e-9)
+    np.testing.assert_allclose(outputs, response(plant, first.params, inputs)[1:], rtol=1e-9)
     assert transitions.observation.shape == (30, env.layout.size)
     assert transitions.observation.dtype == np.float32
     assert transitions.relative_errors.shape == (30, len(targets))

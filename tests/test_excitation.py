@@ -10,7 +10,7 @@ import pytest
 import scipy.signal
 from catalogue import EXCITATIONS, PLANTS, TwoMasses
 
-from excite.env import Env
+from excite.environment import Env
 from excite.excitation import (
     PRBS,
     AbstractSignal,
@@ -26,7 +26,7 @@ from excite.excitation import (
     maximum_length_sequence,
 )
 from excite.plant import Aero2
-from excite.plant.base import Sensor
+from excite.plant.contract import Sensor
 from excite.policy import Layout, Policy
 from excite.simulation import run_episode
 

@@ -16,10 +16,11 @@ import onnx
 import onnxruntime
 import pytest
 
-from excite import export as export_module
 from excite.cli import main
-from excite.export import to_onnx, write_onnx
-from excite.policy import FORMAT, Policy, forward, read_policy, shipped_policies, tensors_from_bytes
+from excite.files import tensors_from_bytes
+from excite.policy import FORMAT, Policy, forward, read_policy, shipped_policies
+from excite.policy import onnx as export_module
+from excite.policy.onnx import to_onnx, write_onnx
 
 SHIPPED = shipped_policies()
 POLICY = read_policy(SHIPPED["aero2"])

@@ -21,12 +21,12 @@ from pythonfmu import FmuBuilder
 
 from excite.description import Input, Output, Parameter, PlantDescription, State
 from excite.plant import Aero2
-from excite.records import read_record
+from excite.record import read_record
 from excite.rig import Recorder, RigError, SignalPlayer, run
 from excite.rig import fmu as fmu_module
 from excite.rig.fmu import FMURig, simulate_fmu
 from excite.safety import Supervision, Trip
-from excite.simulation import simulate
+from excite.simulation import response
 
 PLANT = Aero2()
 DESCRIPTION = PLANT.description
@@ -97,7 +97,7 @@ def test_an_experiment_on_the_unit_is_that_on_the_plant(
     outcome = played(rig, INPUTS, tmp_path)
     assert outcome.is_complete, outcome.reason
     record = read_record(tmp_path / "record.csv", DESCRIPTION)
-    expected = np.asarray(simulate(PLANT, PLANT.nominal, jnp.asarray(INPUTS)))
+    expected = np.asarray(response(PLANT, PLANT.nominal, jnp.asarray(INPUTS)))
     assert 0.1 < np.abs(expected).max() < 0.5
     np.testing.assert_allclose(record.outputs, expected, rtol=0, atol=TOLERANCE)
     np.testing.assert_array_equal(record.inputs[:-1], INPUTS)
@@ -117,7 +117,7 @@ def test_names_start_values_and_variables_inside(unit: Path):
     start = {**STIFFNESS, "K_pu": 0.02, "D_p": 0.01}
     pitch = simulate_fmu(unit, DESCRIPTION, INPUTS, start=start)
     params = PLANT.nominal._replace(K_pu=0.02, D_p=0.01)
-    expected = np.asarray(simulate(PLANT, params, jnp.asarray(INPUTS)))
+    expected = np.asarray(response(PLANT, params, jnp.asarray(INPUTS)))
     np.testing.assert_allclose(pitch, expected, rtol=0, atol=TOLERANCE)
     speed = simulate_fmu(unit, other, INPUTS, names={"speed": "rate"}, start=start)
     assert speed.shape == (301, 1)

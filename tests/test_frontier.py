@@ -12,14 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from excite.benchmark.table import study_table
-from excite.evaluation import evaluate
+from excite.environment import run_episodes
 from excite.excitation import Replay
-from excite.names import excitation_named, plant_named
+from excite.excitation.catalogue import excitation_named
 from excite.plant import Aero2
+from excite.plant.catalogue import plant_named
 from excite.policy import read_policy, shipped_policies
-from excite.records import read_record
+from excite.record import read_record
 from excite.simulation import run_episode
+from excite.study.table import study_table
 
 STUDY = """
 name = "tiny"
@@ -84,7 +85,7 @@ def test_a_designed_signal_is_what_its_summary_says(folder):
     signal = excitation_named(str(folder / "robust.csv"), {}, plant)
     assert isinstance(signal, Replay)
     keys = jax.random.split(jax.random.key(1), 1000)
-    episodes = evaluate(plant, signal, 60, 0.3, keys)
+    episodes = run_episodes(plant, signal, 60, 0.3, keys)
     log_det = np.linalg.slogdet(np.asarray(episodes.information))[1].mean()
     assert said["log_det_information"] == pytest.approx(log_det, rel=1e-4)
     assert said["violations"] == int(episodes.is_violation.sum()) <= 3
@@ -106,7 +107,7 @@ def test_a_tuned_loop_is_what_its_options_say(tmp_path):
     np.testing.assert_allclose(inputs, run.inputs, rtol=1e-9)
     # What is said of the file is said of the file: no loop is closed when it is played.
     played = Replay(jnp.asarray(inputs))
-    episodes = evaluate(plant, played, 40, 0.3, jax.random.split(jax.random.key(1), 1000))
+    episodes = run_episodes(plant, played, 40, 0.3, jax.random.split(jax.random.key(1), 1000))
     log_det = np.linalg.slogdet(np.asarray(episodes.information))[1].mean()
     assert said["log_det_information"] == pytest.approx(log_det, rel=1e-6)
     assert said["violations"] == int(np.sum(episodes.is_violation))
@@ -128,7 +129,7 @@ def test_efficiency_compares_with_the_clairvoyant_signals_on_their_plants(folder
         assert row["d_efficiency"] <= 1
     chirp = rows[0]
     keys = jax.random.split(jax.random.key(0), 6)
-    episodes = evaluate(Aero2(), excitation_named("chirp", {}, Aero2()), 60, 0.3, keys)
+    episodes = run_episodes(Aero2(), excitation_named("chirp", {}, Aero2()), 60, 0.3, keys)
     own = np.linalg.slogdet(np.asarray(episodes.information))[1]
     assert chirp["log_det_information"] == pytest.approx(own.mean())
     assert chirp["log_det_of_clairvoyant_plants"] == pytest.approx(own[:2].mean())
@@ -212,7 +213,7 @@ def test_shipped_policies_are_listed_sound_and_safe():
         policy = read_policy(path)
         plant = plant_named(policy.plant.name)
         assert policy.plant.hash == plant.description.hash, name
-        episodes = evaluate(
+        episodes = run_episodes(
             plant, excitation_named(name, {}, plant), policy.layout.num_steps, 0.3,
             jax.random.split(jax.random.key(77), 100),
         )  # fmt: skip

@@ -12,12 +12,9 @@ import pytest
 from jaxtyping import Array
 
 from excite.description import Input, Output, Parameter, PlantDescription, State
-from excite.env import Env
-from excite.estimation import NLS, stack_experiments
-from excite.excitation import Chirp
-from excite.information import a_optimality, d_optimality, e_optimality, experiment_information
-from excite.objective import (
+from excite.environment import (
     AbstractObjective,
+    Env,
     EstimationError,
     InformationGain,
     OutputError,
@@ -25,10 +22,13 @@ from excite.objective import (
     WeightedSum,
     prior_sd_of,
 )
+from excite.estimation import NLS, stack_experiments
+from excite.excitation import Chirp
+from excite.information import a_optimality, d_optimality, e_optimality, experiment_information
 from excite.plant import AbstractPlant, Aero2
 from excite.policy import Layout, Weights, forward, observe
-from excite.simulation import simulate, step
-from excite.training.base import Checkpoint
+from excite.simulation import response, step
+from excite.training.checkpoint import Checkpoint
 from excite.training.gradient import GradientSettings, Network, experiments, train, train_all
 
 ALL = (True, True, True)
@@ -91,7 +91,7 @@ def test_the_error_of_the_output_error_estimate_is_that_of_nls(seed):
     plant = Aero2()
     objective, params = OutputError(ALL, prior_sd=prior_sd_of(0.3)), plant.nominal
     inputs = Chirp().sequence(plant, 300, KEYS[0])
-    outputs = simulate(plant, params, inputs)
+    outputs = response(plant, params, inputs)
     noise = plant.sensor.sd[None] * jax.random.normal(jax.random.key(seed), outputs.shape)
     measured, state = outputs + noise, plant.initial_state
     memory = objective.init(plant, measured[0])
@@ -198,7 +198,7 @@ def test_excess_counts_from_the_margin_to_the_critical_level():
     env = env_of(OBJECTIVES["D"])
     weights = weights_of(env)
     state, inputs = run(env, weights, KEYS[0])
-    outputs = np.abs(simulate(env.plant, state.params, inputs)[1:, 0])
+    outputs = np.abs(response(env.plant, state.params, inputs)[1:, 0])
     critical = env.plant.definition.outputs[0].critical_level or 0.0
     margin = 0.5 * float(outputs.max()) / critical  # so that some samples lie beyond
     over = np.maximum(outputs / critical - margin, 0) / (1 - margin)

@@ -14,13 +14,12 @@ from gymnasium.envs.registration import registry
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
-from excite.env import Env
-from excite.gymnasium_env import ExperimentEnv, ExperimentVectorEnv
-from excite.objective import InformationGain
+from excite.environment import Env, InformationGain
+from excite.environment.gymnasium import ExperimentEnv, ExperimentVectorEnv
 from excite.plant import Aero2
 from excite.policy import Layout
 
-MODULE = "excite.gymnasium_env:"
+MODULE = "excite.environment.gymnasium:"
 IDS = sorted(name for name in registry if name.startswith("excite/"))
 AERO2 = "excite/Aero2-v0"
 SHORT = Layout.of(Aero2.definition, window=4, num_steps=3)
@@ -265,8 +264,8 @@ dtype = jnp.float64 if "double" in sys.argv else jnp.float32
 seen = []
 choices = [{}, {"plant": Aero2(initial_state=jnp.array([0.25, 0.0]))}]
 for made in choices:
-    env = gymnasium.make("excite.gymnasium_env:excite/Aero2-v0", **made)
-    many = gymnasium.make_vec("excite.gymnasium_env:excite/Aero2-v0", num_envs=2, **made)
+    env = gymnasium.make("excite.environment.gymnasium:excite/Aero2-v0", **made)
+    many = gymnasium.make_vec("excite.environment.gymnasium:excite/Aero2-v0", num_envs=2, **made)
     seen += [env.reset(seed=1)[0], *many.reset(seed=1)[0]]
     for k in range(12):
         observation, reward, *_, info = env.step(np.array([(-1.0) ** (k // 3)], np.float32))
@@ -307,7 +306,7 @@ import numpy as np
 
 if __name__ == "__main__":
     env = gymnasium.make_vec(
-        "excite.gymnasium_env:excite/Aero2-v0",
+        "excite.environment.gymnasium:excite/Aero2-v0",
         num_envs=1, vectorization_mode="async", vector_kwargs={"context": sys.argv[1]},
     )
     env.reset(seed=0)

@@ -16,12 +16,14 @@ from experiments import NUM_STEPS, autoregressive, record_of, recording, spread_
 
 from excite.description import Input, Output, Parameter, PlantDescription, State
 from excite.estimation import ARX, NLS
+from excite.estimation.identify import identify
+from excite.estimation.result import Identification, write_run
 from excite.excitation import PRBS, Chirp, Random, Replay
 from excite.files import json_ready
-from excite.identification import Identification, best_possible, identify, write_run
+from excite.information import best_possible
 from excite.plant import EMPS, AbstractPlant, Aero2, Aero2Lag, DCMotor
-from excite.records import Record, read_record, write_record
-from excite.simulation import simulate
+from excite.record import Record, read_record, write_record
+from excite.simulation import response
 
 ROOT = Path(__file__).parent.parent
 PLANT = Aero2()
@@ -140,7 +142,7 @@ def test_a_lag_may_be_known_or_estimated():
     plant = Aero2Lag()
     signal = Chirp().sequence(plant, 300, jax.random.key(0))
     truth = plant.nominal._replace(J_p=jnp.asarray(0.025), tau=jnp.asarray(0.2))
-    outputs = np.asarray(simulate(plant, truth, signal))
+    outputs = np.asarray(response(plant, truth, signal))
     noisy = outputs + np.random.default_rng(0).normal(0, 2e-4, outputs.shape)
     record = Record.of_episode(
         np.arange(301) * 0.1, np.asarray(signal), noisy, {"starts_at_initial_state": True}

@@ -23,7 +23,7 @@ from excite.information import (
     sensitivity,
 )
 from excite.plant import Aero2, Sensor
-from excite.simulation import simulate
+from excite.simulation import response
 
 NUM_STEPS = 120
 names = pytest.mark.parametrize("name", PLANTS)
@@ -40,12 +40,12 @@ def response_of(name: str):
     count = len(plant.definition.parameters)
     size = relative_size(plant, plant.nominal)
 
-    def response(unknowns):
+    def outputs(unknowns):
         values = jnp.stack(plant.nominal) + size * unknowns[:count]
         start = plant.initial_state + unknowns[count:]
-        return simulate(plant, plant.Params(*values), inputs_of(name), start)
+        return response(plant, plant.Params(*values), inputs_of(name), start)
 
-    return response, count + len(plant.definition.states)
+    return outputs, count + len(plant.definition.states)
 
 
 @functools.cache

@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from excite import live
 from excite.cli import main
 from excite.report import report_html
+from excite.web import jobs as live
 
 ASKED: dict[str, Any] = {
     "plant": "aero2",

@@ -12,11 +12,11 @@ from catalogue import PLANTS, TwoMasses
 
 from excite.description import Input, Output, Parameter, PlantDescription, State, names_of
 from excite.estimation import NLS, AbstractEstimator, Status, bound_reached, stack_experiments
-from excite.estimation.base import from_search, to_search
+from excite.estimation.contract import from_search, to_search
 from excite.excitation import PRBS, Chirp, Multisine, Random
 from excite.information import cramer_rao_bound, experiment_information, relative_size
 from excite.plant import Aero2, Sensor
-from excite.simulation import run_episode, simulate
+from excite.simulation import response, run_episode
 
 NUM_STEPS = 200
 KEY = jax.random.key(23)
@@ -35,7 +35,7 @@ def true_params(plant):
 
 
 def noise_free(plant, inputs, start=None):
-    return simulate(plant, true_params(plant), inputs, start)
+    return response(plant, true_params(plant), inputs, start)
 
 
 def assert_recovered(plant, estimate, rtol: float = 1e-6) -> None:

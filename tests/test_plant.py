@@ -11,7 +11,7 @@ from catalogue import PLANTS, TwoMasses
 from excite.description import names_of
 from excite.excitation import Random
 from excite.plant import Aero2, CartPole, DCMotor, Sensor, draw_params, params_from
-from excite.simulation import run_episode, simulate, step
+from excite.simulation import response, run_episode, step
 
 plants = pytest.mark.parametrize("plant", PLANTS.values(), ids=PLANTS)
 
@@ -100,7 +100,7 @@ def test_other_numbers_do_not_compile_again():
             return super().derivative(state, input, params)
 
     def use(plant, params):
-        simulate(plant, params, jnp.ones((5, 1)))
+        response(plant, params, jnp.ones((5, 1)))
         run_episode(plant, params, Random(), 5, jax.random.key(0))
 
     first = Traced()
@@ -124,20 +124,20 @@ def test_vmap_over_plants_equals_a_loop():
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *plants)
     inputs = jnp.sin(jnp.arange(30.0))[:, None]
     nominal = plants[0].nominal
-    together = jax.vmap(simulate, in_axes=(0, None, None))(stacked, nominal, inputs)
+    together = jax.vmap(response, in_axes=(0, None, None))(stacked, nominal, inputs)
     for plant, outputs in zip(plants, together, strict=True):
-        np.testing.assert_allclose(outputs, simulate(plant, nominal, inputs), rtol=0, atol=1e-13)
+        np.testing.assert_allclose(outputs, response(plant, nominal, inputs), rtol=0, atol=1e-13)
 
 
 def test_a_plant_can_be_changed_by_traced_numbers():
     plant, inputs = Aero2().changed(dt=0.15), jnp.sin(jnp.arange(20.0))[:, None]
 
-    def response(m):
-        return simulate(plant.changed(m=m), plant.nominal, inputs)
+    def with_mass(m):
+        return response(plant.changed(m=m), plant.nominal, inputs)
 
-    together = jax.vmap(response)(jnp.array([0.5, 2.0]))
+    together = jax.vmap(with_mass)(jnp.array([0.5, 2.0]))
     for m, outputs in zip((0.5, 2.0), together, strict=True):
-        alone = simulate(Aero2(m=m, dt=0.15), plant.nominal, inputs)
+        alone = response(Aero2(m=m, dt=0.15), plant.nominal, inputs)
         np.testing.assert_allclose(outputs, alone, rtol=0, atol=1e-13)
 
 
@@ -310,7 +310,7 @@ def test_energy_is_kept_without_friction(plant, friction):
 @pytest.mark.parametrize("plant", [Aero2(), CartPole(), DCMotor()], ids=lambda p: p.definition.name)
 def test_the_mirrored_input_gives_the_mirrored_output(plant):
     inputs = 2 * jax.random.normal(jax.random.key(3), (200, 1))
-    ahead, mirrored = (simulate(plant, plant.nominal, s * inputs) for s in (1.0, -1.0))
+    ahead, mirrored = (response(plant, plant.nominal, s * inputs) for s in (1.0, -1.0))
     assert jnp.abs(ahead).max() > 0
     np.testing.assert_allclose(mirrored, -ahead, rtol=0, atol=1e-12)
 
@@ -319,8 +319,8 @@ def test_emps_is_mirrored_together_with_its_offset():
     plant = PLANTS["emps"]
     inputs = 60 * jax.random.normal(jax.random.key(3), (200, 1))
     params = plant.nominal
-    ahead = simulate(plant, params, inputs)
-    mirrored = simulate(plant, params._replace(offset=-params.offset), -inputs)
+    ahead = response(plant, params, inputs)
+    mirrored = response(plant, params._replace(offset=-params.offset), -inputs)
     np.testing.assert_allclose(mirrored, -ahead, rtol=0, atol=1e-12)
 
 

@@ -19,6 +19,7 @@ import safetensors.numpy
 from catalogue import PLANTS, TwoMasses
 
 from excite.description import Output, PlantDescription
+from excite.files import tensors_from_bytes, tensors_to_bytes
 from excite.plant import Aero2
 from excite.policy import (
     FORMAT,
@@ -30,8 +31,6 @@ from excite.policy import (
     observe,
     read_policy,
     scaled_action,
-    tensors_from_bytes,
-    tensors_to_bytes,
     with_input,
     with_measurement,
 )

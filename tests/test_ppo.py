@@ -12,13 +12,14 @@ import torch
 from gymnasium import spaces
 from stable_baselines3 import PPO
 
-from excite.env import Env
-from excite.gymnasium_env import ExperimentVectorEnv
-from excite.objective import AbstractObjective
+from excite.environment import AbstractObjective, Env
+from excite.environment.gymnasium import ExperimentVectorEnv
 from excite.plant import Aero2
 from excite.policy import Layout, Policy
-from excite.training.base import Checkpoint, PPOSettings, watch
+from excite.training.checkpoint import Checkpoint
 from excite.training.ppo import BatchedVecEnv, policy_weights, train
+from excite.training.settings import PPOSettings
+from excite.training.validation import watch
 
 TINY = PPOSettings(
     total_steps=4 * 8 * 30, num_envs=8, n_steps=30, batch_size=60, n_epochs=2,

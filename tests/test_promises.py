@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from excite.benchmark import run_benchmark
 from excite.policy import read_policy, shipped_policies
 from excite.study import study_from
+from excite.study.tasks import run_benchmark
 
 RESULTS = Path(__file__).parent.parent / "results"
 POLICIES = ("aero2", "aero2-goals", "aero2-damping")

@@ -18,7 +18,7 @@ from catalogue import TwoMasses
 from standin.quanser import hardware as standin
 
 from excite.plant import Aero2Detailed
-from excite.records import read_record
+from excite.record import read_record
 from excite.rig import AbstractPlayer, Recorder, RigError, SignalPlayer, quanser, run
 from excite.rig.quanser import QuanserAero2
 from excite.safety import Supervision, Trip

@@ -23,7 +23,7 @@ from excite.files import (
     write_json,
 )
 from excite.plant import EMPS, Aero2
-from excite.records import Record, columns_in, read_record, require_record_path, write_record
+from excite.record import Record, columns_in, read_record, require_record_path, write_record
 
 AERO2, EMPS_D, TWO_MASSES = Aero2.definition, EMPS.definition, TwoMasses.definition
 

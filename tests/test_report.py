@@ -14,7 +14,7 @@ from catalogue import TwoMasses
 
 from excite.description import HALF_95, PlantDescription
 from excite.plant import EMPS, Aero2, CartPole
-from excite.records import Record
+from excite.record import Record
 from excite.report import (
     PLOT_ENDINGS,
     agents_figure,

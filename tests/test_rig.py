@@ -21,14 +21,14 @@ import numpy as np
 import pytest
 
 import excite
+from excite.environment import run_episodes
 from excite.estimation import NLS, Experiments
-from excite.evaluation import evaluate
+from excite.estimation.identify import identify
 from excite.excitation import Chirp, PolicyExcitation, Square
 from excite.files import csv_text
-from excite.identification import identify
 from excite.plant import Aero2, Aero2Detailed
 from excite.policy import read_policy, shipped_policies
-from excite.records import read_record
+from excite.record import read_record
 from excite.rig import (
     AbstractPlayer,
     AbstractRig,
@@ -39,11 +39,12 @@ from excite.rig import (
     Recorder,
     RigError,
     SignalPlayer,
-    base,
     interruptible,
     run,
 )
-from excite.rig.prediction import FilteredPlayer, SafetyFilter
+from excite.rig import contract as base
+from excite.rig.filter import FilteredPlayer, SafetyFilter
+from excite.rig.live_estimate import Tracker
 from excite.rig.simulated import (
     Body,
     SimulatedRig,
@@ -53,9 +54,8 @@ from excite.rig.simulated import (
     readings_per_sample,
     run_batch,
 )
-from excite.rig.tracking import Tracker
 from excite.safety import Supervision, Trip
-from excite.simulation import simulate
+from excite.simulation import response
 
 PLANT = Aero2Detailed()
 AERO = PLANT.description
@@ -535,7 +535,7 @@ def test_experiments_on_rigs_are_scored_like_those_on_plants():
     scored, runs = evaluate_on_rig(
         PLANT, excitation, bodies(PLANT, fine, 0.3, keys, **bare), RULES, 60
     )
-    on_plants = evaluate(PLANT, excitation, 60, 0.3, keys)
+    on_plants = run_episodes(PLANT, excitation, 60, 0.3, keys)
     for own, other in zip(scored.params, on_plants.params, strict=True):
         np.testing.assert_array_equal(own, other)
     # Without latency it is the same experiment but for steps of integration and the encoder's.
@@ -566,7 +566,7 @@ def test_without_latency_the_physics_is_that_of_the_plant(tmp_path):
     assert outcome.is_complete
     fine = at_interval(PLANT, NUM_READINGS)
     held = jnp.asarray(np.repeat(sequence, NUM_READINGS, axis=0))
-    true = np.asarray(simulate(fine, body.params, held))
+    true = np.asarray(response(fine, body.params, held))
     measured = read_record(tmp_path / "a.csv", AERO).outputs
     half = 0.5 * AERO.outputs[0].resolution
     assert np.abs(measured - true[::NUM_READINGS]).max() <= half * (1 + 1e-9)

@@ -12,10 +12,10 @@ import pytest
 
 import excite
 from excite.cli import main
+from excite.estimation.identify import identify
 from excite.files import csv_text
-from excite.identification import identify
 from excite.plant import Aero2, Aero2Detailed
-from excite.records import read_record
+from excite.record import read_record
 
 command = importlib.import_module("excite.cli.run")  # its name is the command's, too
 AERO = Aero2Detailed.definition

@@ -10,7 +10,7 @@ from catalogue import PLANTS, TwoMasses
 
 from excite.excitation import AbstractExcitation, Chirp, Multisine, Random, Replay
 from excite.plant import Aero2, CartPole, Sensor
-from excite.simulation import measure, run_episode, simulate, step
+from excite.simulation import measure, response, run_episode, step
 
 plants = pytest.mark.parametrize("plant", PLANTS.values(), ids=PLANTS)
 KEY = jax.random.key(5)
@@ -57,7 +57,7 @@ def test_simulation_agrees_with_scipy(plant):
     start = plant.initial_state + 0.3 * jnp.array([s.scale for s in plant.definition.states])
     inputs = Random(hold=3).sequence(plant, NUM_STEPS, KEY)
     params = plant.Params(*(1.2 * v for v in plant.nominal))
-    ours = simulate(plant, params, inputs, start)
+    ours = response(plant, params, inputs, start)
     error = np.abs(ours - integrated(plant, params, inputs, start)).max(axis=0)
     assert np.all(error < allowed * plant.sensor.sd), error / plant.sensor.sd
 
@@ -71,7 +71,7 @@ def test_halving_the_step_divides_the_error_by_sixteen():
         fine = plant.changed(dt=0.4 / 2**halvings)
         assert fine.substeps == 1
         held = jnp.repeat(inputs, 2**halvings, axis=0)
-        ours = simulate(fine, plant.nominal, held, start)[:: 2**halvings]
+        ours = response(fine, plant.nominal, held, start)[:: 2**halvings]
         errors.append(np.linalg.norm(ours - exact))
     np.testing.assert_allclose(np.divide(errors[:-1], errors[1:]), 16, rtol=0.1)
 
@@ -89,9 +89,9 @@ def test_substeps_are_steps_of_their_own():
 def test_an_input_acts_after_its_own_sample_and_before_the_next():
     plant = Aero2()
     impulse = jnp.zeros((10, 1)).at[4].set(20.0)
-    response = simulate(plant, plant.nominal, impulse)[:, 0]
-    np.testing.assert_array_equal(response[:5], 0.0)
-    assert response[5] > 0
+    outputs = response(plant, plant.nominal, impulse)[:, 0]
+    np.testing.assert_array_equal(outputs[:5], 0.0)
+    assert outputs[5] > 0
 
 
 @plants
@@ -99,9 +99,9 @@ def test_vmap_over_parameters_equals_a_loop(plant):
     inputs = Multisine().sequence(plant, NUM_STEPS, KEY)
     factors = jnp.array([0.8, 1.0, 1.3])
     batch = plant.Params(*(factors * v for v in plant.nominal))
-    together = jax.vmap(simulate, in_axes=(None, 0, None))(plant, batch, inputs)
+    together = jax.vmap(response, in_axes=(None, 0, None))(plant, batch, inputs)
     for i in range(3):
-        alone = simulate(plant, plant.Params(*(v[i] for v in batch)), inputs)
+        alone = response(plant, plant.Params(*(v[i] for v in batch)), inputs)
         np.testing.assert_allclose(together[i], alone, rtol=1e-9, atol=1e-12)
 
 
@@ -113,7 +113,7 @@ def test_without_noise_an_episode_is_the_simulation_of_its_inputs(plant):
     silent = jnp.zeros(len(plant.definition.outputs))
     plant = plant.changed(sensor=Sensor(silent, silent))
     episode = run_episode(plant, plant.nominal, Random(), NUM_STEPS, KEY)
-    expected = simulate(plant, plant.nominal, episode.inputs)
+    expected = response(plant, plant.nominal, episode.inputs)
     np.testing.assert_allclose(episode.outputs, expected, rtol=1e-12, atol=1e-14)
     np.testing.assert_array_equal(episode.measured, episode.outputs)
     np.testing.assert_allclose(episode.time, plant.dt * np.arange(NUM_STEPS + 1))
@@ -251,13 +251,13 @@ def test_derivatives_reach_the_constants_and_the_initial_state_of_a_plant():
 
     @eqx.filter_grad
     def slope(plant):
-        return simulate(plant, plant.nominal, inputs)[-1, 0]
+        return response(plant, plant.nominal, inputs)[-1, 0]
 
     def of_gravity(g):
-        return simulate(plant.changed(g=g), plant.nominal, inputs)[-1, 0]
+        return response(plant.changed(g=g), plant.nominal, inputs)[-1, 0]
 
     def of_start(pitch):
-        return simulate(plant, plant.nominal, inputs, jnp.array([pitch, 0.0]))[-1, 0]
+        return response(plant, plant.nominal, inputs, jnp.array([pitch, 0.0]))[-1, 0]
 
     gradient = slope(plant)
     assert gradient.constants.g == pytest.approx(

@@ -7,19 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from excite.environment import InformationGain, OutputError, WeightedSum
 from excite.estimation import ARX, NLS
+from excite.estimation.catalogue import ESTIMATORS, estimator_named
 from excite.excitation import PRBS, Chirp, Multisine, PolicyExcitation, Random
-from excite.names import (
-    ESTIMATORS,
-    EXCITATIONS,
-    PLANTS,
-    estimator_named,
-    excitation_named,
-    plant_named,
-    with_sensor,
-)
-from excite.objective import InformationGain, OutputError, WeightedSum
+from excite.excitation.catalogue import EXCITATIONS, excitation_named
 from excite.plant import AbstractPlant, Aero2, CartPole, DCMotor
+from excite.plant.catalogue import PLANTS, plant_named, with_sensor
 from excite.policy import Layout, Policy
 from excite.study import Study, read_study
 

@@ -16,20 +16,19 @@ import pytest
 import scipy.stats
 from cluster import Cluster, wait_for
 
-from excite.benchmark import table
-from excite.benchmark.base import seed_folder, study_of
-from excite.benchmark.run import _live, opened, run_study
-from excite.benchmark.table import (
+from excite.cli.study import _require_trainer
+from excite.policy import read_policy
+from excite.study import read_study, study_from, table
+from excite.study.folder import seed_folder, study_of
+from excite.study.run import _live, opened, run_study
+from excite.study.table import (
     across_seeds,
     best_seeds,
     finished_table,
     learning_curves,
     study_table,
 )
-from excite.cli.study import _require_trainer
-from excite.engine import local_engine
-from excite.policy import read_policy
-from excite.study import read_study, study_from
+from excite.study.workers import local_engine
 
 TINY = """
 name = "tiny"

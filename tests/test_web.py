@@ -30,19 +30,12 @@ from starlette.testclient import TestClient
 from excite.cli.train import Objective
 from excite.files import write_json
 from excite.report import report_html
-from excite.web import Settings, application
-from excite.web.base import (
-    MAX_JOBS,
-    MAX_SESSIONS,
-    MAX_UPLOAD,
-    Place,
-    RefusedError,
-    Session,
-    Sessions,
-)
+from excite.web import application
 from excite.web.places import _file_name, _receive
+from excite.web.requests import MAX_UPLOAD, RefusedError
 from excite.web.runs import found
 from excite.web.security import MAX_TRIES, _source
+from excite.web.sessions import MAX_JOBS, MAX_SESSIONS, Place, Session, Sessions, Settings
 from excite.web.trainings import OBJECTIVES, Training, _free
 
 HERE = "http://127.0.0.1:8000"

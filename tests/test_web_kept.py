@@ -10,8 +10,9 @@ import pytest
 from starlette.testclient import TestClient
 
 from excite.files import write_json
-from excite.web import Settings, application
-from excite.web.base import MAX_KEPT, RefusedError, Session
+from excite.web import application
+from excite.web.requests import RefusedError
+from excite.web.sessions import MAX_KEPT, Session, Settings
 from excite.web.workers import Workers
 
 HERE = "http://127.0.0.1:8000"

@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from excite.live import columns
 from excite.web import workers as module
-from excite.web.base import RefusedError, without_folders
+from excite.web.jobs import columns
+from excite.web.requests import RefusedError, without_folders
 from excite.web.workers import Workers
 
 HEADER = f"""#!{sys.executable}

@@ -4,15 +4,12 @@ import json
 from pathlib import Path
 
 import jax
+import matplotlib.pyplot as plt
+import numpy as np
 
-jax.config.update("jax_enable_x64", True)
-
-import matplotlib.pyplot as plt  # noqa: E402
-import numpy as np  # noqa: E402
-
-from excite.names import excitation_named  # noqa: E402
-from excite.plant import Aero2, params_from  # noqa: E402
-from excite.simulation import run_episode  # noqa: E402
+from excite.excitation.catalogue import excitation_named
+from excite.plant import Aero2, params_from
+from excite.simulation import run_episode
 
 ROOT = Path(__file__).parents[2]
 METHODS = {  # excitation: title, row of results/frontier, colour

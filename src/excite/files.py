@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import safetensors.numpy
 
 
 def csv_text(columns: Mapping[str, Any]) -> str:
@@ -217,66 +218,48 @@ def _module_at(path: Path) -> Any:
     return module
 
 
-def text_columns(path: Path) -> dict[str, list[str]]:
-    """Columns of a CSV file that anybody may have written, by name, still as text.
+_NUM_HEADER_BYTES = 8  # a safetensors file begins with the length of its JSON header
+
+
+def tensors_to_bytes(
+    tensors: Mapping[str, np.ndarray], file_format: str, data: Mapping[str, Any]
+) -> bytes:
+    """Tensors and JSON-ready data as the content of one safetensors file."""
+    arrays = {name: np.ascontiguousarray(array) for name, array in tensors.items()}
+    metadata = {"format": file_format, "data": json_text(data)}
+    header, rest = _split(safetensors.numpy.save(arrays, metadata=metadata))
+    # The library orders metadata by chance; equal policies must be equal files.
+    text = json.dumps(json.loads(header), sort_keys=True, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % _NUM_HEADER_BYTES)
+    return len(text).to_bytes(_NUM_HEADER_BYTES, "little") + text + rest
+
+
+def _split(content: bytes) -> tuple[bytes, bytes]:
+    """Header and tensors of a sound safetensors file."""
+    end = _NUM_HEADER_BYTES + int.from_bytes(content[:_NUM_HEADER_BYTES], "little")
+    return content[_NUM_HEADER_BYTES:end], content[end:]
+
+
+def tensors_from_bytes(
+    content: bytes, file_format: str, where: str
+) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Tensors and data written by `tensors_to_bytes`.
 
     Raises:
-        ValueError: one sentence for a file that is no such table, or may be truncated.
+        ValueError: one sentence for content that is truncated or of another format.
     """
-    delimiter, (first, *rest) = _rows(path)
-    header = [name.strip() or f"column {i}" for i, name in enumerate(first, 1)]
-    if first and all(map(_is_number, first)):
-        raise ValueError(f"{path}: the first line holds numbers; the columns' names are needed")
-    if len(set(header)) < len(header):
-        raise ValueError(f"{path}: the header names a column twice: {', '.join(header)}")
-    body = [(number, row) for number, row in enumerate(rest, 2) if row]
-    for number, row in body:
-        if len(row) != len(header):
-            raise ValueError(
-                f"{path}: line {number} has {len(row)} values where the header names "
-                f"{len(header)}; is the file truncated?"
-            )
-    point = "," if delimiter == ";" else "."  # of a German or French table
-    cells = [[cell.strip().replace(point, ".") for cell in row] for _, row in body]
-    return {name: [row[i] for row in cells] for i, name in enumerate(header)}
-
-
-def _rows(path: Path) -> tuple[str, list[list[str]]]:
-    """The delimiter of a CSV file, and its rows, one or more, as they are written."""
+    kind = file_format.rpartition(" ")[0]
     try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (UnicodeDecodeError, OSError) as error:
-        raise ValueError(
-            f"{path}: cannot be read as CSV text ({error}); save it as UTF-8"
-        ) from None
-    lines = text.splitlines()
-    if not lines:
-        raise ValueError(f"{path}: the file is empty")
-    try:
-        delimiter = _delimiter(lines[:2])
-        rows = list(csv.reader(lines, delimiter=delimiter))
-    except csv.Error as error:
-        raise ValueError(f"{path}: cannot be read as CSV text ({error})") from None
-    if not text.endswith(("\n", "\r")):
-        # A number cut in half is still a number: only the line's end shows that it is whole.
-        raise ValueError(
-            f"{path}: line {len(lines)} does not end with a line break; is the file truncated? "
-            "(add one if it is complete)"
-        )
-    return delimiter, rows
-
-
-def _delimiter(first: list[str]) -> str:
-    """What splits the first two lines alike; names and numbers may hold commas."""
-    for delimiter in (";", "\t", ","):
-        counts = {len(row) for row in csv.reader(first, delimiter=delimiter)}
-        if len(counts) == 1 and counts != {1}:
-            return delimiter
-    return next((d for d in (",", ";", "\t") if d in first[0]), ",")
-
-
-def _is_number(text: str) -> bool:
-    try:
-        return bool(text) and math.isfinite(float(text.replace(",", ".")))
-    except ValueError:
-        return False
+        tensors = safetensors.numpy.load(content)
+        metadata = json.loads(_split(content)[0]).get("__metadata__") or {}
+        found = metadata.get("format", "none")
+        if found != file_format:
+            raise ValueError(f"{where}: format {found!r}; this version reads {file_format!r} files")
+        data = json.loads(metadata["data"])
+        if not isinstance(data, dict):
+            raise TypeError("its data are no JSON object")
+        return tensors, data
+    except (
+        safetensors.SafetensorError, KeyError, TypeError, RecursionError, json.JSONDecodeError
+    ) as error:  # fmt: skip
+        raise ValueError(f"{where}: truncated, or no {kind} file ({error})") from None

@@ -10,6 +10,7 @@ of the parameters all of it is relative, and comparable between parameters.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -17,10 +18,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .description import names_of
 from .plant import AbstractPlant, Params
-from .simulation import simulate
+from .simulation import response
 
 Information = Float[Array, "param param"]
+
+UNSEEN_SD = 0.5
+"""A direction of relative changes known no better than this is not seen by the data: its
+95 % interval reaches from nothing to the double."""
 
 
 def require_double_precision() -> None:
@@ -96,12 +102,12 @@ def experiment_information(
     size, num_params = relative_size(plant, params), len(theta)
     num_states = 0 if initial_state_known else len(plant.initial_state)
 
-    def response(change: Array) -> Array:
+    def outputs(change: Array) -> Array:
         values = theta + size * change[:num_params]
         moved = change[num_params:] if num_states else 0.0
-        return simulate(plant, plant.Params(*values), inputs, plant.initial_state + moved)
+        return response(plant, plant.Params(*values), inputs, plant.initial_state + moved)
 
-    S = sensitivity(response, jnp.zeros(num_params + num_states))
+    S = sensitivity(outputs, jnp.zeros(num_params + num_states))
     if initial_state_known:
         return fisher_information(S, plant.sensor.sd)
     return marginal_information(S, plant.sensor.sd, num_params)
@@ -117,10 +123,10 @@ def running_information(
     """
     theta, size = jnp.stack([jnp.asarray(p, float) for p in params]), relative_size(plant, params)
 
-    def response(change: Array) -> Array:
-        return simulate(plant, plant.Params(*(theta + size * change)), inputs)
+    def outputs(change: Array) -> Array:
+        return response(plant, plant.Params(*(theta + size * change)), inputs)
 
-    weighted = sensitivity(response, jnp.zeros(len(theta))) / plant.sensor.sd[None, :, None]
+    weighted = sensitivity(outputs, jnp.zeros(len(theta))) / plant.sensor.sd[None, :, None]
     each = jnp.einsum("koi,koj->kij", weighted, weighted)
     return jnp.cumsum(each, axis=0)[1:]
 
@@ -161,3 +167,113 @@ def cramer_rao_bound(information: Information) -> Float[Array, " param"]:
     variance = jnp.sum(vectors**2 / jnp.where(unseen, 1.0, values)[None], axis=1) / safe**2
     lost = jnp.any(unseen[None] & (jnp.abs(vectors) > 1e-6), axis=1)
     return jnp.where(lost | (size == 0), jnp.inf, jnp.sqrt(variance))
+
+
+def best_possible(
+    plant: AbstractPlant,
+    params: Params,
+    inputs: Float[Array, "time input"],
+    *,
+    initial_state_known: bool,
+) -> dict[str, Any]:
+    """Least standard deviation of each parameter for an input, as JSON-ready data.
+
+    Raises:
+        ValueError: for a sensor without noise, which sets no bound, and for a response
+            that is not finite.
+    """
+    if not np.all(np.asarray(plant.sensor.sd) > 0):
+        raise ValueError("a sensor without noise sets no bound; give every output a noise")
+    information = experiment_information(
+        plant, params, inputs, initial_state_known=initial_state_known
+    )
+    values = np.linalg.eigvalsh(np.nan_to_num(np.asarray(information)))
+    if not np.all(np.isfinite(information)) or values[0] < -1e-6 * values[-1]:
+        raise ValueError(
+            "the response to this input is not finite, or chaotic: it has no information that "
+            "could be trusted; a smaller amplitude or other parameters may help"
+        )
+    size = np.asarray(relative_size(plant, params))
+    sd = np.asarray(cramer_rao_bound(information)) * size
+    return {
+        "plant": plant.definition.name,
+        "initial_state": "known" if initial_state_known else "free",
+        "params": {
+            p.name: {
+                "value": float(value),
+                "cramer_rao_bound": float(s) if np.isfinite(s) else None,
+                "cramer_rao_percent": float(100 * s / abs(value))
+                if np.isfinite(s) and value
+                else None,
+                "unit": p.unit,
+            }
+            for p, value, s in zip(plant.definition.parameters, params, sd, strict=True)
+        },
+        "log_det_information": float(d_optimality(information)),
+        "a_optimality": float(a_optimality(information)),
+        "e_optimality": float(e_optimality(information)),
+        "information": np.asarray(information),
+        "verdict": _verdict(names_of(plant.definition.parameters), np.asarray(information)),
+    }
+
+
+def _verdict(names: tuple[str, ...], information: np.ndarray) -> list[str]:
+    """What cannot be seen, one sentence each, and how well the rest is."""
+    free, sentences = np.ones(len(names), bool), []
+    while (unseen := worst_seen(names, information, free)) is not None:
+        free[unseen[0]] = False
+        sentences.append(unseen[1])
+    if free.any():
+        block = np.where(np.outer(free, free), information, np.eye(len(names)))
+        sentences.append(identifiability(names, np.linalg.inv(block), free))
+    return sentences
+
+
+def worst_seen(
+    names: tuple[str, ...], information: Float[np.ndarray, "param param"], free: np.ndarray
+) -> tuple[int, str] | None:
+    """The free parameter to hold because the data do not see it, and why, in words.
+
+    None when every direction of the free parameters is known better than `UNSEEN_SD`.
+    The direction is the eigenvector of the information with the smallest eigenvalue.
+    """
+    index = np.flatnonzero(free)
+    if index.size == 0:
+        return None
+    block = information[np.ix_(index, index)]
+    if np.all(np.isfinite(block)):
+        values, vectors = np.linalg.eigh(block)
+        value, direction = max(values[0], 0.0), vectors[:, 0]
+    else:
+        value, direction = 0.0, np.ones(index.size)
+    if value * UNSEEN_SD**2 >= 1:
+        return None
+    chosen = int(index[np.argmax(np.abs(direction))])
+    involved = [names[i] for i, v in zip(index, direction, strict=True) if abs(v) > 0.3]
+    if len(involved) == 1:
+        return chosen, f"the data cannot see {names[chosen]}"
+    combination = " ".join(
+        f"{names[i]}^{v:+.2g}"
+        for i, v in zip(index, direction / direction[np.argmax(np.abs(direction))], strict=True)
+        if names[i] in involved
+    )
+    return chosen, (
+        f"the data cannot tell {' and '.join(involved)} apart: {combination} could have any size"
+    )
+
+
+def identifiability(
+    names: tuple[str, ...], covariance: Float[np.ndarray, "param param"], free: np.ndarray
+) -> str:
+    """How well the worst direction of the free parameters is seen, in words.
+
+    Args:
+        covariance: of relative changes.
+    """
+    index = np.flatnonzero(free)
+    values, vectors = np.linalg.eigh(covariance[np.ix_(index, index)])
+    sd, direction = np.sqrt(max(values[-1], 0.0)), vectors[:, -1]
+    involved = [names[i] for i, v in zip(index, direction, strict=True) if abs(v) > 0.3]
+    what = involved[0] if len(involved) == 1 else f"a combination of {' and '.join(involved)}"
+    seen = ", ".join(names[i] for i in index)
+    return f"the data see all of {seen}; worst is {what}, to {100 * sd:.2g} %"

@@ -1,4 +1,4 @@
-"""From inputs to outputs: `simulate` without noise, `run_episode` in closed loop.
+"""From inputs to outputs: `response` without noise, `run_episode` in closed loop.
 
 Sample k is measured at time k dt; the input chosen then is held until k + 1. An
 experiment of T steps therefore has T inputs and T + 1 measurements. Integration is the
@@ -55,7 +55,7 @@ def step(
 
 
 @eqx.filter_jit
-def simulate(
+def response(
     plant: AbstractPlant,
     params: Params,
     inputs: Float[Array, "time input"],

@@ -16,10 +16,10 @@ from .. import __version__
 from .benchmark import benchmark
 from .design import design
 from .doctor import doctor
-from .door import RememberingGroup, RunFailedError
 from .export import export
 from .identify import identify
 from .information import information
+from .options import RememberingGroup, RunFailedError
 from .plants import plants
 from .policies import evaluate, policies
 from .report import report

@@ -10,7 +10,7 @@ from typing import Any
 
 import click
 
-from .door import (
+from .options import (
     OUT_FILE,
     command_line,
     computing,
@@ -36,9 +36,10 @@ def benchmark(
     study: Path, out: Path | None, plot: Path | None, as_json: bool, **options: Any
 ) -> None:
     """Compare the methods of STUDY.toml under identical conditions."""
-    from ..benchmark import example_episodes, run_benchmark, write_benchmark
     from ..files import require_free_run_folder
     from ..report import benchmark_figure, save
+    from ..study.episodes import example_episodes
+    from ..study.tasks import run_benchmark, write_benchmark
 
     overwrite = options.pop("overwrite")
     if out is not None:
@@ -90,8 +91,8 @@ def comparison_files(rows: Any, settings: Any) -> dict[str, bytes]:
 
 def episodes_file(study: Any, episodes: Any) -> bytes:
     """Example episodes of a study as the content of a file; shared with `study`."""
-    from ..benchmark import episodes_data
     from ..files import json_ready
+    from ..study.episodes import episodes_data
 
     data = episodes_data(study.build_plant().description, episodes)
     return json.dumps(json_ready(data), ensure_ascii=False).encode()

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from .door import (
+from .options import (
     NUMBERS,
     OUT_FILE,
     WholeNumber,
@@ -70,13 +70,13 @@ def design(
     import jax
     import numpy as np
 
-    from ..design import signal_env
-    from ..evaluation import evaluate
+    from ..environment import run_episodes
     from ..excitation import Replay
     from ..information import d_optimality, require_noise
-    from ..names import plant_named, with_sensor
-    from ..records import require_record_path, write_record
+    from ..plant.catalogue import plant_named, with_sensor
+    from ..record import require_record_path, write_record
     from ..report import episode_figure, save
+    from ..training.signals import signal_env
 
     require_record_path(out, overwrite)
     if not 0 <= options["spread"] < 1:
@@ -92,7 +92,7 @@ def design(
     count = 1 if is_nominal else 1000
     keys = jax.random.split(jax.random.key(options["seed"] + 1), count)
     # The file is played as it stands, whatever closed a loop or drew numbers to make it.
-    judged = evaluate(chosen, Replay(inputs), options["steps"], float(env.spread), keys)
+    judged = run_episodes(chosen, Replay(inputs), options["steps"], float(env.spread), keys)
     information = jax.vmap(d_optimality)(judged.information)
     description = chosen.description
     record = _record(chosen, inputs, found)
@@ -136,10 +136,10 @@ def _record(plant: Any, inputs: Any, found: dict[str, Any]) -> Any:
     import numpy as np
 
     from .. import __version__
-    from ..records import Record
-    from ..simulation import simulate
+    from ..record import Record
+    from ..simulation import response
 
-    outputs = np.asarray(simulate(plant, plant.nominal, inputs))
+    outputs = np.asarray(response(plant, plant.nominal, inputs))
     time = np.arange(len(outputs)) * float(plant.dt)
     origin = {
         "starts_at_initial_state": True,
@@ -155,8 +155,7 @@ def _designed(env: Any, options: dict[str, Any], report: Any) -> tuple[Any, dict
     import jax
     import jax.numpy as jnp
 
-    from ..design import clairvoyant_signals, robust_signal
-    from ..design.optimal import CLAIRVOYANT, ROBUST
+    from ..training.signals import CLAIRVOYANT, ROBUST, clairvoyant_signals, robust_signal
 
     kind, seed, updates = options["kind"], options["seed"], options["updates"]
     found = {"design": kind, "criterion": options["criterion"], "seed": seed}
@@ -185,7 +184,8 @@ def _tuned(
 
     import jax
 
-    from ..names import EXCITATIONS, LOOP, excitation_named, unknown
+    from ..description import unknown
+    from ..excitation.catalogue import EXCITATIONS, LOOP, excitation_named
     from ..simulation import run_episode
 
     kind, plant = options["kind"], env.plant
@@ -194,7 +194,7 @@ def _tuned(
         raise unknown("kind of design", kind, known)
     if find_spec("optuna") is None:
         raise ValueError("tuning needs optuna: python -m pip install -e '.[tune]'")
-    from ..design.tuned import tuned_signal
+    from ..training.tuning import tuned_signal
 
     trials = options["updates"] or 400
     best = tuned_signal(

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from .door import cache_folder, json_option, prepare_jax, show_json, show_table
+from .options import cache_folder, json_option, prepare_jax, show_json, show_table
 
 
 @click.command()

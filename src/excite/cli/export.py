@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from .door import OUT_FILE, json_option, show_json
+from .options import OUT_FILE, json_option, show_json
 
 
 @click.command()
@@ -16,12 +16,12 @@ from .door import OUT_FILE, json_option, show_json
 @json_option
 def export(policy: str, onnx: Path, overwrite: bool, as_json: bool) -> None:
     """Write POLICY, a file or a shipped name, as an ONNX model."""
-    from ..export import require_onnx_path, write_onnx
     from ..policy import policy_path, read_policy, shipped_policies
+    from ..policy.onnx import require_onnx_path, write_onnx
 
     path = policy_path(policy)
     if path is None:
-        from ..names import unknown
+        from ..description import unknown
 
         raise unknown("policy", policy, [*shipped_policies(), "path/to/policy.safetensors"])
     require_onnx_path(onnx, overwrite)

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from .door import (
+from .options import (
     NAMES,
     NUMBERS,
     OUT_FILE,
@@ -88,11 +88,12 @@ def identify(
     import dataclasses
 
     from ..estimation import NLS
+    from ..estimation.catalogue import estimator_named
+    from ..estimation.identify import identify as run
+    from ..estimation.result import write_run
     from ..files import require_free_run_folder
-    from ..identification import identify as run
-    from ..identification import write_run
-    from ..names import estimator_named, plant_named
-    from ..records import read_record
+    from ..plant.catalogue import plant_named
+    from ..record import read_record
     from ..report import identification_figure, save
 
     if out is not None:

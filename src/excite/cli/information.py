@@ -7,7 +7,15 @@ from typing import Any
 
 import click
 
-from .door import OUT_FILE, computing, json_option, plot_option, progress_bar, show_json, show_table
+from .options import (
+    OUT_FILE,
+    computing,
+    json_option,
+    plot_option,
+    progress_bar,
+    show_json,
+    show_table,
+)
 from .simulate import excitation_options, prepared
 
 
@@ -34,8 +42,8 @@ def information(
     """
     import numpy as np
 
-    from ..identification import best_possible
-    from ..records import Record
+    from ..information import best_possible
+    from ..record import Record
     from ..report import information_figure, save
     from ..simulation import run_episode
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from .door import computing, json_option, plot_option, show_json, show_table
+from .options import computing, json_option, plot_option, show_json, show_table
 
 
 @click.command()
@@ -20,7 +20,7 @@ def plants(plant: str | None, as_json: bool, plot: Path | None) -> None:
 
     --plot draws PLANT's nominal response to every classical excitation.
     """
-    from ..names import PLANTS, plant_named
+    from ..plant.catalogue import PLANTS, plant_named
 
     if plant is None and plot is not None:
         raise ValueError("--plot needs a PLANT")
@@ -93,8 +93,8 @@ def _describe(d: Any, text: str) -> None:
 def _plot(plant: Any, path: Path) -> None:
     import jax
 
-    from ..names import EXCITATIONS
-    from ..records import Record
+    from ..excitation.catalogue import EXCITATIONS
+    from ..record import Record
     from ..report import episodes_figure, save
     from ..simulation import run_episode
 

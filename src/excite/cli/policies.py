@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from .benchmark import show_comparison, warned
-from .door import (
+from .options import (
     NUMBERS,
     WholeNumber,
     computing,
@@ -71,7 +71,7 @@ def policies(as_json: bool) -> None:
 @computing
 def evaluate(policy: str, as_json: bool, **options: Any) -> None:
     """Score POLICY, a file or a shipped name, on plants drawn at random."""
-    from ..benchmark import run_benchmark
+    from ..study.tasks import run_benchmark
 
     own = _policy(policy)
     chosen = warned(_study(policy, own, options))
@@ -87,7 +87,7 @@ def evaluate(policy: str, as_json: bool, **options: Any) -> None:
 
 def _policy(policy: str) -> Any:
     """The policy of a file or a shipped name."""
-    from ..names import unknown
+    from ..description import unknown
     from ..policy import POLICY_ENDING, policy_path, read_policy, shipped_policies
 
     path = policy_path(policy)
@@ -100,8 +100,8 @@ def _policy(policy: str) -> Any:
 
 def _study(policy: str, own: Any, options: dict[str, Any]) -> Any:
     """The study of one method that these options mean."""
-    from ..names import plant_named
     from ..plant import AbstractARXPlant
+    from ..plant.catalogue import plant_named
     from ..study import study_from
 
     if options["filtered"] and not options["on_rig"]:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from .door import OUT_FILE, json_option, progress_bar, show_json
+from .options import OUT_FILE, json_option, progress_bar, show_json
 
 
 @click.command()

@@ -12,7 +12,8 @@ from typing import Any
 import click
 
 from ..description import PlantDescription, display_unit
-from ..rig.base import AbstractPlayer, AbstractRig, PolicyPlayer, Sample, SignalPlayer
+from ..rig.contract import AbstractRig, Sample
+from ..rig.player import AbstractPlayer, PolicyPlayer, SignalPlayer
 
 DEFAULT_POLICY = "aero2_detailed"
 """Of the simulated and the Quanser rig: robust against what the ideal plant leaves out."""
@@ -170,7 +171,7 @@ def _plant(options: dict[str, Any], has_jax: bool) -> Any:
         if options["plant"] or options["rig"] == "simulated":
             raise ValueError("--plant and a simulated rig need JAX, which is not installed")
         return None
-    from ..names import plant_named
+    from ..plant.catalogue import plant_named
 
     return plant_named(options["plant"] or DEFAULT_POLICY)
 
@@ -187,7 +188,7 @@ def _simulated(options: dict[str, Any], plant: Any) -> AbstractRig:
     import jax
 
     from ..rig.simulated import Body, SimulatedRig, readings_per_sample
-    from .door import merged
+    from .options import merged
 
     num_readings = readings_per_sample(plant)
     faults = merged(options["fault"])
@@ -223,7 +224,7 @@ def _maker(
         def bare() -> AbstractPlayer:
             return PolicyPlayer(policy)
     else:
-        from ..records import read_signal
+        from ..record import read_signal
 
         record = read_signal(options["signal"], description)
 
@@ -234,7 +235,7 @@ def _maker(
         return bare
     if plant is None:
         raise ValueError("--filter needs JAX, which is not installed")
-    from ..rig.prediction import FilteredPlayer, SafetyFilter
+    from ..rig.filter import FilteredPlayer, SafetyFilter
 
     filter = SafetyFilter.of(plant, options["spread"], options["slew"])
     return lambda: FilteredPlayer(bare(), filter)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..description import display_unit
-from .door import (
+from .options import (
     NUMBERS,
     OUT_FILE,
     RunFailedError,
@@ -76,7 +76,7 @@ def run(out: Path | None, overwrite: bool, dry_run: bool, as_json: bool, **optio
     Without JAX, a policy or a signal is played with NumPy alone; the live estimate and the
     filter are then off.
     """
-    from ..records import require_record_path
+    from ..record import require_record_path
     from ..rig import Recorder, RigError, interruptible
     from ..rig import run as play
     from ..safety import Supervision
@@ -131,7 +131,7 @@ def _has_jax() -> bool:
 def _tracker(job: Job, has_jax: bool) -> Any:
     if not has_jax or job.plant is None:
         return None
-    from ..rig.tracking import Tracker
+    from ..rig.live_estimate import Tracker
 
     return Tracker(job.plant, job.player.num_steps, job.rig.starts_at_rest)
 

@@ -9,7 +9,7 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from .door import OUT_FILE, WholeNumber, cache_folder, json_option, show_json
+from .options import OUT_FILE, WholeNumber, cache_folder, json_option, show_json
 
 
 @click.command()
@@ -58,8 +58,9 @@ def serve(
     from urllib.parse import quote
 
     try:
-        from ..web import Settings, is_loopback
         from ..web import serve as serve_here
+        from ..web.security import is_loopback
+        from ..web.sessions import Settings
     except ImportError:
         raise ValueError(
             "the bench page needs the extra: python -m pip install -e '.[web]'"

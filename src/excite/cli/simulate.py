@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from .door import (
+from .options import (
     NAMES,
     NUMBERS,
     OUT_FILE,
@@ -64,9 +64,9 @@ def prepared(options: dict[str, Any], plant_name: str, file: Path | None) -> dic
     import jax.numpy as jnp
 
     from ..excitation import Replay
-    from ..names import plant_named, with_sensor
     from ..plant import params_from
-    from ..records import read_record, require_playable
+    from ..plant.catalogue import plant_named, with_sensor
+    from ..record import read_record, require_playable
 
     plant = with_sensor(
         plant_named(plant_name), merged(options["noise"]), merged(options["resolution"])
@@ -105,7 +105,7 @@ def prepared(options: dict[str, Any], plant_name: str, file: Path | None) -> dic
 def _named(name: str, options: dict[str, Any], plant: Any) -> tuple[Any, dict[str, str], int]:
     """An excitation by name, the origin of a policy, and how many steps."""
     from ..excitation import PolicyExcitation, Replay
-    from ..names import excitation_and_origin
+    from ..excitation.catalogue import excitation_and_origin
 
     excitation, origin = excitation_and_origin(name, merged(options["settings"]), plant)
     if isinstance(excitation, PolicyExcitation):
@@ -140,7 +140,7 @@ def simulate(
     import numpy as np
 
     from ..excitation import crest_factor
-    from ..records import require_record_path, write_record
+    from ..record import require_record_path, write_record
     from ..report import episode_figure, save
     from ..safety import critical_levels, is_violation, max_abs_output
     from ..simulation import run_episode
@@ -184,7 +184,7 @@ def _by_name(parts: Any, values: Any) -> dict[str, float]:
 
 
 def _record(run: Any, job: dict[str, Any], seed: int) -> Any:
-    from ..live import simulated_record
+    from ..web.jobs import simulated_record
 
     provenance = {"excitation": job["excitation_name"], "seed": seed, **job["origin"]}
     return simulated_record(run, job["plant"], job["params"], provenance)

@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from .benchmark import comparison_files, episodes_file, show_comparison, study_in
-from .door import (
+from .options import (
     OUT_FILE,
     RunFailedError,
     WholeNumber,
@@ -64,7 +64,7 @@ def run_study_here(
     workers: int | None = None,
 ) -> None:
     """Runs a study, writes and shows its table; shared with `train`."""
-    from ..benchmark.run import run_study
+    from ..study.run import run_study
 
     if engine == "local":
         _require_trainer(chosen, out)
@@ -112,7 +112,7 @@ def _require_trainer(chosen: Any, out: Path) -> None:
     """Raises ValueError where seeds are left to train and a library is missing."""
     from importlib.util import find_spec
 
-    from ..benchmark.base import seed_folder
+    from ..study.folder import seed_folder
 
     agents = [name for name, agent in chosen.agents.items() if agent.method == "ppo"]
     folders = [seed_folder(out, a, seed) for a in agents for seed in range(chosen.seeds)]
@@ -124,7 +124,7 @@ def _require_trainer(chosen: Any, out: Path) -> None:
 
 
 def _engine(engine: str, address: str | None, workers: int | None) -> Any:
-    from ..engine import dask_engine, local_engine
+    from ..study.workers import dask_engine, local_engine
 
     if engine == "dask":
         if address is None:
@@ -140,8 +140,6 @@ def _engine(engine: str, address: str | None, workers: int | None) -> Any:
 
 def _finish(chosen: Any, folder: Path) -> None:
     """Writes the table and the figures into the run folder."""
-    from ..benchmark import example_episodes
-    from ..benchmark.table import best_seeds, learning_curves, study_table
     from ..files import write_bytes, write_json
     from ..report import (
         agents_figure,
@@ -153,6 +151,8 @@ def _finish(chosen: Any, folder: Path) -> None:
         image,
         lengths_figure,
     )
+    from ..study.episodes import example_episodes
+    from ..study.table import best_seeds, learning_curves, study_table
 
     content, settings = study_table(folder), chosen.model_dump()
     rows, title = content["rows"], chosen.title or chosen.name
@@ -181,8 +181,8 @@ def _finish(chosen: Any, folder: Path) -> None:
 
 
 def _show(folder: Path, as_json: bool) -> None:
-    from ..benchmark.base import study_of
-    from ..benchmark.table import finished_table
+    from ..study.folder import study_of
+    from ..study.table import finished_table
 
     content, settings = finished_table(folder), study_of(folder).model_dump()
     if as_json:

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from .door import NUMBERS, OUT_FILE, VALUES, WholeNumber, computing, json_option, merged
+from .options import NUMBERS, OUT_FILE, VALUES, WholeNumber, computing, json_option, merged
 from .study import run_study_here
 
 _OBJECTIVES = {
@@ -29,7 +29,7 @@ class Objective(click.ParamType):
 
     def convert(self, value: Any, param: Any, ctx: Any) -> tuple[str, float | None]:
         """The two of them."""
-        from ..names import unknown
+        from ..description import unknown
 
         name, has_weight, weight = value.partition("=")
         if name not in _OBJECTIVES:
@@ -117,8 +117,8 @@ def _rewards(
 
 def _study(plant: str, out: Path, options: dict[str, Any]) -> dict[str, Any]:
     """The study that these options mean."""
-    from ..names import plant_named
     from ..plant import AbstractARXPlant
+    from ..plant.catalogue import plant_named
 
     rewards = _rewards(options["objectives"] or [("D", None)], merged(options["goals"]))
     name = f"{options['method']}({', '.join(rewards)})"

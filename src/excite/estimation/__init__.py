@@ -1,11 +1,11 @@
 """Estimators: the contract (`base`), `ARX`, `NLS` and `Decrement`."""
 
 from .arx import ARX as ARX
-from .base import AbstractEstimator as AbstractEstimator
-from .base import Estimate as Estimate
-from .base import Experiments as Experiments
-from .base import Status as Status
-from .base import bound_reached as bound_reached
-from .base import stack_experiments as stack_experiments
+from .contract import AbstractEstimator as AbstractEstimator
+from .contract import Estimate as Estimate
+from .contract import Experiments as Experiments
+from .contract import Status as Status
+from .contract import bound_reached as bound_reached
+from .contract import stack_experiments as stack_experiments
 from .decrement import Decrement as Decrement
 from .nls import NLS as NLS

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..information import require_double_precision
 from ..plant import AbstractARXPlant, AbstractPlant, Params
-from .base import (
+from .contract import (
     AbstractEstimator,
     Estimate,
     Experiments,

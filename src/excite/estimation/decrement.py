@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..information import require_double_precision
 from ..plant import AbstractARXPlant, AbstractPlant, Params
-from .base import (
+from .contract import (
     AbstractEstimator,
     Estimate,
     Experiments,

@@ -11,10 +11,6 @@ import numpy as np
 import scipy.special
 from jaxtyping import Float
 
-UNSEEN_SD = 0.5
-"""A direction of relative changes known no better than this is not seen by the data: its
-95 % interval reaches from nothing to the double."""
-
 
 def fit_percent(
     measured: Float[np.ndarray, " sample"], simulated: Float[np.ndarray, " sample"]
@@ -145,53 +141,3 @@ def widened(
     variance, safe = np.diag(white), np.where(np.diag(white) > 0, np.diag(white), 1.0)
     factor = np.sqrt(np.where(variance > 0, np.maximum(np.diag(robust) / safe, 1.0), 1.0))
     return white * np.outer(factor, factor)
-
-
-def worst_seen(
-    names: tuple[str, ...], information: Float[np.ndarray, "param param"], free: np.ndarray
-) -> tuple[int, str] | None:
-    """The free parameter to hold because the data do not see it, and why, in words.
-
-    None when every direction of the free parameters is known better than `UNSEEN_SD`.
-    The direction is the eigenvector of the information with the smallest eigenvalue.
-    """
-    index = np.flatnonzero(free)
-    if index.size == 0:
-        return None
-    block = information[np.ix_(index, index)]
-    if np.all(np.isfinite(block)):
-        values, vectors = np.linalg.eigh(block)
-        value, direction = max(values[0], 0.0), vectors[:, 0]
-    else:
-        value, direction = 0.0, np.ones(index.size)
-    if value * UNSEEN_SD**2 >= 1:
-        return None
-    chosen = int(index[np.argmax(np.abs(direction))])
-    involved = [names[i] for i, v in zip(index, direction, strict=True) if abs(v) > 0.3]
-    if len(involved) == 1:
-        return chosen, f"the data cannot see {names[chosen]}"
-    combination = " ".join(
-        f"{names[i]}^{v:+.2g}"
-        for i, v in zip(index, direction / direction[np.argmax(np.abs(direction))], strict=True)
-        if names[i] in involved
-    )
-    return chosen, (
-        f"the data cannot tell {' and '.join(involved)} apart: {combination} could have any size"
-    )
-
-
-def identifiability(
-    names: tuple[str, ...], covariance: Float[np.ndarray, "param param"], free: np.ndarray
-) -> str:
-    """How well the worst direction of the free parameters is seen, in words.
-
-    Args:
-        covariance: of relative changes.
-    """
-    index = np.flatnonzero(free)
-    values, vectors = np.linalg.eigh(covariance[np.ix_(index, index)])
-    sd, direction = np.sqrt(max(values[-1], 0.0)), vectors[:, -1]
-    involved = [names[i] for i, v in zip(index, direction, strict=True) if abs(v) > 0.3]
-    what = involved[0] if len(involved) == 1 else f"a combination of {' and '.join(involved)}"
-    seen = ", ".join(names[i] for i in index)
-    return f"the data see all of {seen}; worst is {what}, to {100 * sd:.2g} %"

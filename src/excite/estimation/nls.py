@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float
 from ..description import names_of
 from ..information import marginal_information, relative_size, require_double_precision
 from ..plant import AbstractPlant, Params
-from .base import (
+from .contract import (
     AbstractEstimator,
     Estimate,
     Experiments,

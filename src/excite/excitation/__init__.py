@@ -1,10 +1,10 @@
 """Excitations: the contract (`base`), signals, and those that look at the measurements."""
 
-from .base import AbstractExcitation as AbstractExcitation
-from .base import AbstractShape as AbstractShape
-from .base import AbstractSignal as AbstractSignal
-from .base import crest_factor as crest_factor
-from .base import optional_array as optional_array
+from .contract import AbstractExcitation as AbstractExcitation
+from .contract import AbstractShape as AbstractShape
+from .contract import AbstractSignal as AbstractSignal
+from .contract import crest_factor as crest_factor
+from .contract import optional_array as optional_array
 from .feedback import PolicyExcitation as PolicyExcitation
 from .feedback import PositionLoop as PositionLoop
 from .signals import PRBS as PRBS

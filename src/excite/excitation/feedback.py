@@ -21,7 +21,7 @@ from ..policy import (
     with_measurement,
 )
 from ..safety import watched_output
-from .base import AbstractExcitation, AbstractShape, optional_array
+from .contract import AbstractExcitation, AbstractShape, optional_array
 
 
 class PositionLoop(AbstractExcitation):

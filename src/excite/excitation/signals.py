@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..plant import AbstractPlant
-from .base import AbstractShape, AbstractSignal, Sequence, optional_array
+from .contract import AbstractShape, AbstractSignal, Sequence, optional_array
 
 # Feedback taps of maximum-length shift registers (period 2^bits - 1), counted from 1;
 # S. W. Golomb, Shift Register Sequences, 1967.

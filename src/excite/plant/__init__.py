@@ -1,14 +1,17 @@
-"""Plants: the contract (`base`) and one file per shipped plant."""
+"""Plants: the contract (`contract`), one file per shipped plant, names (`catalogue`).
+
+Importing this package switches JAX to double precision (see `contract`).
+"""
 
 from .aero2 import Aero2 as Aero2
 from .aero2 import Aero2Detailed as Aero2Detailed
 from .aero2 import Aero2Lag as Aero2Lag
-from .base import AbstractARXPlant as AbstractARXPlant
-from .base import AbstractPlant as AbstractPlant
-from .base import Params as Params
-from .base import Sensor as Sensor
-from .base import draw_params as draw_params
-from .base import params_from as params_from
 from .cart_pole import CartPole as CartPole
+from .contract import AbstractARXPlant as AbstractARXPlant
+from .contract import AbstractPlant as AbstractPlant
+from .contract import Params as Params
+from .contract import Sensor as Sensor
+from .contract import draw_params as draw_params
+from .contract import params_from as params_from
 from .dc_motor import DCMotor as DCMotor
 from .emps import EMPS as EMPS

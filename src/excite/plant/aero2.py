@@ -6,7 +6,7 @@ import math
 import jax.numpy as jnp
 
 from ..description import Constant, Input, Output, Parameter, PlantDescription, State
-from .base import AbstractARXPlant, AbstractPlant
+from .contract import AbstractARXPlant, AbstractPlant
 
 
 class Aero2(AbstractARXPlant):

@@ -5,7 +5,7 @@ import math
 import jax.numpy as jnp
 
 from ..description import Constant, Input, Output, Parameter, PlantDescription, State
-from .base import AbstractPlant
+from .contract import AbstractPlant
 
 
 class CartPole(AbstractPlant):

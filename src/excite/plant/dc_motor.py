@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from ..description import Input, Output, Parameter, PlantDescription, State
-from .base import AbstractPlant
+from .contract import AbstractPlant
 
 
 class DCMotor(AbstractPlant):

@@ -4,13 +4,11 @@ Everything comes in as plain data (records, descriptions, JSON-ready dictionarie
 line of this room computes an experiment.
 """
 
-from .base import PLOT_ENDINGS as PLOT_ENDINGS
-from .base import digits_for as digits_for
-from .base import image as image
-from .base import kept_samples as kept_samples
-from .base import number as number
-from .base import require_plot_path as require_plot_path
-from .base import save as save
+from .figure import PLOT_ENDINGS as PLOT_ENDINGS
+from .figure import image as image
+from .figure import kept_samples as kept_samples
+from .figure import require_plot_path as require_plot_path
+from .figure import save as save
 from .figures import autocorrelation_figure as autocorrelation_figure
 from .figures import benchmark_figure as benchmark_figure
 from .figures import correlation_figure as correlation_figure
@@ -21,8 +19,10 @@ from .figures import information_figure as information_figure
 from .frontier import frontier_figure as frontier_figure
 from .frontier import lengths_figure as lengths_figure
 from .html import report_html as report_html
-from .study import agents_figure as agents_figure
-from .study import curves_figure as curves_figure
+from .numbers import digits_for as digits_for
+from .numbers import number as number
+from .study_figures import agents_figure as agents_figure
+from .study_figures import curves_figure as curves_figure
 from .tables import all_cells as all_cells
 from .tables import benchmark_csv as benchmark_csv
 from .tables import benchmark_latex as benchmark_latex

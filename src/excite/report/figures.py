@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ..description import HALF_95, PlantDescription, display_unit
-from ..records import Record
-from .base import (
+from ..record import Record
+from .figure import (
     BLUE,
     GREEN,
     GREY,
@@ -22,12 +22,11 @@ from .base import (
     add_title,
     axis_label,
     colour_of,
-    digits_for,
     draw_episodes,
     new_figure,
-    number,
     thin,
 )
+from .numbers import digits_for, number
 
 
 def identification_figure(

@@ -8,7 +8,7 @@ from typing import Any
 
 import matplotlib.figure
 
-from .base import add_legend, add_title, colour_of, new_figure
+from .figure import add_legend, add_title, colour_of, new_figure
 
 _MARKERS = "osD^vP*X<>hpd"  # as many as share no factor with the colours
 

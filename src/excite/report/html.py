@@ -11,8 +11,8 @@ import matplotlib
 
 from .. import __version__
 from ..files import read_json
-from .base import MAX_POINTS, PAGE_STYLE, at_most
-from .sections.base import Section, paragraph, text
+from .figure import MAX_POINTS, PAGE_STYLE, at_most
+from .sections.elements import Section, paragraph, text
 from .sections.experiment import Experiment, comparison, experiment_section, read_experiment
 from .sections.record import Recorded, read_recorded, record_section
 from .sections.study import StudyRun, common_methods, read_study_run, study_section

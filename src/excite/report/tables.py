@@ -13,7 +13,7 @@ import numpy as np
 
 from ..description import RARE
 from ..files import csv_text
-from .base import digits_for, mean_sd, number
+from .numbers import digits_for, mean_sd, number
 
 
 def table_header(rows: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -6,16 +6,16 @@ experiment; `loop` runs one, both with NumPy alone. Rigs: `simulated`, `quanser`
 needs JAX or an extra is imported by its module's name.
 """
 
-from .base import AbstractPlayer as AbstractPlayer
-from .base import AbstractRig as AbstractRig
-from .base import Pacer as Pacer
-from .base import PolicyPlayer as PolicyPlayer
-from .base import Reading as Reading
-from .base import Recorder as Recorder
-from .base import RigError as RigError
-from .base import Sample as Sample
-from .base import SignalPlayer as SignalPlayer
-from .base import step_seconds as step_seconds
+from .contract import AbstractRig as AbstractRig
+from .contract import Pacer as Pacer
+from .contract import Reading as Reading
+from .contract import RigError as RigError
+from .contract import Sample as Sample
 from .loop import Outcome as Outcome
 from .loop import interruptible as interruptible
 from .loop import run as run
+from .player import AbstractPlayer as AbstractPlayer
+from .player import PolicyPlayer as PolicyPlayer
+from .player import SignalPlayer as SignalPlayer
+from .player import step_seconds as step_seconds
+from .recorder import Recorder as Recorder

@@ -30,7 +30,7 @@ except ImportError:
     fmi: Any = None
 
 from ..description import PlantDescription, names_of
-from .base import AbstractRig, Pacer, Reading, RigError
+from .contract import AbstractRig, Pacer, Reading, RigError
 
 _REAL = ("Real", "Float64", "Float32")
 _FATAL = 4  # the status after which not even the release of a unit may be called

@@ -22,7 +22,9 @@ import numpy as np
 from ..description import Output, display_unit
 from ..files import json_text
 from ..safety import Supervision, Trip, Watch, allowed, check_reading, check_sample, tripped
-from .base import AbstractPlayer, AbstractRig, Reading, Recorder, RigError, Sample
+from .contract import AbstractRig, Reading, RigError, Sample
+from .player import AbstractPlayer
+from .recorder import Recorder
 
 COMPLETE = "complete"
 

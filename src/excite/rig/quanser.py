@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from ..description import PlantDescription
-from .base import AbstractRig, Reading, RigError
+from .contract import AbstractRig, Reading, RigError
 
 try:
     from quanser import hardware  # pyright: ignore[reportMissingImports]

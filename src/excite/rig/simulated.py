@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray
 
 from ..description import names_of
-from ..evaluation import Episodes, scored
+from ..environment import Episodes, scored
 from ..excitation import AbstractExcitation
 from ..plant import AbstractPlant, Params, draw_params
 from ..safety import (
@@ -32,7 +32,7 @@ from ..safety import (
     safe_input,
 )
 from ..simulation import Trajectory, measure, step
-from .base import AbstractRig, Pacer, Reading
+from .contract import AbstractRig, Pacer, Reading
 
 
 class BodyState(eqx.Module):

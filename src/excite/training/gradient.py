@@ -23,21 +23,18 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, Key, PRNGKeyArray
 
-from ..env import Env, EnvState
+from ..environment import Env, EnvState
 from ..policy import Layout, Weights, forward, observe
 from ..safety import watched_levels
-from .base import (
-    Checkpoint,
-    OnBoundary,
-    Trained,
+from .checkpoint import Checkpoint, OnBoundary, Trained
+from .settings import (
     check_counts,
     check_fractions,
     check_not_negative,
     check_positive,
     check_widths,
-    look,
-    watch_keys,
 )
+from .validation import look, watch_keys
 
 
 @dataclass(frozen=True)

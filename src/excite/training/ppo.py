@@ -20,10 +20,12 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-from ..env import Env
-from ..gymnasium_env import ExperimentVectorEnv
+from ..environment import Env
+from ..environment.gymnasium import ExperimentVectorEnv
 from ..policy import Weights
-from .base import Checkpoint, OnBoundary, PPOSettings, Trained, look
+from .checkpoint import Checkpoint, OnBoundary, Trained
+from .settings import PPOSettings
+from .validation import look
 
 
 class BatchedVecEnv(VecEnv):

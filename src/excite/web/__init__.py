@@ -1,7 +1,7 @@
 """The bench page: choose an excitation, watch the identification happen, keep the result.
 
 This process serves and computes nothing: it loads neither JAX nor a plant, so that the page
-opens at once. `worker` processes call `excite.live` and tell what they find, event by event.
+opens at once. `worker` processes call `excite.web.jobs` and tell what they find, event by event.
 `base` holds the nouns, `security` guards every request, `streams`, `places`, `runs` and
 `trainings` answer them.
 """
@@ -27,11 +27,12 @@ from starlette.responses import FileResponse, JSONResponse
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
-from .base import MAX_BODY, RefusedError, Sessions, Settings
 from .places import routes as place_routes
+from .requests import MAX_BODY, RefusedError
 from .runs import routes as run_routes
 from .runs import run_of
 from .security import Guard, is_loopback
+from .sessions import Sessions, Settings
 from .streams import routes as stream_routes
 from .trainings import Training
 from .trainings import routes as training_routes

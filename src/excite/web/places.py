@@ -13,7 +13,8 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
 
-from .base import MAX_STORED, MAX_UPLOAD, Pool, RefusedError, Session
+from .requests import MAX_UPLOAD, RefusedError
+from .sessions import MAX_STORED, Pool, Session
 
 _MAX_NAME = 200  # bytes of a file's name
 _SILENCE = 30.0  # seconds without a part of a file

@@ -19,7 +19,7 @@ from starlette.responses import FileResponse, JSONResponse
 from starlette.routing import Route
 
 from ..files import folder_word
-from .base import RefusedError, without_folders
+from .requests import RefusedError, without_folders
 
 _TYPES = {
     ".png": "image/png",

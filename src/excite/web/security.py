@@ -25,7 +25,8 @@ from starlette.requests import ClientDisconnect
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from .base import RefusedError, Session, Sessions, Settings
+from .requests import RefusedError
+from .sessions import Session, Sessions, Settings
 
 MAX_TRIES = 10
 """Wrong tokens in a minute, from one address."""

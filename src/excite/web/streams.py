@@ -17,7 +17,8 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, StreamingResponse
 from starlette.routing import Route
 
-from .base import MAX_STEPS, Pool, RefusedError, Session, number, numbers, texts, whole, word
+from .requests import MAX_STEPS, RefusedError, number, numbers, texts, whole, word
+from .sessions import Pool, Session
 
 FRAME = 0.04
 """Seconds between two parts of a stream."""
@@ -61,7 +62,7 @@ def routes(pool: Pool, body: Callable[[Request], Any]) -> list[Route]:
 
 
 def _experiment(asked: Mapping[str, Any]) -> Event:
-    """An experiment as `excite.live` takes it: checked names and numbers, nothing else."""
+    """An experiment as `excite.web.jobs` takes it: checked names and numbers, nothing else."""
     others = asked.get("others")
     if not isinstance(others, list) or len(others) > 2:
         raise RefusedError(400, "others: at most two excitations can be compared")

@@ -21,7 +21,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse
 from starlette.routing import Route
 
-from .base import RefusedError, number, whole, without_folders, word
+from .requests import RefusedError, number, whole, without_folders, word
 
 MAX_TRAININGS = 2
 _PATIENCE = 10.0  # seconds for a training to end when it is interrupted

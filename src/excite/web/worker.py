@@ -19,7 +19,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from ..files import json_ready
-from .base import without_folders
+from .requests import without_folders
 
 _MAX_SENTENCE = 1000  # characters; a file's content may be quoted in it
 
@@ -34,7 +34,7 @@ def _answer() -> None:
     with os.fdopen(os.dup(1), "w", encoding="utf-8", errors="replace") as out:
         os.dup2(2, 1)  # whatever a library prints is no event
         os.nice(5)  # the server comes first: a stream has to flow while others compute
-        live = importlib.import_module("excite.live")
+        live = importlib.import_module("excite.web.jobs")
         limit = int(sys.argv[1])
         resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
         _write(out, {"kind": "ready"})

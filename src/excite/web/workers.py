@@ -19,7 +19,7 @@ from collections.abc import AsyncGenerator, Mapping
 from pathlib import Path
 from typing import Any
 
-from .base import RefusedError
+from .requests import RefusedError
 
 _LOG = logging.getLogger(__name__)
 GRACE = 0.5
@@ -35,7 +35,7 @@ _ONE = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NPROC", "
 
 
 class Workers:
-    """Processes that answer calls of functions of `excite.live`."""
+    """Processes that answer calls of functions of `excite.web.jobs`."""
 
     def __init__(self, num_workers: int, cache: Path | None) -> None:
         self._num_workers, self._environment = num_workers, _environment(cache)

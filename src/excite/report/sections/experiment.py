@@ -12,16 +12,16 @@ import numpy as np
 
 from ...description import RARE, PlantDescription, display_unit, names_of
 from ...files import read_columns, read_json
-from ...records import Record
-from ..base import number
+from ...record import Record
 from ..figures import (
     autocorrelation_figure,
     correlation_figure,
     episode_figure,
     identification_figure,
 )
+from ..numbers import number
 from ..tables import largest_correlation, parameter_cells, parameter_header, residual_cells
-from .base import (
+from .elements import (
     Section,
     bullets,
     command,

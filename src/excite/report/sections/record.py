@@ -9,9 +9,9 @@ from typing import Any
 
 from ...description import PlantDescription
 from ...files import read_json
-from ...records import RECORD_KIND, Record
+from ...record import RECORD_KIND, Record
 from ..figures import episode_figure
-from .base import (
+from .elements import (
     Section,
     facts,
     figure,

@@ -11,19 +11,12 @@ import numpy as np
 
 from ...description import PlantDescription, names_of
 from ...files import folder_word, numbers_of, read_columns, read_json
-from ...records import Record
+from ...record import Record
 from ..figures import benchmark_figure
 from ..frontier import frontier_figure, lengths_figure
-from ..study import Curve, agents_figure, curves_figure
-from ..tables import (
-    DIFFERENCES,
-    all_cells,
-    differences_cells,
-    footnotes,
-    table_cells,
-    table_header,
-)
-from .base import (
+from ..study_figures import Curve, agents_figure, curves_figure
+from ..tables import DIFFERENCES, all_cells, differences_cells, footnotes, table_cells, table_header
+from .elements import (
     Section,
     bullets,
     command,

@@ -1,0 +1,70 @@
+"""Scoring an excitation: many experiments, each on a plant of its own.
+
+The only way anything is scored here, signals and policies alike: the plant and the noise
+of an episode depend on its key alone.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key, PRNGKeyArray
+
+from ..excitation import AbstractExcitation
+from ..information import cramer_rao_bound, experiment_information, relative_size
+from ..plant import AbstractPlant, Params, draw_params
+from ..safety import critical_levels, is_violation, max_abs_output
+from ..simulation import Trajectory, run_episode
+
+
+class Episodes(eqx.Module):
+    """A batch of evaluation episodes of one method; the leading axis is the episode.
+
+    Attributes:
+        params: true parameters.
+        trajectory: inputs and outputs.
+        is_violation: whether the critical level was reached.
+        max_abs_output: largest magnitude of each output.
+        information: relative Fisher information of each episode's inputs.
+        bound: least relative standard deviation of each parameter (Cramér-Rao).
+    """
+
+    params: Params
+    trajectory: Trajectory
+    is_violation: Array
+    max_abs_output: Float[Array, "*episode output"]
+    information: Float[Array, "*episode param param"]
+    bound: Float[Array, "*episode param"]
+
+
+@eqx.filter_jit
+def run_episodes(
+    plant: AbstractPlant,
+    excitation: AbstractExcitation,
+    num_steps: int,
+    spread: float,
+    keys: Key[Array, " episode"],
+) -> Episodes:
+    """One episode a key. The plant and the noise of a key are the same for any excitation."""
+
+    def episode(key: PRNGKeyArray) -> Episodes:
+        params_key, episode_key = jax.random.split(key)
+        params = draw_params(plant, params_key, spread)
+        return scored(plant, params, run_episode(plant, params, excitation, num_steps, episode_key))
+
+    return jax.vmap(episode)(keys)
+
+
+def scored(plant: AbstractPlant, params: Params, trajectory: Trajectory) -> Episodes:
+    """One experiment, and how informative and how safe it was."""
+    information = experiment_information(plant, params, trajectory.inputs)
+    relative = relative_size(plant, params) / jnp.abs(jnp.stack(params))
+    return Episodes(
+        params=params,
+        trajectory=trajectory,
+        is_violation=is_violation(trajectory.outputs, critical_levels(plant.definition)),
+        max_abs_output=max_abs_output(trajectory.outputs),
+        information=information,
+        bound=cramer_rao_bound(information) * relative,
+    )

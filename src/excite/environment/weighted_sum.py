@@ -1,0 +1,77 @@
+"""Several objectives at once."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from ..plant import AbstractPlant, Params
+from .objective import AbstractObjective, Sample
+
+
+class SumMemory(eqx.Module):
+    """Memories of the terms, and what each was rewarded so far."""
+
+    terms: tuple[Any, ...]
+    gained: Float[Array, " term"]
+
+
+class WeightedSum(AbstractObjective):
+    """Information and errors, several criteria or several estimators: each by its weight.
+
+    Attributes:
+        terms: objectives; the weight of each is its own.
+    """
+
+    terms: tuple[AbstractObjective, ...] = eqx.field(converter=tuple)
+
+    def __check_init__(self) -> None:
+        """Raises ValueError where there is nothing to add."""
+        if not self.terms:
+            raise ValueError("a sum of objectives needs at least one")
+
+    def init(self, plant: AbstractPlant, measured: Float[Array, " output"]) -> SumMemory:
+        """Of every term."""
+        memories = tuple(term.init(plant, measured) for term in self.terms)
+        return SumMemory(memories, jnp.zeros(len(memories)))
+
+    def update(
+        self, plant: AbstractPlant, memory: SumMemory, sample: Sample, k: Int[Array, ""]
+    ) -> tuple[SumMemory, Float[Array, ""]]:
+        """Every term one step on, and the sum of their gains."""
+        pairs = zip(self.terms, memory.terms, strict=True)
+        memories, gains = zip(*(t.update(plant, own, sample, k) for t, own in pairs), strict=True)
+        return SumMemory(memories, memory.gained + jnp.stack(gains)), sum(gains, jnp.zeros(()))
+
+    def final(self, plant: AbstractPlant, memory: SumMemory, params: Params) -> Float[Array, ""]:
+        """The sum of what the terms add at the end."""
+        return jnp.sum(self._finals(plant, memory, params))
+
+    def relative_errors(
+        self, plant: AbstractPlant, memory: SumMemory, params: Params
+    ) -> Float[Array, " param"]:
+        """As the first term knows them."""
+        return self.terms[0].relative_errors(plant, memory.terms[0], params)
+
+    def outcome(
+        self, plant: AbstractPlant, memory: SumMemory, params: Params, worth: Float[Array, ""]
+    ) -> tuple[Any, ...]:
+        """Of every term, which got its own part of the rewards."""
+        del worth
+        parts = memory.gained + self._finals(plant, memory, params)
+        of_terms = zip(self.terms, memory.terms, parts, strict=True)
+        return tuple(term.outcome(plant, own, params, part) for term, own, part in of_terms)
+
+    def of_batch(self, outcomes: tuple[Any, ...]) -> Float[Array, ""]:
+        """The sum of what the terms make of the batch."""
+        values = [term.of_batch(own) for term, own in zip(self.terms, outcomes, strict=True)]
+        return sum(values, jnp.zeros(()))
+
+    def _finals(
+        self, plant: AbstractPlant, memory: SumMemory, params: Params
+    ) -> Float[Array, " term"]:
+        pairs = zip(self.terms, memory.terms, strict=True)
+        return jnp.stack([term.final(plant, own, params) for term, own in pairs])

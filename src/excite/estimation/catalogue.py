@@ -1,0 +1,42 @@
+"""Estimators by name."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from ..description import unknown, with_options
+from .arx import ARX
+from .contract import AbstractEstimator
+from .decrement import Decrement
+from .nls import NLS
+
+ESTIMATORS: Mapping[str, AbstractEstimator] = {
+    "arx-rls": ARX(),
+    "arx-rls-wide": ARX(start_covariance=1e8, name="arx-rls-wide"),
+    "nls": NLS(),
+    "decrement": Decrement(),
+}
+
+
+def estimator_named(name: str, options: Mapping[str, Any] | None = None) -> AbstractEstimator:
+    """An estimator by name, with other options where given.
+
+    Raises:
+        ValueError: for an unknown name or option, or a value that is not allowed.
+    """
+    if name not in ESTIMATORS:
+        raise unknown("estimator", name, ESTIMATORS)
+    default = ESTIMATORS[name]
+    if not options:
+        return default
+    estimator = with_options(default, name, options)
+    for option in ("start_covariance", "forgetting_factor", "tolerance", "max_steps"):
+        value = float(getattr(estimator, option, 1.0))
+        if not 0 < value < math.inf:
+            raise ValueError(f"{option} of {name!r} must be positive: got {options[option]!r}")
+    if float(getattr(estimator, "forgetting_factor", 1.0)) > 1:
+        got = options["forgetting_factor"]
+        raise ValueError(f"forgetting_factor of {name!r} must be at most 1: got {got!r}")
+    return estimator

@@ -1,0 +1,236 @@
+"""The contract of an estimator: from experiments to parameters with a covariance.
+
+Estimators are pure: failure is a `Status`, counted by a benchmark and turned into a
+sentence at the door.
+"""
+
+from __future__ import annotations
+
+import abc
+import enum
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from ..description import PlantDescription
+from ..information import relative_size
+from ..plant import AbstractPlant, Params
+from ..simulation import response
+
+
+class Status(enum.IntEnum):
+    """How an estimation ended; anything but SUCCESSFUL is a failed estimate."""
+
+    SUCCESSFUL = 0
+    ILL_CONDITIONED = 1
+    UNPHYSICAL = 2
+    NOT_FINITE = 3
+    ITERATIONS_EXHAUSTED = 4
+
+    @property
+    def sentence(self) -> str:
+        """The status in words."""
+        return {
+            Status.SUCCESSFUL: "successful",
+            Status.ILL_CONDITIONED: "the data do not determine all parameters",
+            Status.UNPHYSICAL: "the ARX model has no physical counterpart "
+            "(a pole is negative real or not inside the unit circle, or a parameter negative)",
+            Status.NOT_FINITE: "the estimate is not finite",
+            Status.ITERATIONS_EXHAUSTED: "the search did not converge",
+        }[self]
+
+
+class Experiments(eqx.Module):
+    """One or several experiments of one plant, padded to one length.
+
+    Attributes:
+        inputs: row k is held from sample k to k + 1.
+        measured: measured outputs.
+        valid: False where an experiment was padded.
+        initial_state: known, or where the search for it begins.
+        initial_state_known: False where it is estimated along.
+    """
+
+    inputs: Float[Array, "experiment time input"]
+    measured: Float[Array, "experiment sample output"]
+    valid: Bool[Array, "experiment sample"]
+    initial_state: Float[Array, "experiment state"]
+    initial_state_known: bool = eqx.field(static=True)
+
+
+def stack_experiments(
+    plant: AbstractPlant,
+    inputs: Sequence[Float[Array, "_time input"]],
+    measured: Sequence[Float[Array, "_samples output"]],
+    initial_state_known: bool,
+) -> Experiments:
+    """Experiments of any lengths side by side; each has one more output than inputs."""
+    longest = max(len(u) for u in inputs)
+
+    def padded(rows: Array, length: int) -> Array:
+        return jnp.pad(jnp.asarray(rows, float), ((0, length - len(rows)), (0, 0)))
+
+    counts = jnp.asarray([len(y) for y in measured])
+    return Experiments(
+        inputs=jnp.stack([padded(u, longest) for u in inputs]),
+        measured=jnp.stack([padded(y, longest + 1) for y in measured]),
+        valid=jnp.arange(longest + 1)[None] < counts[:, None],
+        initial_state=jnp.tile(plant.initial_state, (len(inputs), 1)),
+        initial_state_known=initial_state_known,
+    )
+
+
+class Estimate(eqx.Module):
+    """What an estimator returns.
+
+    Attributes:
+        params: estimated parameters.
+        covariance: of `params` (held parameters: zero rows).
+        information: inverse covariance of relative changes: logarithms of positive
+            parameters, free ones over their scale.
+        status: a `Status`.
+        initial_state: known or estimated.
+        residual: measured minus simulated outputs, zero where padded.
+    """
+
+    params: Params
+    covariance: Float[Array, "param param"]
+    information: Float[Array, "param param"]
+    status: Int[Array, ""]
+    initial_state: Float[Array, "experiment state"]
+    residual: Float[Array, "experiment sample output"]
+
+
+class AbstractEstimator(eqx.Module):
+    """Base of all estimators; `name` is its word on the command line."""
+
+    name: eqx.AbstractVar[str]
+
+    @abc.abstractmethod
+    def __call__(
+        self,
+        plant: AbstractPlant,
+        experiments: Experiments,
+        start: Params | None = None,
+        free: Bool[Array, " param"] | None = None,
+    ) -> Estimate:
+        """Estimate of the plant's parameters.
+
+        Args:
+            plant: its constants, sensor and sampling time are taken as known.
+            experiments: the data.
+            start: where a search begins, default the nominal parameters.
+            free: False for a parameter that is held at `start`; default all free.
+        """
+
+
+def simulate_experiments(
+    plant: AbstractPlant,
+    params: Params,
+    experiments: Experiments,
+    initial_state: Float[Array, "experiment state"],
+) -> Float[Array, "experiment sample output"]:
+    """Noise-free outputs of all experiments for one set of parameters."""
+    return jax.vmap(response, in_axes=(None, None, 0, 0))(
+        plant, params, experiments.inputs, initial_state
+    )
+
+
+def residual_of(
+    experiments: Experiments, simulated: Float[Array, "experiment sample output"]
+) -> Float[Array, "experiment sample output"]:
+    """Measured minus simulated outputs, zero where padded."""
+    return jnp.where(experiments.valid[..., None], experiments.measured - simulated, 0.0)
+
+
+def status_of(plant: AbstractPlant, params: Params, status: Int[Array, ""]) -> Int[Array, ""]:
+    """The status of an estimate, of its parameters' signs and finiteness too."""
+    values = jnp.stack(params)
+    positive = np.array([p.positive for p in plant.definition.parameters])
+    status = jnp.where(jnp.any(positive & (values <= 0)), Status.UNPHYSICAL, status)
+    finite = jnp.all(jnp.isfinite(values))
+    return jnp.where(finite, status, Status.NOT_FINITE)
+
+
+def relative_information(
+    plant: AbstractPlant, params: Params, covariance: Float[Array, "param param"]
+) -> Float[Array, "param param"]:
+    """Information of relative changes, as an estimate has it, from a covariance of `params`."""
+    size = relative_size(plant, params)
+    return jnp.linalg.inv(covariance / jnp.outer(size, size))
+
+
+class _Bounds:
+    """Bounds of all parameters in units of relative change: logarithms, or over the scale."""
+
+    def __init__(self, description: PlantDescription) -> None:
+        parts = description.parameters
+        self.positive = np.array([p.positive for p in parts])
+        self.scale = np.array([1.0 if p.positive else p.scale for p in parts])
+
+        def relative(value: float | None, positive: bool, scale: float) -> float:
+            if value is None:
+                return np.nan
+            return float(np.log(value)) if positive else value / scale
+
+        pairs = list(zip(parts, self.scale, strict=True))
+        lower = np.array([relative(p.lower, p.positive, scale) for p, scale in pairs])
+        upper = np.array([relative(p.upper, p.positive, scale) for p, scale in pairs])
+        self.has_lower, self.has_upper = np.isfinite(lower), np.isfinite(upper)
+        self.both = self.has_lower & self.has_upper
+        self.lower, self.upper = np.nan_to_num(lower), np.nan_to_num(upper)
+        self.width = np.where(self.both, self.upper - self.lower, 1.0)
+
+    def relative(self, values: Array) -> Array:
+        """Logarithms of positive parameters, free ones over their scale."""
+        logarithm = jnp.log(jnp.where(self.positive, values, 1.0))
+        return jnp.where(self.positive, logarithm, values / self.scale)
+
+
+def to_search(description: PlantDescription, params: Params) -> Float[Array, " param"]:
+    """Search coordinates: log of positive parameters, free ones over their scale.
+
+    A bounded parameter passes through a logistic function as well (a soft ramp, where it
+    has one bound only), so that the search never leaves its bounds.
+    """
+    b = _Bounds(description)
+    c = b.relative(jnp.stack([jnp.asarray(p, float) for p in params]))
+    fraction = jnp.where(b.both, (c - b.lower) / b.width, 0.5)
+    between = b.width / 4 * (jnp.log(fraction) - jnp.log1p(-fraction))
+    above = jnp.where(b.has_lower, c - b.lower, 1.0)
+    below = jnp.where(b.has_upper, b.upper - c, 1.0)
+    one_sided = jnp.where(b.has_lower, _inverse_ramp(above), -_inverse_ramp(below))
+    bounded = jnp.where(b.both, between, one_sided)
+    return jnp.where(b.has_lower | b.has_upper, bounded, c)
+
+
+def _inverse_ramp(value: Array) -> Array:
+    """Inverse of log(1 + exp(x)), the soft ramp."""
+    return value + jnp.log(-jnp.expm1(-value))
+
+
+def from_search(description: PlantDescription, z: Float[Array, " param"]) -> Array:
+    """Parameters, as a vector, at search coordinates `z`; the inverse of `to_search`."""
+    b = _Bounds(description)
+    between = b.lower + b.width * jax.nn.sigmoid(4 * z / b.width)
+    one_sided = jnp.where(b.has_lower, b.lower + jax.nn.softplus(z), b.upper - jax.nn.softplus(-z))
+    bounded = jnp.where(b.both, between, one_sided)
+    c = jnp.where(b.has_lower | b.has_upper, bounded, z)
+    return jnp.where(b.positive, jnp.exp(jnp.where(b.positive, c, 0.0)), c * b.scale)
+
+
+def bound_reached(description: PlantDescription, params: Params) -> tuple[int, float] | None:
+    """Index and bound of the first parameter that ended at one; None where none did."""
+    b = _Bounds(description)
+    c = np.asarray(b.relative(jnp.stack([jnp.asarray(p, float) for p in params])))
+    for i, p in enumerate(description.parameters):
+        margin = 1e-3 * b.width[i]
+        if p.lower is not None and c[i] - b.lower[i] < margin:
+            return i, p.lower
+        if p.upper is not None and b.upper[i] - c[i] < margin:
+            return i, p.upper
+    return None

@@ -1,0 +1,360 @@
+"""From recorded experiments to parameters with confidence: the everyday job."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ..description import RARE, PlantDescription, names_of
+from ..files import json_ready
+from ..information import identifiability, relative_size, worst_seen
+from ..plant import AbstractPlant, Params, params_from
+from ..record import Record
+from .contract import (
+    AbstractEstimator,
+    Estimate,
+    Experiments,
+    Status,
+    bound_reached,
+    stack_experiments,
+)
+from .diagnosis import (
+    chance_of_fit,
+    fit_percent,
+    input_dependence,
+    ljung_box,
+    robust_covariance,
+    widened,
+)
+from .nls import NLS
+from .result import Fitted, Identification
+
+InitialState = Literal["auto", "free", "known"]
+_NOTHING_SEEN = (
+    "no parameter can be seen in the data; are columns, signs and units right, and does the "
+    "input move the plant beyond the noise? or has the search begun too far from the truth "
+    "(--start)?"
+)
+_BY_CHANCE = 1e-3  # a fit that chance would reach more often explains nothing
+
+
+def identify(
+    plant: AbstractPlant,
+    records: Sequence[Record],
+    estimator: AbstractEstimator | None = None,
+    *,
+    start: Mapping[str, float] | None = None,
+    initial_state: InitialState = "auto",
+    validation: Sequence[Record] = (),
+) -> Identification:
+    """Parameters of one plant from one or several records.
+
+    Args:
+        plant: its constants and sensor are taken as known; its dt gives way to the records'.
+        records: all with one sampling time.
+        estimator: default `NLS()`.
+        start: where the search begins, by name; default the nominal parameters.
+        initial_state: "known" (the plant's), "free" (estimated along), or "auto": known
+            where every sidecar says so.
+        validation: records for which only the initial state is fitted.
+
+    Raises:
+        ValueError: for records too short, of different sampling times, or in which no
+            parameter can be seen, and for a start or a held value that is not allowed.
+    """
+    estimator = NLS() if estimator is None else estimator
+    if initial_state not in get_args(InitialState):
+        raise ValueError(f"initial state {initial_state!r} is not one of: known, free, auto")
+    known = initial_state == "known" or (
+        initial_state == "auto" and all(_starts_at(record, plant) for record in records)
+    )
+    _check_lengths(plant, [*records, *validation], known)
+    plant = plant.changed(dt=_common_dt(plant, [*records, *validation]))
+    experiments = _experiments(plant, records, known)
+    fit = _fit(plant, experiments, estimator, params_from(plant, start or {}))
+    residual = _residuals(plant, records, experiments, estimator, fit)
+    fitted = tuple(_fitted(plant.definition, *pair) for pair in zip(records, residual, strict=True))
+    if isinstance(estimator, NLS) and fit.estimate.status != Status.NOT_FINITE:
+        _require_explanation(records, residual, int(fit.free.sum()))
+    whiteness = {
+        name: _whiteness([r[:, i] for r in residual], plant.definition.outputs[i].scale)
+        for i, name in enumerate(names_of(plant.definition.outputs))
+    }
+    structure = {
+        name: _dependence(residual, records, i, plant.definition.outputs[i].scale)
+        for i, name in enumerate(whiteness)
+    }
+    covariance, verdict = _confidence(plant, experiments, estimator, fit, whiteness)
+    wrong = _wrong_structure(structure, estimator) if fit.is_successful else ()
+    verdict = (*wrong, *verdict)
+    verdict += tuple(s for record in [*records, *validation] for s in _other_plant(record, plant))
+    names, d = names_of(plant.definition.parameters), plant.description
+    sd = np.where(fit.free, np.sqrt(np.maximum(np.diag(covariance), 0.0)), np.nan)
+    return Identification(
+        plant=d,
+        estimator=estimator.name,
+        status=fit.status,
+        params={n: float(v) for n, v in zip(names, fit.estimate.params, strict=True)},
+        std_error={n: float(v) for n, v in zip(names, sd, strict=True)},
+        held=tuple(n for n, is_free in zip(names, fit.free, strict=True) if not is_free),
+        covariance=covariance,
+        information=np.asarray(fit.estimate.information),
+        whiteness=whiteness,
+        structure=structure,
+        verdict=verdict,
+        fitted=fitted,
+        validation=tuple(_validated(plant, record, fit.estimate.params) for record in validation),
+        initial_state_known=known,
+    )
+
+
+def _starts_at(record: Record, plant: AbstractPlant) -> bool:
+    """Whether the sidecar says that the record starts at this plant's initial state."""
+    states = record.metadata.get("plant", {}).get("states", [])
+    initial = [s.get("initial") for s in states]
+    return record.starts_at_initial_state and initial == plant.initial_state.tolist()
+
+
+def _other_plant(record: Record, plant: AbstractPlant) -> tuple[str, ...]:
+    """A sentence where the sidecar says that the record is of a plant with other constants."""
+    made_with, own = record.metadata.get("plant", {}), json_ready(plant.description.to_dict())
+    if all(made_with.get(key, own[key]) == own[key] for key in ("name", "constants")):
+        return ()
+    return (
+        f"{record.source} is of plant {made_with.get('name')!r} with other known constants "
+        f"than {own['name']!r}, according to its sidecar",
+    )
+
+
+def _check_lengths(plant: AbstractPlant, records: Sequence[Record], known: bool) -> None:
+    d = plant.definition
+    unknowns = len(d.parameters) + (0 if known else len(d.states))
+    needed = max(10, -(-3 * unknowns // len(d.outputs)))
+    for record in records:
+        if len(record.time) < needed:
+            raise ValueError(
+                f"{record.source}: {len(record.time)} samples are too short a record; "
+                f"{needed} or more are needed for {unknowns} unknowns"
+            )
+
+
+def _common_dt(plant: AbstractPlant, records: Sequence[Record]) -> float:
+    """The records' sampling time [s], freed of rounding: it enters the plant's hash."""
+    first, own = records[0], float(plant.dt)
+    for record in records[1:]:
+        if abs(record.dt - first.dt) > 1e-3 * first.dt:
+            raise ValueError(
+                f"{record.source} is sampled every {record.dt:g} s and {first.source} every "
+                f"{first.dt:g} s; records fitted together need one sampling time"
+            )
+    return own if abs(first.dt - own) < 1e-6 * own else float(f"{first.dt:.6g}")
+
+
+def _experiments(plant: AbstractPlant, records: Sequence[Record], known: bool) -> Experiments:
+    inputs = [jnp.asarray(r.inputs[:-1]) for r in records]
+    return stack_experiments(plant, inputs, [jnp.asarray(r.outputs) for r in records], known)
+
+
+def _known(plant: AbstractPlant, estimator: AbstractEstimator) -> np.ndarray:
+    """Which parameters the estimator holds because they are known; ValueError where all are."""
+    names = names_of(plant.definition.parameters)
+    held = estimator.held(plant) if isinstance(estimator, NLS) else (False,) * len(names)
+    if all(held):
+        raise ValueError("every parameter is held; nothing is left to estimate")
+    return np.array(held)
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """An estimate, which parameters were free or known, and a sentence for each held one."""
+
+    estimate: Estimate
+    free: np.ndarray
+    known: np.ndarray
+    reasons: tuple[str, ...]
+
+    @property
+    def is_successful(self) -> bool:
+        return int(self.estimate.status) == Status.SUCCESSFUL
+
+    @property
+    def status(self) -> str:
+        if self.is_successful and not (self.free | self.known).all():
+            return "partly identifiable"
+        return Status(int(self.estimate.status)).name.lower().replace("_", " ")
+
+
+def _fit(
+    plant: AbstractPlant,
+    experiments: Experiments,
+    estimator: AbstractEstimator,
+    start: Params,
+) -> _Fit:
+    """Fits; what could not be seen on the way is looked at again from where the search ended.
+
+    Far from the truth a search can get stuck where the data seem to say nothing.
+    """
+    fit = _fit_seen(plant, experiments, estimator, start)
+    if not (fit.reasons and fit.is_successful):
+        return fit
+    again = _fit_seen(plant, experiments, estimator, fit.estimate.params)
+    return again if again.is_successful and again.free.sum() > fit.free.sum() else fit
+
+
+def _fit_seen(
+    plant: AbstractPlant,
+    experiments: Experiments,
+    estimator: AbstractEstimator,
+    start: Params,
+) -> _Fit:
+    """Fits; holds what ends at a bound or cannot be seen, and fits again."""
+    names = names_of(plant.definition.parameters)
+    known = _known(plant, estimator)
+    free, reasons = ~known, ()
+    while True:
+        estimate = estimator(plant, experiments, start, jnp.asarray(free))
+        fit = _Fit(estimate, free, known, reasons)
+        # ARX estimates all parameters or none.
+        if not isinstance(estimator, NLS) or estimate.status == Status.NOT_FINITE:
+            return fit
+        held = _to_hold(plant, fit, start)
+        if held is None:
+            return fit
+        chosen, value, why = held
+        start = start._replace(**{names[chosen]: jnp.asarray(value, float)})
+        free = free & (np.arange(len(names)) != chosen)
+        reasons = (*reasons, why)
+        if not free.any():
+            raise ValueError(_NOTHING_SEEN)
+
+
+def _to_hold(plant: AbstractPlant, fit: _Fit, start: Params) -> tuple[int, float, str] | None:
+    """The parameter to hold next, its value, and why in words; None where all is well."""
+    names = names_of(plant.definition.parameters)
+    reached = bound_reached(plant.definition, fit.estimate.params)
+    if reached is not None and fit.free[reached[0]]:
+        name, value = names[reached[0]], float(fit.estimate.params[reached[0]])
+        return reached[0], value, f"{name} ended at its bound {reached[1]:g} and was held there"
+    unseen = worst_seen(names, np.asarray(fit.estimate.information), fit.free)
+    if unseen is None:
+        return None
+    value = float(start[unseen[0]])
+    why = f"{unseen[1]}; {names[unseen[0]]} was held at {value:g}"
+    return unseen[0], value, why + (", and the rest holds for that" if "apart" in why else "")
+
+
+def _residuals(
+    plant: AbstractPlant,
+    records: Sequence[Record],
+    experiments: Experiments,
+    estimator: AbstractEstimator,
+    fit: _Fit,
+) -> list[Float[np.ndarray, "sample output"]]:
+    """Measured minus simulated outputs of each record, at its own length."""
+    estimate = fit.estimate
+    knows_state = experiments.initial_state_known or isinstance(estimator, NLS)
+    if fit.is_successful and not knows_state:  # judge ARX fairly, too
+        estimate = _with_initial_state(plant, experiments, estimate.params)
+    residual = np.asarray(estimate.residual)
+    return [residual[i, : len(record.time)] for i, record in enumerate(records)]
+
+
+def _with_initial_state(plant: AbstractPlant, experiments: Experiments, params: Params) -> Estimate:
+    """The best initial states for given parameters."""
+    return NLS()(plant, experiments, params, jnp.zeros(len(params), bool))
+
+
+def _confidence(
+    plant: AbstractPlant,
+    experiments: Experiments,
+    estimator: AbstractEstimator,
+    fit: _Fit,
+    whiteness: Mapping[str, float],
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Covariance of the estimates, and the verdict in words."""
+    covariance = np.asarray(fit.estimate.covariance)
+    if not fit.is_successful:
+        return covariance, (*fit.reasons, Status(int(fit.estimate.status)).sentence)
+    names = names_of(plant.definition.parameters)
+    size = np.asarray(relative_size(plant, fit.estimate.params))
+    remarks = ()
+    coloured = [name for name, p in whiteness.items() if p < RARE]
+    if coloured and isinstance(estimator, NLS):
+        S, residual = estimator.sensitivity(plant, experiments, fit.estimate, jnp.asarray(fit.free))
+        robust = robust_covariance(np.asarray(S), np.asarray(residual))
+        robust = np.outer(size, size) * robust[: len(names), : len(names)]
+        covariance = widened(covariance, robust)
+        remarks = ("the intervals allow for coloured noise, not for another plant",)
+    elif coloured:
+        remarks = ("the intervals assume that it is, and are too narrow",)
+    remarks = tuple(
+        f"the residual of {' and '.join(coloured)} is not white: {remark}" for remark in remarks
+    )
+    seen = identifiability(names, covariance / np.outer(size, size), fit.free)
+    return covariance, (*fit.reasons, seen, *remarks)
+
+
+def _fitted(description: PlantDescription, record: Record, residual: np.ndarray) -> Fitted:
+    simulated = record.outputs - residual
+    fits = {
+        name: fit_percent(record.outputs[:, i], simulated[:, i])
+        for i, name in enumerate(names_of(description.outputs))
+    }
+    return Fitted(record, simulated, fits)
+
+
+def _whiteness(residuals: list[np.ndarray], scale: float) -> float:
+    """p-value of white residuals; not a number where only rounding is left of them."""
+    return ljung_box(*(r for r in residuals if _is_more_than_rounding(r, scale)))
+
+
+def _is_more_than_rounding(residual: np.ndarray, scale: float) -> bool:
+    return bool(np.abs(residual).max() > 1e-8 * scale)
+
+
+def _dependence(
+    residual: Sequence[np.ndarray], records: Sequence[Record], output: int, scale: float
+) -> float:
+    """p-value of an output's residual not following the input; see `_whiteness`."""
+    pairs = [(r[:, output], record.inputs) for r, record in zip(residual, records, strict=True)]
+    pairs = [(r, inputs) for r, inputs in pairs if _is_more_than_rounding(r, scale)]
+    return input_dependence([r for r, _ in pairs], [inputs for _, inputs in pairs])
+
+
+def _wrong_structure(
+    structure: Mapping[str, float], estimator: AbstractEstimator
+) -> tuple[str, ...]:
+    """A sentence where a residual follows the input."""
+    wrong = [name for name, p in structure.items() if p < RARE]
+    if not wrong:
+        return ()
+    or_biased = "" if isinstance(estimator, NLS) else "; or the estimator is biased: try nls"
+    return (
+        f"the residual of {' and '.join(wrong)} follows the input: the structure of this plant is "
+        "wrong for these data, or time, input or sensor are not what it takes them for; no "
+        f"interval covers that{or_biased}",
+    )
+
+
+def _require_explanation(
+    records: Sequence[Record], residual: Sequence[np.ndarray], unknowns: int
+) -> None:
+    """Raises where the best simulation follows the outputs no better than chance does."""
+    chances = [
+        chance_of_fit(record.outputs[:, i], r[:, i], unknowns)
+        for record, r in zip(records, residual, strict=True)
+        for i in range(r.shape[1])
+    ]
+    if min(chances) > _BY_CHANCE:
+        raise ValueError(_NOTHING_SEEN)
+
+
+def _validated(plant: AbstractPlant, record: Record, params: Params) -> Fitted:
+    """A record beside its simulation; only its initial state is fitted."""
+    estimate = _with_initial_state(plant, _experiments(plant, [record], False), params)
+    return _fitted(plant.definition, record, np.asarray(estimate.residual[0]))

@@ -1,0 +1,156 @@
+"""What an identification is, and the run folder it leaves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from .. import __version__
+from ..description import HALF_95, PlantDescription, names_of
+from ..files import csv_text, new_run_folder, write_json
+from ..record import Record, write_record
+from .diagnosis import correlation, fit_percent
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """One record beside its simulation.
+
+    Attributes:
+        record: what was measured.
+        simulated: noise-free outputs of the estimated plant.
+        fit_percent: by output, 100 (1 - |y - y_s| / |y - mean y|).
+    """
+
+    record: Record
+    simulated: Float[np.ndarray, "sample output"]
+    fit_percent: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Identification:
+    """The result of `identify`.
+
+    Attributes:
+        plant: the plant as it was fitted, sampled as the records are.
+        estimator: its name on the command line.
+        status: in a few words; docs/machine-readable.md lists them.
+        params, std_error: by parameter, in its unit; the error of a held one is nan.
+        held: parameters not estimated: unseen by the data and held where the search started,
+            or held at a bound that they reached.
+        covariance, information: of the estimates; see `excite.estimation.Estimate`.
+        whiteness: by output, p-value of the residual being white (Ljung-Box).
+        structure: by output, p-value of the residual not following past inputs.
+        verdict: sentences on what the data can see and how far to trust the intervals.
+        fitted, validation: records beside their simulation.
+        initial_state_known: whether initial states were taken as known.
+    """
+
+    plant: PlantDescription
+    estimator: str
+    status: str
+    params: Mapping[str, float]
+    std_error: Mapping[str, float]
+    held: tuple[str, ...]
+    covariance: Float[np.ndarray, "param param"]
+    information: Float[np.ndarray, "param param"]
+    whiteness: Mapping[str, float]
+    structure: Mapping[str, float]
+    verdict: tuple[str, ...]
+    fitted: tuple[Fitted, ...]
+    validation: tuple[Fitted, ...]
+    initial_state_known: bool
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether there is an estimate at all."""
+        return self.status in ("successful", "partly identifiable")
+
+    def ci95(self, name: str) -> tuple[float, float]:
+        """95 % interval of a parameter; symmetric, estimate ± 1.96 standard errors."""
+        half = HALF_95 * self.std_error[name]
+        return self.params[name] - half, self.params[name] + half
+
+    def fit(self) -> dict[str, float]:
+        """Fit in percent by output; over several records, of all of them together."""
+        outputs = names_of(self.plant.outputs)
+        measured = np.concatenate(
+            [f.record.outputs - f.record.outputs.mean(axis=0) for f in self.fitted]
+        )
+        simulated = np.concatenate(
+            [f.simulated - f.record.outputs.mean(axis=0) for f in self.fitted]
+        )
+        return {n: fit_percent(measured[:, i], simulated[:, i]) for i, n in enumerate(outputs)}
+
+    def to_dict(self) -> dict[str, Any]:
+        """The result as JSON-ready data; its keys are documented in docs/machine-readable.md."""
+        return {
+            "plant": self.plant.name,
+            "plant_hash": self.plant.hash,
+            "estimator": self.estimator,
+            "status": self.status,
+            "params": {
+                p.name: {
+                    "estimate": self.params[p.name],
+                    "std_error": self.std_error[p.name],
+                    "ci95": self.ci95(p.name),
+                    "unit": p.unit,
+                    "relative_to_nominal": self.params[p.name] / p.nominal if p.nominal else None,
+                    "held": p.name in self.held,
+                }
+                for p in self.plant.parameters
+            },
+            "fit_percent": self.fit(),
+            "validation": [
+                {"file": f.record.source, "fit_percent": dict(f.fit_percent)}
+                for f in self.validation
+            ],
+            "files": [f.record.source for f in self.fitted],
+            "initial_state": "known" if self.initial_state_known else "free",
+            "correlation": correlation(self.covariance),
+            "whiteness_p_value": dict(self.whiteness),
+            "structure_p_value": dict(self.structure),
+            "verdict": list(self.verdict),
+        }
+
+
+def write_run(
+    result: Identification, path: Path, overwrite: bool = False, command: str = ""
+) -> None:
+    """Leaves a run folder: records, simulated outputs, residuals, estimate, information.
+
+    Args:
+        command: that made it, for those who want to do it again.
+
+    Raises:
+        ValueError: where `path` holds something else, or a run and not `overwrite`.
+    """
+    d = result.plant
+    outputs = names_of(d.outputs)
+    with new_run_folder(path, overwrite) as folder:
+        for i, f in enumerate(result.fitted, 1):
+            ending = "" if len(result.fitted) == 1 else f"_{i}"
+            write_record(folder / f"record{ending}.csv", f.record, d)
+            for name, values in (
+                ("simulated", f.simulated),
+                ("residual", f.record.outputs - f.simulated),
+            ):
+                columns = {"time": f.record.time, **dict(zip(outputs, values.T, strict=True))}
+                (folder / f"{name}{ending}.csv").write_text(csv_text(columns))
+        write_json(folder / "estimate.json", result.to_dict())
+        write_json(
+            folder / "information.json",
+            {
+                "coordinates": "logarithm of positive parameters, free ones over their scale",
+                "parameters": names_of(d.parameters),
+                "information": result.information,
+                "covariance": result.covariance,
+            },
+        )
+        about = {"kind": "excite identification", "excite": __version__, "command": command}
+        write_json(folder / "run.json", {**about, "plant": d.to_dict()})

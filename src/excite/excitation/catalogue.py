@@ -1,0 +1,144 @@
+"""Excitations by name, their options checked against the plant; nothing is evaluated as code."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+
+from ..description import unknown, with_options
+from ..plant import AbstractPlant
+from ..policy import POLICY_ENDING, mismatch, policy_path, read_policy, shipped_policies
+from ..record import read_signal
+from ..record.read import SIGNAL_ENDINGS
+from .contract import AbstractExcitation, AbstractShape
+from .feedback import PolicyExcitation, PositionLoop
+from .signals import PRBS, Chirp, Decay, Multisine, Random, Replay, Square, maximum_length_sequence
+
+EXCITATIONS: Mapping[str, type[AbstractShape]] = {
+    "random": Random,
+    "prbs": PRBS,
+    "chirp": Chirp,
+    "multisine": Multisine,
+    "square": Square,
+    "decay": Decay,
+}
+LOOP = "loop-"
+"""Before the name of an excitation: it is the reference of a position loop."""
+
+
+def excitation_named(
+    name: str, options: Mapping[str, Any], plant: AbstractPlant
+) -> AbstractExcitation:
+    """An excitation by name, or a trained policy, checked against the plant.
+
+    Raises:
+        ValueError: as `excitation_and_origin`.
+    """
+    return excitation_and_origin(name, options, plant)[0]
+
+
+def excitation_and_origin(
+    name: str, options: Mapping[str, Any], plant: AbstractPlant
+) -> tuple[AbstractExcitation, dict[str, str]]:
+    """An excitation, and what a record must say of the policy that it is.
+
+    That is `policy_hash`, and a `warning` where the policy was trained on another plant;
+    nothing for other excitations.
+
+    Raises:
+        ValueError: for an unknown name or option, a value that is not allowed, or a policy
+            that may not excite this plant.
+    """
+    path = policy_path(name)
+    if path is not None:
+        if options:
+            raise ValueError(f"a policy has no options: got {', '.join(options)}")
+        policy = read_policy(path)
+        try:
+            warning = mismatch(policy, plant.description)
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from None
+        origin = {"policy_hash": policy.hash} | ({} if warning is None else {"warning": warning})
+        return PolicyExcitation.of(policy), origin
+    if name.endswith(SIGNAL_ENDINGS):
+        signal = _recorded(name, options, plant)
+        return signal, {"signal_hash": hashlib.sha256(Path(name).read_bytes()).hexdigest()}
+    excitation = _classical(name, options, plant)
+    _check_excitation(excitation, plant)
+    return excitation, {}
+
+
+def _recorded(name: str, options: Mapping[str, Any], plant: AbstractPlant) -> Replay:
+    """The designed or recorded input in a file."""
+    if options:
+        raise ValueError(f"a signal from a file has no options: got {', '.join(options)}")
+    return Replay(jnp.asarray(read_signal(Path(name), plant.description).inputs))
+
+
+def _classical(name: str, options: Mapping[str, Any], plant: AbstractPlant) -> AbstractExcitation:
+    """A signal, or one as the reference of a position loop, which shares its options."""
+    shape = name.removeprefix(LOOP)
+    if shape not in EXCITATIONS:
+        known = [*EXCITATIONS, *(LOOP + word for word in EXCITATIONS), *shipped_policies()]
+        raise unknown("excitation", name, [*known, f"path/to/policy{POLICY_ENDING}"])
+    if shape == name:
+        return with_options(EXCITATIONS[name](), name, options)
+    own = {k: v for k, v in options.items() if k in ("amplitude", "gain", "damping")}
+    rest = {k: v for k, v in options.items() if k not in own}
+    signal = with_options(EXCITATIONS[shape](), shape, rest)
+    _check_excitation(signal, plant)
+    return with_options(PositionLoop(signal), name, own)
+
+
+def _check_excitation(excitation: Any, plant: AbstractPlant) -> None:
+    """Values of an excitation that the plant does not allow."""
+    if isinstance(excitation, PositionLoop):
+        _check_loop(excitation)
+    else:
+        _check_amplitude(excitation, plant)
+    nyquist = 0.5 / float(plant.dt)
+    for option in ("start_frequency", "stop_frequency", "frequency"):
+        value = getattr(excitation, option, None)
+        if value is not None and not 0 < float(value) <= nyquist * (1 + 1e-9):
+            raise ValueError(
+                f"{option} {float(value):g} Hz is not allowed: above 0, and at most "
+                f"{nyquist:g} Hz at this sampling time"
+            )
+    for option in ("hold", "clock"):
+        if getattr(excitation, option, 1) < 1:
+            raise ValueError(f"{option} is a number of samples, at least 1")
+    if (phases := getattr(excitation, "phases", 0)) < 0:
+        raise ValueError(f"phases is 0 or the seed of random ones: got {phases}")
+    pump, register = getattr(excitation, "pump", 0.5), getattr(excitation, "register", 0)
+    if not 0 < float(pump) < 1:
+        raise ValueError(f"pump must lie between 0 and 1: got {float(pump):g}")
+    if register:
+        maximum_length_sequence(register)
+
+
+def _check_amplitude(excitation: Any, plant: AbstractPlant) -> None:
+    inputs, amplitude = plant.definition.inputs, getattr(excitation, "amplitude", None)
+    if amplitude is None:
+        return
+    values = amplitude.tolist() if amplitude.ndim else [float(amplitude)] * len(inputs)
+    if len(values) != len(inputs):
+        raise ValueError(f"{len(values)} amplitudes were given for {len(inputs)} inputs")
+    for value, part in zip(values, inputs, strict=True):
+        half = (part.upper - part.lower) / 2
+        if not 0 <= value <= half * (1 + 1e-9):
+            raise ValueError(
+                f"amplitude {value:g} {part.unit} is not allowed for {part.name!r}: "
+                f"from 0 to {half:g} {part.unit}"
+            )
+
+
+def _check_loop(loop: PositionLoop) -> None:
+    for option in ("amplitude", "gain", "damping"):
+        value = getattr(loop, option)
+        if value is not None and not (value.ndim == 0 and 0 <= float(value) < math.inf):
+            raise ValueError(f"{option} of a position loop must not be negative: got {value}")

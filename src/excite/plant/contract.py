@@ -1,0 +1,237 @@
+"""The contract of a plant: an ordinary differential equation and its description.
+
+A new plant is one class with a `definition` (plain data) and two pure functions:
+
+    x'(t) = derivative(x, u, params)        y(t) = output(x, params)
+
+Everything else (simulation, sensitivities, estimation, training) follows from those.
+Numbers of a plant are leaves of the pytree, names and limits are static: two plants of a
+class that differ in a constant, in sensor noise or in the initial state share one
+compilation.
+"""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+import math
+from collections import namedtuple
+from collections.abc import Mapping
+from functools import cache
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from ..description import PlantDescription, names_of
+
+# Estimation and information are of no value in single precision. Everything that computes
+# starts with a plant, so this is the one place where the process is switched.
+jax.config.update("jax_enable_x64", True)
+
+Params: TypeAlias = Any
+"""The unknown parameters: a named tuple of scalars in the order of the description."""
+
+
+@cache
+def _tuple_type(title: str, names: tuple[str, ...]) -> type:
+    # One class for one set of names: a pytree of another class would compile anew.
+    return namedtuple(title, names)  # pyright: ignore[reportUntypedNamedTuple]
+
+
+class Sensor(eqx.Module):
+    """Sensor of all outputs: Gaussian noise, then rounding to the encoder's step."""
+
+    noise_sd: Float[Array, " output"]
+    resolution: Float[Array, " output"]
+
+    @property
+    def sd(self) -> Float[Array, " output"]:
+        """Standard deviation of one measurement; rounding counts as uniform noise."""
+        return jnp.sqrt(self.noise_sd**2 + self.resolution**2 / 12)
+
+
+if TYPE_CHECKING:
+    # Equinox tells type checkers that every class has a dataclass's constructor of its own;
+    # all plants inherit the one below.
+    class _Module: ...
+else:
+    _Module = eqx.Module
+
+
+class AbstractPlant(_Module):
+    """Base of all plants.
+
+    Attributes:
+        definition: the class's description with its default numbers.
+        constants: known constants, a named tuple in the order of the definition.
+        sensor: noise and resolution of the outputs.
+        initial_state: state at which an experiment starts.
+        dt: sampling time [s].
+        substeps: Runge-Kutta steps in one `dt`.
+    """
+
+    definition: ClassVar[PlantDescription]
+    constants: Any
+    sensor: Sensor
+    initial_state: Float[Array, " state"]
+    dt: Float[Array, ""]
+    substeps: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        *,
+        sensor: Sensor | None = None,
+        initial_state: Float[Array, " state"] | None = None,
+        dt: float | Float[Array, ""] | None = None,
+        **constants: float | Float[Array, ""],
+    ) -> None:
+        """A plant with the numbers of its definition, but for those given.
+
+        Args:
+            dt: sampling time [s]; it is integrated no more coarsely than in the definition.
+
+        Raises:
+            ValueError: for a constant that the definition does not have.
+        """
+        d = self.definition
+        values: dict[str, Any] = {c.name: c.value for c in d.constants}
+        if unknown := sorted(constants.keys() - values.keys()):
+            raise ValueError(
+                f"plant {d.name!r} has no constant {unknown[0]!r}; "
+                f"it has {', '.join(values) or 'none'}"
+            )
+        values |= constants
+        self.constants = _tuple_type("Constants", tuple(values))(
+            *(jnp.asarray(v, float) for v in values.values())
+        )
+        self.sensor = sensor or Sensor(
+            jnp.asarray([o.noise_sd for o in d.outputs]),
+            jnp.asarray([o.resolution for o in d.outputs]),
+        )
+        at_rest = [s.initial for s in d.states]
+        self.initial_state = jnp.asarray(at_rest if initial_state is None else initial_state, float)
+        self.dt = jnp.asarray(d.dt if dt is None else dt, float)
+        # Without a dt of its own a plant can be built of traced numbers.
+        self.substeps = (
+            d.substeps if dt is None else math.ceil(float(dt) * d.substeps / d.dt - 1e-3)
+        )
+
+    @abc.abstractmethod
+    def derivative(
+        self, state: Float[Array, " state"], input: Float[Array, " input"], params: Params
+    ) -> Float[Array, " state"]:
+        """Time derivative of the state, in state units per second."""
+
+    @abc.abstractmethod
+    def output(self, state: Float[Array, " state"], params: Params) -> Float[Array, " output"]:
+        """Noise-free outputs. An input acts only through the state."""
+
+    @property
+    def Params(self) -> Any:  # noqa: N802  (it is a class)
+        """Named-tuple class of the parameters: `plant.Params(*vector)`."""
+        return _tuple_type("Params", names_of(self.definition.parameters))
+
+    @property
+    def nominal(self) -> Params:
+        """Nominal parameters."""
+        return self.Params(*(jnp.asarray(p.nominal, float) for p in self.definition.parameters))
+
+    @property
+    def description(self) -> PlantDescription:
+        """The definition with this plant's own numbers; not for use inside jit."""
+        d, dt = self.definition, float(self.dt)
+        return dataclasses.replace(
+            d,
+            constants=tuple(
+                dataclasses.replace(c, value=float(v))
+                for c, v in zip(d.constants, self.constants, strict=True)
+            ),
+            outputs=tuple(
+                dataclasses.replace(o, noise_sd=float(sd), resolution=float(resolution))
+                for o, sd, resolution in zip(
+                    d.outputs, self.sensor.noise_sd, self.sensor.resolution, strict=True
+                )
+            ),
+            states=tuple(
+                dataclasses.replace(s, initial=float(x))
+                for s, x in zip(d.states, self.initial_state, strict=True)
+            ),
+            dt=dt,
+            band=(min(d.band[0], 0.25 / dt), min(d.band[1], 0.5 / dt)),
+            substeps=self.substeps,
+        )
+
+    @property
+    def input_limits(self) -> tuple[Float[Array, " input"], Float[Array, " input"]]:
+        """Lower and upper limit of the inputs."""
+        inputs = self.definition.inputs
+        return jnp.asarray([i.lower for i in inputs]), jnp.asarray([i.upper for i in inputs])
+
+    def changed(self, **numbers: Any) -> Self:
+        """The same plant with another `dt`, `sensor`, `initial_state` or constants.
+
+        All but `dt` may be traced numbers.
+        """
+        own = {"sensor": self.sensor, "initial_state": self.initial_state}
+        plant = type(self)(**{**own, **self.constants._asdict(), **numbers})
+        if "dt" not in numbers:
+            plant = eqx.tree_at(lambda p: p.dt, plant, self.dt)
+            object.__setattr__(plant, "substeps", self.substeps)
+        return plant
+
+
+class AbstractARXPlant(AbstractPlant):
+    """A plant of one input and one output whose parameters follow from an ARX model.
+
+    The ARX model of order 2 is mapped to the differential equation
+    y'' + c_1 y' + c_0 y = d_0 u by `excite.estimation.arx`; the plant knows the rest.
+    """
+
+    @abc.abstractmethod
+    def from_transfer_function(
+        self, c_0: Float[Array, ""], c_1: Float[Array, ""], d_0: Float[Array, ""]
+    ) -> Params:
+        """Physical parameters of y'' + c_1 y' + c_0 y = d_0 u."""
+
+
+def params_from(plant: AbstractPlant, values: Mapping[str, float]) -> Params:
+    """Nominal parameters, but for those given.
+
+    Raises:
+        ValueError: for an unknown name or a value outside the parameter's bounds.
+    """
+    names = names_of(plant.definition.parameters)
+    for name, value in values.items():
+        if name not in names:
+            raise ValueError(
+                f"plant {plant.definition.name!r} has no parameter {name!r}; "
+                f"it has {', '.join(names)}"
+            )
+        p = plant.definition.parameters[names.index(name)]
+        lower = 0.0 if p.positive and p.lower is None else p.lower
+        if not (
+            math.isfinite(value)
+            and (lower is None or value > lower)
+            and (p.upper is None or value < p.upper)
+        ):
+            raise ValueError(
+                f"{name} = {value:g} {p.unit} is not allowed; it must be finite, above "
+                f"{'minus infinity' if lower is None else format(lower, 'g')} and below "
+                f"{'infinity' if p.upper is None else format(p.upper, 'g')}"
+            )
+    given = {name: jnp.asarray(value, float) for name, value in values.items()}
+    return plant.nominal._replace(**given)
+
+
+def draw_params(
+    plant: AbstractPlant, key: PRNGKeyArray, spread: float | Float[Array, ""]
+) -> Params:
+    """Random parameters, each uniform in its nominal value ± `spread` times its scale."""
+    unit = jax.random.uniform(key, (len(plant.nominal),), float, -1.0, 1.0)
+    scales = [p.scale for p in plant.definition.parameters]
+    return plant.Params(
+        *(n + spread * s * u for n, s, u in zip(plant.nominal, scales, unit, strict=True))
+    )

@@ -1,0 +1,313 @@
+"""`Policy`: a network and the contract under which it may excite a plant.
+
+A policy is a feed-forward network and the layout of what it observes, in one safetensors
+file: the weights as tensors, the contract (plant, layout, provenance) as JSON in the
+header. It is read and run with NumPy alone; the same `observe` and `forward` serve the
+training environment and the simulation with JAX (`xp` is the module of array functions),
+so that a policy sees on a rig exactly what it saw in training. Nothing is ever unpickled.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+
+from ..description import Input, Output, PlantDescription
+from ..files import tensors_from_bytes, tensors_to_bytes
+
+FORMAT = "excite policy 1"
+_MAX_COUNT = 2**31  # of samples, in a file of unknown origin
+
+AnyArray: TypeAlias = Any
+"""A NumPy or a JAX array."""
+
+Weights: TypeAlias = tuple[tuple[AnyArray, AnyArray], ...]
+"""Matrix [out, in] and bias [out] of every layer."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What a policy observes: Eq. 2 of Langschwert et al., for any plant.
+
+    The last `window` measurements over `output_scale`, the last `window` inputs over the
+    input limits, oldest first, and k / num_steps. The newest input is the one of the step
+    before: the next is what the policy is asked for. Samples before the first are zero.
+    Beyond Eq. 2, sine and cosine of clocks that run with k may follow.
+
+    Attributes:
+        window: samples remembered.
+        num_steps: T, steps of the experiment the policy was made for.
+        output_scale: y_max of each output, in its unit.
+        input_middle, input_half: middle of each input's limits, and how far from it the
+            policy may go: half their width, or less.
+        clocks: frequencies of the clocks, in cycles a step, at most one half.
+    """
+
+    window: int
+    num_steps: int
+    output_scale: tuple[float, ...]
+    input_middle: tuple[float, ...]
+    input_half: tuple[float, ...]
+    clocks: tuple[float, ...] = ()
+
+    @classmethod
+    def of(cls, description: PlantDescription, window: int = 80, num_steps: int = 500) -> Layout:
+        """The layout for a plant, scaled by its outputs' scales and its input limits.
+
+        Raises:
+            ValueError: where a length is below one.
+        """
+        if window < 1 or num_steps < 1:
+            raise ValueError(
+                f"window and num_steps must be at least 1: got {window} and {num_steps}"
+            )
+        return cls(
+            window=window,
+            num_steps=num_steps,
+            output_scale=tuple(o.scale for o in description.outputs),
+            input_middle=tuple((i.lower + i.upper) / 2 for i in description.inputs),
+            input_half=tuple((i.upper - i.lower) / 2 for i in description.inputs),
+        )
+
+    @property
+    def size(self) -> int:
+        """Numbers in an observation."""
+        width = len(self.output_scale) + len(self.input_half)
+        return self.window * width + 1 + 2 * len(self.clocks)
+
+
+class Window(NamedTuple):
+    """The last measurements and inputs, normalised, oldest first; time is axis 0."""
+
+    outputs: AnyArray
+    inputs: AnyArray
+
+
+def empty_window(xp: Any, layout: Layout) -> Window:
+    """The window before the first measurement."""
+    return Window(
+        outputs=xp.zeros((layout.window, len(layout.output_scale))),
+        inputs=xp.zeros((layout.window, len(layout.input_half))),
+    )
+
+
+def with_measurement(xp: Any, layout: Layout, window: Window, measured: AnyArray) -> Window:
+    """The window after one more measurement, in output units."""
+    newest = measured / xp.asarray(layout.output_scale)
+    return window._replace(outputs=xp.concatenate([window.outputs[1:], newest[None]]))
+
+
+def with_input(xp: Any, layout: Layout, window: Window, input: AnyArray) -> Window:
+    """The window after one more input was applied, in input units."""
+    newest = (input - xp.asarray(layout.input_middle)) / xp.asarray(layout.input_half)
+    return window._replace(inputs=xp.concatenate([window.inputs[1:], newest[None]]))
+
+
+def observe(xp: Any, layout: Layout, window: Window, k: AnyArray) -> AnyArray:
+    """Observation of step k, in single precision: outputs, inputs, k / T, sines, cosines."""
+    progress = xp.reshape(xp.asarray(k / layout.num_steps), (1,))
+    parts = [xp.ravel(window.outputs), xp.ravel(window.inputs), progress]
+    if layout.clocks:
+        phase = 2 * math.pi * k * xp.asarray(layout.clocks)
+        parts += [xp.sin(phase), xp.cos(phase)]
+    return xp.concatenate(parts).astype(xp.float32)
+
+
+def network(xp: Any, weights: Weights, observation: AnyArray) -> AnyArray:
+    """Hyperbolic tangents and a linear last layer."""
+    x = observation
+    for matrix, bias in weights[:-1]:
+        x = xp.tanh(matrix @ x + bias)
+    matrix, bias = weights[-1]
+    return matrix @ x + bias
+
+
+def forward(xp: Any, weights: Weights, observation: AnyArray) -> AnyArray:
+    """Action in [-1, 1]: what the network says, clipped; 0 if not finite."""
+    action = network(xp, weights, observation)
+    return xp.where(xp.isfinite(action), xp.clip(action, -1.0, 1.0), 0.0)
+
+
+def scaled_action(xp: Any, layout: Layout, action: AnyArray) -> AnyArray:
+    """Input, in its unit, that an action in [-1, 1] stands for."""
+    return xp.asarray(layout.input_middle) + xp.asarray(layout.input_half) * action
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A trained network and its contract.
+
+    Attributes:
+        plant: description of the plant it was trained on.
+        layout: what it observes.
+        weights: float32 matrices and biases.
+        provenance: how it was made, JSON-ready.
+    """
+
+    plant: PlantDescription
+    layout: Layout
+    weights: Weights
+    provenance: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        layers = tuple(
+            (np.asarray(matrix, np.float32), np.asarray(bias, np.float32))
+            for matrix, bias in self.weights
+        )
+        object.__setattr__(self, "weights", layers)
+        _check_layers(layers, self.layout.size, len(self.layout.input_half))
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        """Action in [-1, 1] for one observation.
+
+        Raises:
+            ValueError: for an observation of another size.
+        """
+        if np.shape(observation) != (self.layout.size,):
+            raise ValueError(
+                f"an observation of this policy has shape {(self.layout.size,)}; "
+                f"got {np.shape(observation)}"
+            )
+        return forward(np, self.weights, observation)
+
+    @property
+    def hash(self) -> str:
+        """SHA-256 of the policy's file content."""
+        return hashlib.sha256(self.to_bytes()).hexdigest()
+
+    def to_bytes(self) -> bytes:
+        """Content of the policy's file; `from_bytes` reads it back."""
+        contract = {
+            "plant": self.plant.to_dict(),
+            "plant_hash": self.plant.hash,
+            "layout": dataclasses.asdict(self.layout),
+            "provenance": dict(self.provenance),
+        }
+        tensors = {
+            f"{i}.{part}": array
+            for i, layer in enumerate(self.weights)
+            for part, array in zip(("weight", "bias"), layer, strict=True)
+        }
+        return tensors_to_bytes(tensors, FORMAT, contract)
+
+    @classmethod
+    def from_bytes(cls, content: bytes, where: str = "policy") -> Policy:
+        """The policy in the content of a file.
+
+        Raises:
+            ValueError: one sentence for content that is truncated, of another version,
+                inconsistent, or not finite.
+        """
+        tensors, contract = tensors_from_bytes(content, FORMAT, where)
+        try:
+            numbers: dict[str, Any] = {  # JSON has lists
+                k: tuple(v) if isinstance(v, list) else v for k, v in contract["layout"].items()
+            }
+            layout = Layout(**numbers)
+            plant = PlantDescription.from_dict(contract["plant"])
+            if contract["plant_hash"] != plant.hash:
+                raise ValueError("the plant in the contract is not the one that was written")
+            num_layers = (len(tensors) + 1) // 2
+            weights = tuple(
+                (tensors[f"{i}.weight"], tensors[f"{i}.bias"]) for i in range(num_layers)
+            )
+            if any(array.dtype != np.float32 for array in tensors.values()):
+                raise ValueError("weights are not in single precision")
+            _check_layout(layout, plant)
+            return cls(plant, layout, weights, dict(contract["provenance"]))
+        except (KeyError, TypeError, AttributeError, OverflowError) as error:
+            raise ValueError(f"{where}: incomplete or malformed contract ({error})") from None
+        except ValueError as error:
+            raise ValueError(f"{where}: {error}") from None
+
+
+def _check_layout(layout: Layout, plant: PlantDescription) -> None:
+    numbers = (*layout.output_scale, *layout.input_middle, *layout.input_half)
+    if not all(type(n) is int and n < _MAX_COUNT for n in (layout.window, layout.num_steps)):
+        raise ValueError("window and num_steps of a layout are whole numbers")
+    usual = Layout.of(plant, layout.window, layout.num_steps)
+    own = ("output_scale", "input_half", "clocks")  # may differ from policy to policy
+    if layout != dataclasses.replace(usual, **{n: getattr(layout, n) for n in own}) or not all(
+        math.isfinite(n) for n in numbers
+    ):
+        raise ValueError("the observation layout does not belong to the policy's plant")
+    if len(layout.input_half) != len(plant.inputs) or not all(
+        0 < own <= whole for own, whole in zip(layout.input_half, usual.input_half, strict=True)
+    ):
+        raise ValueError("the layout's inputs go beyond the limits of the policy's plant")
+    if not all(0 < n <= 0.5 for n in layout.clocks):
+        raise ValueError("the clocks of a layout are above 0 and at most half a cycle a step")
+    if len(layout.output_scale) != len(plant.outputs) or min(layout.output_scale) <= 0:
+        raise ValueError("the observation layout does not belong to the policy's plant")
+
+
+def _check_layers(weights: Weights, num_inputs: int, num_outputs: int) -> None:
+    """Raises ValueError where the layers do not fit each other, the layout or the plant."""
+    if not weights:
+        raise ValueError("a policy needs at least one layer")
+    width = num_inputs
+    for i, (matrix, bias) in enumerate(weights):
+        if matrix.ndim != 2 or matrix.shape[1] != width or bias.shape != matrix.shape[:1]:
+            raise ValueError(
+                f"layer {i} has weights {matrix.shape} and biases {bias.shape}; "
+                f"{width} numbers enter it"
+            )
+        if not (np.all(np.isfinite(matrix)) and np.all(np.isfinite(bias))):
+            raise ValueError(f"layer {i} has weights that are not finite")
+        width = matrix.shape[0]
+    if width != num_outputs:
+        raise ValueError(f"the last layer gives {width} numbers for {num_outputs} inputs")
+
+
+def mismatch(policy: Policy, plant: PlantDescription) -> str | None:
+    """A warning where the plant is not the one of training, but may be excited all the same.
+
+    Raises:
+        ValueError: one sentence where it may not: other names, units, input limits,
+            levels or sampling time.
+    """
+    own = policy.plant
+    _require_same("inputs", own.inputs, plant.inputs, ("unit", "lower", "upper"))
+    levels = ("unit", "warning_level", "critical_level")
+    _require_same("outputs", own.outputs, plant.outputs, levels)
+    if not math.isclose(own.dt, plant.dt, rel_tol=1e-9):
+        raise ValueError(
+            f"the policy was trained for a sampling time of {own.dt:g} s; "
+            f"{plant.name!r} has {plant.dt:g} s"
+        )
+    if own.hash == plant.hash:
+        return None
+    if own.name != plant.name:
+        return f"the policy was trained on {own.name!r}, not on {plant.name!r}"
+    return (
+        f"the policy was trained on another {own.name!r} (hash {own.hash[:8]}) than this one, "
+        "with other constants, nominal values or noise"
+    )
+
+
+def _require_same(
+    kind: str,
+    trained: Sequence[Input] | Sequence[Output],
+    given: Sequence[Input] | Sequence[Output],
+    fields: tuple[str, ...],
+) -> None:
+    if len(trained) != len(given):
+        raise ValueError(f"the policy has {len(trained)} {kind}; the plant has {len(given)}")
+    for ours, theirs in zip(trained, given, strict=True):
+        if ours.name != theirs.name:
+            raise ValueError(
+                f"the policy was trained for the {kind[:-1]} {ours.name!r}; "
+                f"the plant has {theirs.name!r}"
+            )
+        for field in fields:
+            if getattr(ours, field) != getattr(theirs, field):
+                raise ValueError(
+                    f"the policy was trained with {field} {getattr(ours, field)!r} of "
+                    f"{ours.name!r}; the plant has {getattr(theirs, field)!r}"
+                )

@@ -1,0 +1,108 @@
+"""A policy as ONNX: one file that other tools run, without Python and without this package.
+
+The graph holds the network alone, from the observation of Eq. 2 to an action in [-1, 1];
+the window of measurements and inputs is kept by whoever runs it. How, the contract says,
+which stands in the model's metadata as JSON, as in the policy's own file.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+try:
+    import onnx
+    from onnx import TensorProto, helper, numpy_helper
+except ImportError:
+    onnx: Any = None
+    TensorProto = helper = numpy_helper = onnx
+
+from .. import __version__
+from ..files import json_text, require_new_file, tensors_from_bytes, write_bytes
+from .contract import FORMAT, Policy
+
+ONNX_ENDING = ".onnx"
+_OPSET = 13  # of 2020: every run-time in use knows it
+
+
+def to_onnx(policy: Policy) -> bytes:
+    """Content of an ONNX file: `observation` [batch, size] to `action` [batch, input].
+
+    Both are single precision; a single observation is a batch of one. Metadata:
+    `format`, `contract` (plant, layout, provenance as JSON), `policy_hash`.
+
+    Raises:
+        ValueError: one sentence where onnx is not installed.
+    """
+    if onnx is None:
+        raise ValueError("exporting needs onnx: python -m pip install -e '.[onnx]'")
+    nodes, constants = _network(policy)
+    graph = helper.make_graph(
+        nodes,
+        f"policy for {policy.plant.name}",
+        [_batch("observation", policy.layout.size)],
+        [_batch("action", len(policy.layout.input_half))],
+        [numpy_helper.from_array(array, name) for name, array in constants.items()],
+    )
+    opsets = [helper.make_opsetid("", _OPSET)]
+    model = helper.make_model(
+        graph,
+        opset_imports=opsets,
+        ir_version=helper.find_min_ir_version_for(opsets),
+        producer_name="excite",
+        producer_version=__version__,
+    )
+    _, contract = tensors_from_bytes(policy.to_bytes(), FORMAT, "policy")
+    about = {"format": FORMAT, "contract": json_text(contract), "policy_hash": policy.hash}
+    helper.set_model_props(model, about)
+    onnx.checker.check_model(model, full_check=True)
+    return model.SerializeToString(deterministic=True)
+
+
+def require_onnx_path(path: Path, overwrite: bool) -> None:
+    """Raises ValueError where no ONNX file may be written."""
+    if path.suffix.lower() != ONNX_ENDING:
+        raise ValueError(f"{path}: an ONNX file ends in {ONNX_ENDING}")
+    require_new_file(path, overwrite)
+
+
+def write_onnx(policy: Policy, path: Path, overwrite: bool = False) -> None:
+    """Writes the ONNX file of a policy, whole or not at all.
+
+    Raises:
+        ValueError: one sentence where it may not or cannot be written.
+    """
+    require_onnx_path(path, overwrite)
+    write_bytes(path, to_onnx(policy))
+
+
+def _batch(name: str, size: int) -> Any:
+    return helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size])
+
+
+def _network(policy: Policy) -> tuple[list[Any], dict[str, np.ndarray]]:
+    """Nodes and constants of `policy.forward`."""
+    constants = {
+        "lowest": np.array(-1, np.float32),
+        "highest": np.array(1, np.float32),
+        "zero": np.array(0, np.float32),
+    }
+    nodes, into = [], "observation"
+    for i, (matrix, bias) in enumerate(policy.weights):
+        if i:
+            nodes.append(helper.make_node("Tanh", [into], [f"{i}.tanh"]))
+            into = f"{i}.tanh"
+        constants |= {f"{i}.weight": matrix, f"{i}.bias": bias}
+        words = [into, f"{i}.weight", f"{i}.bias"]
+        into = f"{i}.sum"
+        nodes.append(helper.make_node("Gemm", words, [into], transB=1))
+    nodes += [
+        helper.make_node("Clip", [into, "lowest", "highest"], ["clipped"]),
+        helper.make_node("IsNaN", [into], ["is_nan"]),
+        helper.make_node("IsInf", [into], ["is_infinite"]),
+        helper.make_node("Or", ["is_nan", "is_infinite"], ["is_not_finite"]),
+        helper.make_node("Where", ["is_not_finite", "zero", "clipped"], ["action"]),
+    ]
+    return nodes, constants

@@ -1,0 +1,14 @@
+"""Experiment files: `record` is the noun and its file, `read` reads them, `prepare` checks them.
+
+What `table` reads is text of anybody's; nothing here needs JAX.
+"""
+
+from .prepare import require_playable as require_playable
+from .read import SIGNAL_ENDINGS as SIGNAL_ENDINGS
+from .read import columns_in as columns_in
+from .read import read_record as read_record
+from .read import read_signal as read_signal
+from .record import RECORD_KIND as RECORD_KIND
+from .record import Record as Record
+from .record import require_record_path as require_record_path
+from .record import write_record as write_record

@@ -1,0 +1,232 @@
+"""What tables and figures share: numbers as text, axes, levels, files.
+
+Degrees and percent live in this room and in the command line only.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+import textwrap
+from collections.abc import Collection, Iterator, Sequence
+from contextvars import ContextVar
+from pathlib import Path
+from typing import Any
+
+import matplotlib.axis
+import matplotlib.figure
+import matplotlib.pyplot as plt
+import matplotlib.ticker
+import numpy as np
+
+from ..description import Input, Output, PlantDescription, display_unit
+from ..files import require_folder, write_bytes
+from ..record import Record
+
+# Distinguishable with any colour vision (M. Okabe and K. Ito, 2008).
+BLUE, ORANGE, GREEN, RED, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#767676"
+_COLOURS = (BLUE, ORANGE, GREEN, RED, "#CC79A7", "#56B4E9")
+PLOT_ENDINGS = (".png", ".svg", ".pdf")
+_MIN_WIDTH = 6.4  # inches; a narrower figure cuts its title and its legend
+MAX_POINTS = 4000
+"""Of one line: more cannot be told apart on paper and make files slow to open."""
+_POINTS = ContextVar("points", default=MAX_POINTS)
+
+
+def require_plot_path(path: Path) -> None:
+    """Raises ValueError, before anything is computed, where a figure cannot be written."""
+    if path.suffix.lower() not in PLOT_ENDINGS:
+        raise ValueError(f"{path}: figures end in {', '.join(PLOT_ENDINGS)}")
+    require_folder(path)
+
+
+def save(figure: matplotlib.figure.Figure, path: Path) -> None:
+    """Writes a figure, whole or not at all."""
+    write_bytes(path, image(figure, path.suffix[1:].lower()))
+
+
+def image(figure: matplotlib.figure.Figure, kind: str) -> bytes:
+    """A figure as the content of a file of this kind: png, svg or pdf."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format=kind, dpi=150)
+    plt.close(figure)
+    return buffer.getvalue()
+
+
+PAGE_STYLE: dict[Any, Any] = {
+    "svg.fonttype": "none",  # text stays text: it can be searched, and the file is smaller
+    "svg.hashsalt": "excite",  # the same figure is the same file
+    "text.parse_math": False,  # a name with $ is a name
+    "legend.frameon": False,
+}
+"""Matplotlib's settings under which a figure for `inline_svg` is drawn."""
+
+_NAMED = {"blue": BLUE, "orange": ORANGE, "green": GREEN, "red": RED, "grey": GREY}
+_NAMED |= {"pink": _COLOURS[4], "sky": _COLOURS[5]}
+_PAGE_COLOURS = {value.lower(): f"var(--{name})" for name, value in _NAMED.items()}
+_PAGE_COLOURS["#000000"] = "currentColor"
+
+
+class _PlainLog(matplotlib.ticker.LogFormatter):
+    """Powers of ten as numbers, without mathematics that a page would have to set."""
+
+    def _num_to_string(self, x: float, *_: Any) -> str:
+        return f"{x:g}"
+
+
+def inline_svg(figure: matplotlib.figure.Figure, prefix: str) -> str:
+    """A figure as an element of a page, whose style says what its colours are.
+
+    It has no title: a page has headings and captions.
+
+    Args:
+        prefix: of the figure's ids, which no other figure of the page may have.
+    """
+    if figure.get_suptitle():
+        figure.suptitle("")
+    for axes in figure.axes:
+        for axis in (axes.xaxis, axes.yaxis):
+            if axis.get_scale() in ("log", "symlog"):
+                _set_plain(axis)
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
+    plt.close(figure)
+    svg = buffer.getvalue()
+    svg = re.sub("<metadata>.*?</metadata>|<style.*?</style>", "", svg, flags=re.DOTALL)
+    used = set(re.findall(r'(?:href="|url\()#(\w+)', svg))
+    tags = re.sub("<[^>]*>", lambda tag: _of_page(tag[0], prefix, used), svg)
+    return re.sub(r"\s*\n\s*", "\n", tags[tags.index("<svg") :])
+
+
+def _set_plain(axis: matplotlib.axis.Axis) -> None:
+    """Marks of a logarithmic axis as plain numbers, and few of them: a page has many axes."""
+    axis.set_major_formatter(_PlainLog())
+    axis.set_minor_formatter(_PlainLog())
+    low, high = sorted(axis.get_view_interval())
+    if low <= 0 or high / low > 100:  # its powers of ten are enough
+        axis.set_minor_locator(matplotlib.ticker.NullLocator())
+
+
+def _of_page(tag: str, prefix: str, used: Collection[str]) -> str:
+    """One of Matplotlib's tags: ids of its own, the page's colours and font, shorter numbers."""
+    tag = re.sub(r' id="([^"]*)"', lambda m: f' id="{prefix}-{m[1]}"' if m[1] in used else "", tag)
+    tag = tag.replace('xlink:href="#', f'href="#{prefix}-').replace("url(#", f"url(#{prefix}-")
+    if tag.startswith("<svg"):
+        width, box = re.findall(r' (?:width|viewBox)="([^"]*)"', tag)
+        return f'<svg viewBox="{box}" style="--width: {width}">'
+    tag = re.sub(r" font-family: [^;]*;", "", tag)
+    tag = re.sub(r"(\.\d\d)\d+", r"\1", tag)  # hundredths of a point cannot be seen
+    return re.sub("#[0-9a-f]{6}", lambda m: _PAGE_COLOURS.get(m[0], m[0]), tag)
+
+
+def colour_of(i: int) -> str:
+    """Colour of the i-th thing in a picture."""
+    return _COLOURS[i % len(_COLOURS)]
+
+
+def new_figure(
+    rows: int, columns: int = 1, height: float = 2.2, width: float = 8.0, sharey: Any = False
+) -> tuple:
+    """A figure and its grid of axes; height of one row and width of all, in inches."""
+    plt.switch_backend("agg")
+    figure, axes = plt.subplots(
+        rows,
+        columns,
+        figsize=(max(width, _MIN_WIDTH), height * rows + 0.6),
+        sharey=sharey,
+        squeeze=False,
+        layout="constrained",
+    )
+    for axis in axes.ravel():
+        axis.spines[["top", "right"]].set_visible(False)
+        axis.grid(alpha=0.25)
+    return figure, axes
+
+
+def add_title(figure: matplotlib.figure.Figure, title: str) -> None:
+    """A title above all axes, broken where the figure ends."""
+    figure.suptitle(textwrap.fill(title, int(9 * figure.get_figwidth())))
+
+
+def add_legend(figure: matplotlib.figure.Figure, *axes: Any) -> None:
+    """One legend below all axes, where it hides nothing."""
+    entries = {}
+    for axis in axes:
+        handles, labels = axis.get_legend_handles_labels()
+        entries |= dict(zip(labels, handles, strict=True))
+    if entries:
+        columns = int(figure.get_figwidth() / 2)
+        place = "outside lower center"
+        figure.legend(entries.values(), entries, loc=place, ncols=columns, fontsize=8)
+
+
+def axis_label(part: Input | Output) -> str:
+    """Name and unit as people read it."""
+    return f"{part.name} [{display_unit(part.unit)[0]}]"
+
+
+@contextlib.contextmanager
+def at_most(points: int) -> Iterator[None]:
+    """Figures drawn inside have no longer lines than this."""
+    token = _POINTS.set(points)
+    try:
+        yield
+    finally:
+        _POINTS.reset(token)
+
+
+def thin(time: np.ndarray, *values: np.ndarray) -> list[np.ndarray]:
+    """Long arrays as they look in a picture: every peak of them is kept."""
+    kept = kept_samples(values, _POINTS.get())
+    return [a[kept] for a in (time, *values)]
+
+
+def kept_samples(values: Sequence[np.ndarray], points: int) -> np.ndarray:
+    """At most so many indices: ends, and the smallest and largest of every stretch of samples.
+
+    Args:
+        values: arrays of one length, which share the indices; what is no number is no peak.
+    """
+    length = len(values[0])
+    if length <= points:
+        return np.arange(length)
+    stretches = max(1, (points - 2) // (2 * len(values)))
+    starts = np.unique(np.linspace(0, length, stretches, endpoint=False).astype(int))
+    kept = {0, length - 1}
+    for array in values:
+        parts = list(zip(starts, np.split(array, starts[1:]), strict=True))
+        known = [(start, np.isnan(part), part) for start, part in parts]
+        kept |= {start + int(np.where(gap, np.inf, v).argmin()) for start, gap, v in known}
+        kept |= {start + int(np.where(gap, -np.inf, v).argmax()) for start, gap, v in known}
+    return np.array(sorted(kept))
+
+
+def draw_levels(axis: Any, part: Output, largest: float) -> None:
+    """Both safety levels, where the output comes near enough for them to fit the picture."""
+    factor = display_unit(part.unit)[1]
+    words = ((part.warning_level, ORANGE, "warning"), (part.critical_level, RED, "critical"))
+    levels = [(level, *shown) for level, *shown in words if level is not None]
+    if not levels or largest < 0.25 * levels[0][0]:
+        return
+    for level, colour, word in levels:
+        for sign in (1, -1):
+            label = f"{word} level" if sign == 1 else None
+            axis.axhline(sign * level * factor, color=colour, ls="--", lw=1, label=label)
+
+
+def draw_episodes(axes: Any, description: PlantDescription, records: Sequence[Record]) -> None:
+    """One column an experiment; one row an input, then one row an output."""
+    for i, part in enumerate(description.inputs):
+        axes[i, 0].set(ylabel=axis_label(part))
+        for axis, record in zip(axes[i], records, strict=True):
+            time, values = thin(record.time, record.inputs[:, i])
+            axis.step(time, values, where="post", color=GREEN, lw=1)
+    for i, part in enumerate(description.outputs):
+        row = axes[len(description.inputs) + i]
+        row[0].set(ylabel=axis_label(part))
+        largest = max(float(np.max(np.abs(record.outputs[:, i]))) for record in records)
+        for axis, record in zip(row, records, strict=True):
+            time, values = thin(record.time, record.outputs[:, i])
+            axis.plot(time, display_unit(part.unit)[1] * values, color=BLUE, lw=1)
+            draw_levels(axis, part, largest)

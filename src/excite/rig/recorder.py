@@ -1,0 +1,107 @@
+"""The record of an experiment under way: every sample is on disk before the next.
+
+The sidecar of a record is written before its first sample, without an end, and again at
+the end; a process that is killed leaves a record of all samples so far that can be read
+like any other.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from ..description import PlantDescription
+from ..files import json_text, write_bytes
+from ..record import RECORD_KIND, require_record_path
+
+_RESERVE = 16_384  # spaces in a sidecar, in whose place its end is written on a full disk
+
+
+class Recorder:
+    """Appends to a CSV record; a context manager."""
+
+    def __init__(
+        self,
+        path: Path,
+        description: PlantDescription,
+        metadata: Mapping[str, Any],
+        overwrite: bool = False,
+    ) -> None:
+        """A record at `path`, which ends in .csv.
+
+        Args:
+            metadata: for the sidecar: policy hash, limits, versions.
+
+        Raises:
+            ValueError: where it may not be written.
+        """
+        require_record_path(path, overwrite)
+        if path.suffix.lower() != ".csv":
+            raise ValueError(f"{path}: an experiment is recorded as .csv, line by line")
+        if "clock" in description.columns:
+            raise ValueError("no input or output may be called 'clock': a record has its own")
+        self._path, self._description = path, description
+        self._metadata = {
+            "plant": description.to_dict(),
+            "plant_hash": description.hash,
+            "starts_at_initial_state": False,
+            **metadata,
+            "kind": RECORD_KIND,
+            "dt": description.dt,
+        }
+        self.num_samples = 0
+
+    def __enter__(self) -> Self:
+        """Writes the sidecar and the header; what was there before stays where one cannot."""
+        # A line is one call, whole or not at all.
+        self._file = self._path.open("ab", buffering=0)
+        try:
+            self._write_sidecar({"ended": None}, _RESERVE)
+            self._file.truncate(0)
+            self._line([*self._description.columns, "clock"])
+        except BaseException:
+            self._file.close()
+            raise
+        return self
+
+    def append(self, inputs: np.ndarray, outputs: np.ndarray, clock: float) -> None:
+        """One more sample: outputs measured at it and inputs held from it.
+
+        Args:
+            clock: the rig's time [s]; the column `time` has the nominal one.
+        """
+        nominal = self.num_samples * self._description.dt
+        numbers = (nominal, *np.asarray(inputs).tolist(), *np.asarray(outputs).tolist(), clock)
+        self._line([repr(float(x)) for x in numbers])
+        self.num_samples += 1
+
+    def end(self, ended: Mapping[str, Any]) -> None:
+        """Says in the sidecar how the experiment ended, on a full disk as well."""
+        try:
+            self._write_sidecar({"ended": dict(ended)})
+        except ValueError:
+            text = json_text({**self._metadata, "ended": dict(ended)}).encode()
+            with self._path.with_suffix(".json").open("r+b") as file:
+                if len(text) > file.seek(0, os.SEEK_END):
+                    raise
+                file.seek(0)
+                file.write(text)
+                file.truncate()
+
+    def __exit__(self, *_: object) -> None:
+        """Closes the file."""
+        self._file.close()
+
+    def _line(self, words: list[str]) -> None:
+        line, before = (",".join(words) + "\n").encode(), self._file.tell()
+        if self._file.write(line) != len(line):
+            self._file.truncate(before)  # half a line would spoil all others
+            raise OSError(f"{self._path}: the disk is full")
+
+    def _write_sidecar(self, more: Mapping[str, Any], reserve: int = 0) -> None:
+        text = json_text({**self._metadata, **more}) + " " * reserve + "\n"
+        write_bytes(self._path.with_suffix(".json"), text.encode())

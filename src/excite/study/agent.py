@@ -1,0 +1,312 @@
+"""Agents: what a policy is trained for, on which decision process, and how."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from ..description import names_of, unknown
+from ..environment import (
+    MAX_SENSITIVITY,
+    AbstractObjective,
+    Env,
+    EstimationError,
+    InformationGain,
+    OutputError,
+    WeightedSum,
+    prior_sd_of,
+    target_mask,
+)
+from ..estimation import ARX, NLS
+from ..estimation.catalogue import estimator_named
+from ..plant import AbstractARXPlant, AbstractPlant
+from ..policy import Layout
+from ..training.gradient import GradientSettings
+from ..training.settings import PPOSettings
+from .settings import Count, EstimatorSettings, Positive, Settings, checked
+
+METHODS = {"ppo": PPOSettings, "gradient": GradientSettings}
+"""Trainers, and their hyper-parameters."""
+
+
+class RewardSettings(Settings):
+    """What an agent is rewarded for.
+
+    Attributes:
+        reward: of the experiment: `relative` errors (Eq. 4), `log` of them, the worst over
+            its goal (`goals`), or `information`; by default the plant's.
+        dense: whether information is rewarded at every step, by default for PPO alone.
+        weight: factor of that reward.
+        criterion, max_sensitivity: of the information, see `InformationGain`.
+        goals: by parameter, the relative error that counts as one, default one.
+        estimator: in the reward, by the study's name or any; an ARX estimator, or `nls` to
+            first order in the noise, for any plant.
+        start_covariance: instead of that estimator's; a smaller one lets its bias, which is
+            a smooth function of the inputs, outweigh the sensor's noise.
+    """
+
+    reward: Literal["relative", "log", "goals", "information"] | None = None
+    dense: Annotated[bool, Field(strict=True)] | None = None
+    weight: Positive = 1.0
+    criterion: Literal["D", "A", "E"] = "D"
+    max_sensitivity: Positive = MAX_SENSITIVITY
+    goals: dict[str, Positive] = {}
+    estimator: str = "arx-rls"
+    start_covariance: Positive | None = None
+
+
+REWARD_TABLES: Mapping[str, type[Settings]] = {"terms": RewardSettings}
+"""Tables inside the settings of a decision process."""
+
+
+class DecisionSettings(RewardSettings):
+    """The decision process an agent is trained on; the paper's, but for what is set.
+
+    Attributes:
+        terms: several rewards instead of one, which are added.
+        window: samples observed.
+        clocks: frequencies [Hz] whose sine and cosine are observed too.
+        output_scale: y_max by output, in its unit, where it differs from the output's scale.
+        input_amplitude: by input, in its unit, how far from the middle of its limits the
+            policy may go, where that is less than the limits allow.
+        spread: of the plants it is trained on, where it differs from the study's.
+        constants: of these plants, drawn between two ends, [0.12, 0.21], for every one.
+        normalise_penalty: whether the safety penalty is divided by the number of steps.
+    """
+
+    terms: Annotated[list[RewardSettings], Field(min_length=1)] = []
+    window: Annotated[Count, Field(le=10_000)] = 80
+    clocks: list[Positive] = []
+    output_scale: dict[str, Positive] = {}
+    input_amplitude: dict[str, Positive] = {}
+    spread: Annotated[float, Field(ge=0, lt=1, strict=True, allow_inf_nan=False)] | None = None
+    constants: dict[str, tuple[float, float]] = {}
+    normalise_penalty: Annotated[bool, Field(strict=True)] = False
+
+
+class AgentSettings(Settings):
+    """An agent as a study file has it: where it differs from the study's other agents.
+
+    Attributes:
+        targets: parameters in its reward, default the plant's targets.
+        method: how it is trained.
+        decision, training: instead of the study's.
+    """
+
+    targets: list[str] | None = None
+    method: Literal["ppo", "gradient"] = "ppo"
+    decision: dict[str, Any] = {}
+    training: dict[str, Any] = {}
+
+
+@dataclass(frozen=True)
+class Agent:
+    """What a policy is trained for, on which decision process, and how.
+
+    Attributes:
+        targets: parameters that count, default the plant's targets.
+        method: of training.
+        decision: settings of the process.
+        training: hyper-parameters of the method.
+        estimators: those that the reward may name beside the usual ones.
+    """
+
+    targets: Sequence[str] | None
+    method: str
+    decision: DecisionSettings
+    training: PPOSettings | GradientSettings
+    estimators: Mapping[str, EstimatorSettings] = dataclasses.field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls,
+        own: AgentSettings,
+        decision: Mapping[str, Any],
+        training: Mapping[str, Any],
+        estimators: Mapping[str, EstimatorSettings],
+    ) -> Agent:
+        """An agent from its own settings and those it shares with others.
+
+        Raises:
+            ValueError: for a setting that does not exist or is not allowed.
+        """
+        replaced = {"terms"} if "reward" in own.decision else set()
+        if "terms" in own.decision:
+            replaced = set(RewardSettings.model_fields)
+        shared = {name: value for name, value in decision.items() if name not in replaced}
+        process = checked(DecisionSettings, {**shared, **own.decision}, "decision", REWARD_TABLES)
+        _require_one_reward(process)
+        if process.reward is not None:  # another agent may use what all have in common
+            stated = own.decision if "reward" in own.decision else process.model_fields_set
+            _require_used(_kind(process.reward, process, estimators), stated)
+        targets = own.targets or []
+        if len(set(targets)) < len(targets):
+            raise ValueError(f"targets must differ from each other, got {', '.join(targets)}")
+        chosen = checked(METHODS[own.method], {**training, **own.training}, "training")
+        return cls(own.targets, own.method, process, chosen, estimators)
+
+    def env(self, plant: AbstractPlant, spread: float, num_steps: int) -> Env:
+        """The decision process of this agent.
+
+        Raises:
+            ValueError: for a target, output or input that does not exist, an amplitude
+                beyond the input's limits, or a reward from an ARX estimator where the
+                plant has no mapping from it.
+        """
+        decision = self.decision
+        own = spread if decision.spread is None else decision.spread
+        return Env.of(
+            plant,
+            objective=self._objective(plant, own),
+            layout=self._layout(plant, num_steps),
+            spread=own,
+            penalty_weight=1 / num_steps if decision.normalise_penalty else 1.0,
+            constants=_ends(plant, decision.constants),
+        )
+
+    def _layout(self, plant: AbstractPlant, num_steps: int) -> Layout:
+        decision, outputs = self.decision, plant.definition.outputs
+        usual = Layout.of(plant.description, decision.window, num_steps)
+        halves = dict(zip(names_of(plant.definition.inputs), usual.input_half, strict=True))
+        for name in decision.output_scale:
+            if name not in names_of(outputs):
+                raise unknown("output in output_scale", name, names_of(outputs))
+        for name, amplitude in decision.input_amplitude.items():
+            if name not in halves:
+                raise unknown("input in input_amplitude", name, halves)
+            if amplitude > halves[name]:
+                raise ValueError(
+                    f"input_amplitude of {name!r} is at most {halves[name]:g}: got {amplitude:g}"
+                )
+        return dataclasses.replace(
+            usual,
+            output_scale=tuple(decision.output_scale.get(o.name, o.scale) for o in outputs),
+            input_half=tuple((halves | decision.input_amplitude).values()),
+            clocks=_cycles(decision.clocks, float(plant.dt)),
+        )
+
+    def _objective(self, plant: AbstractPlant, spread: float) -> AbstractObjective:
+        terms = [self._term(reward, plant, spread) for reward in self.decision.terms]
+        return WeightedSum(terms) if terms else self._term(self.decision, plant, spread)
+
+    def _term(
+        self, chosen: RewardSettings, plant: AbstractPlant, spread: float
+    ) -> AbstractObjective:
+        has_mapping = isinstance(plant, AbstractARXPlant)
+        form = chosen.reward or ("relative" if has_mapping else "information")
+        if chosen.reward is None or chosen is not self.decision:  # the others were checked
+            _require_used(_kind(form, chosen, self.estimators), chosen.model_fields_set)
+        targets = target_mask(plant.definition, self.targets)
+        if form == "information":
+            return InformationGain(
+                targets,
+                prior_sd_of(spread),
+                chosen.weight,
+                criterion=chosen.criterion,
+                max_sensitivity=chosen.max_sensitivity,
+                # A gradient needs no reward on the way.
+                dense=self.method == "ppo" if chosen.dense is None else chosen.dense,
+            )
+        own = _estimator(chosen, self.estimators)
+        estimator = estimator_named(own.kind, own.options)
+        target_mask(plant.definition, list(chosen.goals) or None)  # checks the names
+        goals = [chosen.goals.get(p.name, 1.0) for p in plant.definition.parameters]
+        common = targets, goals, form, chosen.weight
+        if isinstance(estimator, NLS):
+            bound = {"max_sensitivity": chosen.max_sensitivity}
+            return OutputError(*common, prior_sd=prior_sd_of(spread), **bound)
+        if not (has_mapping and isinstance(estimator, ARX)):
+            raise ValueError(
+                f"the reward {form!r} from the estimator {chosen.estimator!r} needs "
+                "an ARX estimator, and a plant with a mapping from ARX coefficients; the "
+                "estimator 'nls' and the reward 'information' need neither"
+            )
+        if chosen.start_covariance is not None:
+            estimator = dataclasses.replace(estimator, start_covariance=chosen.start_covariance)
+        return EstimationError(*common, estimator=estimator)
+
+    def total_steps(self, num_steps: int) -> int:
+        """Sampling times of the whole training, for experiments of so many."""
+        if isinstance(self.training, PPOSettings):
+            return self.training.total_steps
+        return self.training.num_updates * self.training.num_plants * num_steps
+
+    def settings(self, plant: AbstractPlant) -> dict[str, Any]:
+        """All that decides what it becomes, defaults included, JSON-ready."""
+        names = names_of(plant.definition.parameters)
+        mask = target_mask(plant.definition, self.targets)
+        # What settings did not have from the first stands here only where it is used, so
+        # that seeds trained before it are still known.
+        later = {"clocks", "criterion", "max_sensitivity", "input_amplitude", "spread", "dense"}
+        later |= {"constants", "terms"}
+        return {
+            "method": self.method,
+            "targets": [name for name, chosen in zip(names, mask, strict=True) if chosen],
+            "decision": self.decision.model_dump(exclude=later - self.decision.model_fields_set),
+            "training": dataclasses.asdict(self.training),
+        }
+
+
+def _ends(plant: AbstractPlant, ranges: Mapping[str, tuple[float, float]]) -> Any:
+    """Lowest and highest constants of a plant; ValueError for a range that is not allowed."""
+    if not ranges:
+        return None
+    names = names_of(plant.definition.constants)
+    for name, (low, high) in ranges.items():
+        if name not in names:
+            raise unknown("constant in constants", name, names)
+        if not low <= high:
+            raise ValueError(f"the range of the constant {name!r} must grow: got {low:g}, {high:g}")
+    ends = ({name: ends[i] for name, ends in ranges.items()} for i in (0, 1))
+    return tuple(plant.changed(**own).constants for own in ends)
+
+
+def _require_one_reward(process: DecisionSettings) -> None:
+    """Raises ValueError for a reward beside terms, each of which states its own."""
+    beside = sorted(set(RewardSettings.model_fields) & process.model_fields_set)
+    if process.terms and beside:
+        raise ValueError(f"decision: with terms, {beside[0]!r} belongs to one of them")
+
+
+_USED = {
+    "information": {"dense", "criterion", "max_sensitivity"},
+    "errors of nls": {"goals", "estimator", "max_sensitivity"},
+    "errors of an ARX estimator": {"goals", "estimator", "start_covariance"},
+}
+"""Settings that kinds of reward have beside `reward` and `weight`."""
+
+
+def _kind(form: str, chosen: RewardSettings, estimators: Mapping[str, EstimatorSettings]) -> str:
+    if form == "information":
+        return "information"
+    is_nls = _estimator(chosen, estimators).kind == "nls"
+    return "errors of nls" if is_nls else "errors of an ARX estimator"
+
+
+def _estimator(
+    chosen: RewardSettings, estimators: Mapping[str, EstimatorSettings]
+) -> EstimatorSettings:
+    """The estimator of a reward: the study's by that name, or the usual one."""
+    return estimators.get(chosen.estimator, EstimatorSettings(kind=chosen.estimator))
+
+
+def _require_used(kind: str, names: Iterable[str]) -> None:
+    """Raises ValueError for a setting of another kind of reward."""
+    unused = sorted(set().union(*_USED.values()) & set(names) - _USED[kind])
+    if unused:
+        raise ValueError(f"decision: the reward {kind!r} has no {unused[0]!r}")
+
+
+def _cycles(clocks: Sequence[float], dt: float) -> tuple[float, ...]:
+    """Cycles a step of clocks given in Hz; ValueError beyond half the sampling frequency."""
+    for frequency in clocks:
+        if frequency * dt > 0.5:
+            raise ValueError(
+                f"a clock of {frequency:g} Hz is too fast: at most {0.5 / dt:g} Hz at this "
+                "sampling time"
+            )
+    return tuple(frequency * dt for frequency in clocks)

@@ -1,0 +1,99 @@
+"""One episode of every method and agent: what a report shows of how they excite.
+
+All play on the same plant with the same noise, that of the first evaluation episode.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import jax
+import numpy as np
+
+from ..description import PlantDescription, names_of
+from ..environment import run_episodes
+from ..estimation import ARX
+from ..estimation.arx import running_params
+from ..excitation import AbstractExcitation, PolicyExcitation
+from ..plant import AbstractARXPlant, AbstractPlant
+from ..policy import read_policy
+from ..record import Record
+from .evaluation import CHUNK, episode_keys
+from .folder import damaged, seed_folder
+from .spec import Study
+
+_DIGITS = 6  # more than a figure can show
+
+
+def example_episodes(
+    study: Study, folder: Path = Path(), seeds: Mapping[str, int] = MappingProxyType({})
+) -> dict[str, tuple[Record, np.ndarray]]:
+    """The first evaluation episode of every method and agent, and its running estimates.
+
+    The estimates are those of the study's first ARX estimator, over the true parameters;
+    not numbers where there is none.
+
+    Args:
+        folder: of the run, where there are agents.
+        seeds: by agent, the one to show.
+    """
+    plant, episodes = study.build_plant(), {}
+    keys = episode_keys(study)[:CHUNK]  # as the table has them: nothing compiles again
+    for name, seed, excitation in _excitations(study, plant, folder, seeds):
+        batch = run_episodes(plant, excitation, study.num_steps, study.spread, keys)
+        run, params = jax.tree.map(lambda leaf: leaf[0], (batch.trajectory, batch.params))
+        estimator, estimates = _running(study, plant, run.inputs, run.measured)
+        about = {"estimator": estimator, **({} if seed is None else {"seed": seed})}
+        record = Record.of_episode(run.time, run.inputs, run.outputs, about)
+        episodes[name] = record, estimates / np.stack(params)
+    return episodes
+
+
+def _excitations(
+    study: Study, plant: AbstractPlant, folder: Path, seeds: Mapping[str, int]
+) -> Iterator[tuple[str, int | None, AbstractExcitation]]:
+    """Name, seed of an agent, and excitation of all that a study compares."""
+    for name, excitation in study.build_methods(plant).items():
+        yield name, None, excitation
+    for agent, seed in seeds.items():
+        path = seed_folder(folder, agent, seed) / "policy.safetensors"
+        try:
+            yield agent, seed, PolicyExcitation.of(read_policy(path))
+        except ValueError:
+            raise damaged(path) from None
+
+
+def _running(
+    study: Study, plant: AbstractPlant, inputs: Any, measured: Any
+) -> tuple[str, np.ndarray]:
+    for name, estimator in study.build_estimators(plant).items():
+        if isinstance(estimator, ARX) and isinstance(plant, AbstractARXPlant):
+            return name, np.asarray(running_params(estimator, plant, inputs, measured))
+    return "", np.full((len(measured), len(names_of(plant.definition.parameters))), np.nan)
+
+
+def episodes_data(
+    description: PlantDescription, episodes: Mapping[str, tuple[Record, np.ndarray]]
+) -> dict[str, Any]:
+    """Episodes as JSON-ready data; docs/machine-readable.md documents the keys."""
+
+    def columns(parts: Any, values: np.ndarray) -> dict[str, list[float]]:
+        return dict(zip(names_of(parts), map(_rounded, np.transpose(values)), strict=True))
+
+    return {
+        name: {
+            **record.metadata,
+            "time": _rounded(record.time),
+            "inputs": columns(description.inputs, record.inputs),
+            "outputs": columns(description.outputs, record.outputs),
+            "estimate_over_true": columns(description.parameters, estimates),
+        }
+        for name, (record, estimates) in episodes.items()
+    }
+
+
+def _rounded(values: np.ndarray) -> list[float]:
+    return [float(f"{value:.{_DIGITS}g}") for value in np.asarray(values).tolist()]

@@ -1,0 +1,170 @@
+"""Methods x estimators over common plants and noise.
+
+Every method meets the same plants and the same sensor noise, episode by episode; every
+estimator sees the same data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Key
+
+from ..description import names_of
+from ..environment import Episodes, run_episodes
+from ..estimation import AbstractEstimator, stack_experiments
+from ..excitation import AbstractExcitation
+from ..information import d_optimality, require_noise
+from ..plant import AbstractPlant
+from ..rig.filter import SafetyFilter
+from ..rig.simulated import bodies, evaluate_on_rig, readings_per_sample
+from ..safety import Supervision, Trip
+from ..simulation import Trajectory
+from .spec import Study
+from .statistics import Outcome, table_row
+
+CHUNK = 100
+"""Episodes computed in one call: enough to be fast, few enough to show progress."""
+
+Progress = Callable[[str, int, int], None]
+"""Called with what is being computed, how much of it is done, and how much there is."""
+
+
+@eqx.filter_jit
+def estimate_all(
+    plant: AbstractPlant, estimator: AbstractEstimator, trajectory: Trajectory
+) -> tuple[Float[Array, "episode param"], Float[Array, "episode param"], Array]:
+    """Estimates, standard errors and status of every episode; initial states are known."""
+
+    def one(inputs: Array, measured: Array) -> tuple[Array, Array, Array]:
+        data = stack_experiments(plant, [inputs], [measured], True)
+        estimate = estimator(plant, data)
+        variance = jnp.diagonal(estimate.covariance)
+        return jnp.stack(estimate.params), jnp.sqrt(variance), estimate.status
+
+    return jax.vmap(one)(trajectory.inputs, trajectory.measured)
+
+
+def episode_keys(study: Study) -> Key[Array, " episode"]:
+    """Keys of the study's evaluation episodes."""
+    return jax.random.split(jax.random.key(study.seed), study.episodes)
+
+
+Play = Callable[[AbstractExcitation, Any], tuple[Episodes, dict[str, np.ndarray]]]
+"""Plays an excitation once for every key; with what else happened on a rig."""
+
+
+def num_chunks(study: Study) -> int:
+    """Calls in which the episodes of one method are computed."""
+    return -(-study.episodes // CHUNK)
+
+
+def player_of(study: Study, plant: AbstractPlant) -> Play:
+    """How the study's experiments are made: on the plant, or on its simulated rig."""
+    if study.rig is None:
+        return lambda excitation, keys: (
+            run_episodes(plant, excitation, study.num_steps, study.spread, keys),
+            {},
+        )
+    rules, numbers = Supervision.of(plant.description), study.rig.numbers()
+    safety = SafetyFilter.of(plant, study.spread) if study.rig.filter else None
+
+    def play(excitation: AbstractExcitation, keys: Any) -> tuple[Episodes, dict[str, np.ndarray]]:
+        many = bodies(plant, readings_per_sample(plant), study.spread, keys, **numbers)
+        on_rig = plant, excitation, many, rules, study.num_steps
+        episodes, runs = evaluate_on_rig(*on_rig)
+        seen = {"trips": runs.trip != int(Trip.NONE)}
+        if safety is not None:
+            _, runs = evaluate_on_rig(*on_rig, safety, safety.start())
+            seen["filtered_violations"] = runs.is_violation
+            seen["filtered_trips"] = runs.trip != int(Trip.NONE)
+            seen["interventions"] = runs.num_interventions
+        return episodes, {name: np.asarray(counts) for name, counts in seen.items()}
+
+    return play
+
+
+def evaluate_method(
+    study: Study,
+    plant: AbstractPlant,
+    name: str,
+    excitation: AbstractExcitation,
+    progress: Callable[[int], None] = lambda _: None,
+) -> tuple[list[dict[str, Any]], Float[np.ndarray, " input"]]:
+    """One row an estimator for one method, and each input's root mean square.
+
+    The latter counts from the middle of the input's limits.
+
+    Raises:
+        ValueError: for a sensor without noise, which has no Cramér-Rao bound.
+    """
+    require_noise(plant)
+    estimators = study.build_estimators(plant)
+    middle = np.mean(plant.input_limits, axis=0)
+    keys = episode_keys(study)
+    outcomes: dict[str, list[Outcome]] = {e: [] for e in estimators}
+    play, squares = player_of(study, plant), []
+    for c, first in enumerate(range(0, study.episodes, CHUNK)):
+        progress(c)
+        chunk = keys[first : first + CHUNK]
+        episodes, on_rig = play(excitation, chunk)
+        inputs = np.asarray(episodes.trajectory.inputs) - middle
+        squares.append(np.mean(inputs**2, axis=1))
+        for e, estimator in estimators.items():
+            outcomes[e].append(outcome(plant, estimator, episodes, on_rig))
+    own = _of_method(study, plant, excitation)
+    rows = [
+        {**table_row(study, plant.description, (name, e), joined(parts)), **own}
+        for e, parts in outcomes.items()
+    ]
+    return rows, np.sqrt(np.concatenate(squares).mean(axis=0))
+
+
+def _of_method(
+    study: Study, plant: AbstractPlant, excitation: AbstractExcitation
+) -> dict[str, Any]:
+    """Bounds of shorter experiments, where the study asks for them; signals are replanned."""
+    if not study.lengths:
+        return {}
+    keys = episode_keys(study)[:CHUNK]
+    bounds = [
+        np.asarray(run_episodes(plant, excitation, length, study.spread, keys).bound).mean(axis=0)
+        for length in study.lengths
+    ]
+    names = names_of(plant.definition.parameters)
+    percent = {
+        n: (100 * values).tolist() for n, values in zip(names, np.transpose(bounds), strict=True)
+    }
+    return {"bound_by_length": {"num_steps": list(study.lengths), "cramer_rao_percent": percent}}
+
+
+def outcome(
+    plant: AbstractPlant,
+    estimator: AbstractEstimator,
+    episodes: Episodes,
+    on_rig: Mapping[str, np.ndarray] = MappingProxyType({}),
+) -> Outcome:
+    """What an estimator makes of a batch of episodes."""
+    estimated, std_error, status = estimate_all(plant, estimator, episodes.trajectory)
+    return Outcome(
+        true=np.stack(episodes.params, axis=1),
+        estimated=np.asarray(estimated),
+        std_error=np.asarray(std_error),
+        status=np.asarray(status),
+        is_violation=np.asarray(episodes.is_violation),
+        max_abs_output=np.asarray(episodes.max_abs_output),
+        bound=np.asarray(episodes.bound),
+        log_det=np.asarray(jax.vmap(d_optimality)(episodes.information)),
+        on_rig=on_rig,
+    )
+
+
+def joined(parts: list[Outcome]) -> Outcome:
+    """Several batches as one."""
+    return jax.tree.map(lambda *arrays: np.concatenate(arrays), *parts)

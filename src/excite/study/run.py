@@ -1,0 +1,294 @@
+"""A study with agents: what is missing is trained, what is finished is kept.
+
+A run folder grows: `seeds/AGENT/N/` holds the policy, learning curve and metrics of one
+finished seed (while it runs, its checkpoint and logs), `methods.json` the rows of the
+methods. Everything is written whole or not at all, so that a study can be interrupted at
+any moment and started again. The table is made from those files alone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import hashlib
+import os
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from .. import __version__
+from ..files import csv_text, json_ready, write_bytes, write_json
+from ..plant import AbstractPlant
+from ..policy import POLICY_ENDING, read_policy
+from ..record.read import SIGNAL_ENDINGS
+from .evaluation import Progress
+from .folder import agent_settings, fingerprint, read_json, seed_folder, study_of
+from .spec import Study
+from .workers import Engine, run
+
+KIND = "excite study"
+FREE = {"name", "title", "inferred", "ours", "reference", "source"}
+FREE |= {"agents", "decision", "training", "gradient", "seeds"}
+"""What may change in a study that goes on: words, and agents; every seed says what it was."""
+
+_Target = tuple[str, str, int]
+
+_TASKS = {
+    "methods": "excite.study.tasks:methods_task",
+    "clairvoyant": "excite.study.tasks:clairvoyant_task",
+    "seed": "excite.study.tasks:seed_task",
+}
+
+
+@contextlib.contextmanager
+def opened(study: Study, folder: Path, command: str = "") -> Iterator[dict[str, dict[str, Any]]]:
+    """A run folder of this study, new or begun, for one process at a time.
+
+    Yields the arguments of every task that is not finished, by its name.
+
+    Raises:
+        ValueError: where the folder holds something else, or another study, or is in use.
+    """
+    every = _checkpoint_seconds()
+    markers = {"study.json", "run.json"}
+    is_begun = folder.is_dir() and bool({p.name for p in folder.iterdir()} - {*markers, ".lock"})
+    if is_begun and not any((folder / name).is_file() for name in markers):
+        raise ValueError(f"{folder} exists and is no run folder; choose another name")
+    with _locked(folder):
+        plant, text = study.build_plant(), _plant_text(study)
+        marker = {**_marker(study, plant, text), "command": command}
+        if is_begun:
+            _require_same_study(study, marker, folder)
+        tasks = _missing(study, plant, folder, every)
+        # Whatever is refused was refused by now.
+        write_json(folder / "study.json", study.model_dump())
+        write_json(folder / "run.json", marker)
+        source = {"text": text, "hash": plant.description.hash}
+        shared = {"study": json_ready(study.model_dump()), "plant": source}
+        for own in tasks.values():
+            if "folder" in own:
+                Path(own["folder"]).mkdir(parents=True, exist_ok=True)
+        yield {name: {**shared, **own} for name, own in tasks.items()}
+
+
+@contextlib.contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """The folder, made where there is none, for one process at a time."""
+    if folder.is_file():
+        raise ValueError(f"{folder} exists and is no run folder; choose another name")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = (folder / ".lock").open("w")
+    except OSError as error:
+        raise ValueError(f"{folder}: cannot be written ({error.strerror})") from None
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise ValueError(f"{folder}: another process is working on this study") from None
+        yield
+
+
+def _checkpoint_seconds() -> float:
+    """Least time between two checkpoints of a seed."""
+    text = os.environ.get("EXCITE_CHECKPOINT_SECONDS", "20")
+    with contextlib.suppress(ValueError):
+        if (seconds := float(text)) >= 0:
+            return seconds
+    raise ValueError(f"EXCITE_CHECKPOINT_SECONDS must be zero or a positive number: got {text!r}")
+
+
+def _marker(study: Study, plant: AbstractPlant, text: str | None) -> dict[str, Any]:
+    """What `run.json` says, by which the folder is known again."""
+    return {
+        "kind": KIND,
+        "excite": __version__,
+        "plant": plant.description.to_dict(),
+        "plant_hash": plant.description.hash,
+        "plant_file": None if text is None else hashlib.sha256(text.encode()).hexdigest(),
+        "policies": {
+            name: origin.get("policy_hash") or origin["signal_hash"]
+            for name, origin in study.origins(plant).items()
+        },
+    }
+
+
+def _plant_text(study: Study) -> str | None:
+    """Source of a user's own plant."""
+    if ":" not in study.plant:
+        return None
+    return Path(study.plant.rpartition(":")[0]).read_text(encoding="utf-8")
+
+
+def _require_same_study(study: Study, marker: Mapping[str, Any], folder: Path) -> None:
+    """Raises ValueError where the folder is of another study; a file that was deleted may be."""
+    if (folder / "study.json").is_file():
+        own, saved = _compared(study), _compared(study_of(folder))
+        for key in own:
+            if saved[key] != own[key]:
+                raise ValueError(
+                    f"{folder} holds another study: its {key!r} differs; choose another name"
+                )
+    if (folder / "run.json").is_file():
+        saved = read_json(folder / "run.json", "kind", "plant_hash", "plant_file")
+        if saved["kind"] != KIND:
+            raise ValueError(f"{folder} holds a run of another kind; choose another name")
+        for key, what in (("plant_hash", "plant"), ("plant_file", "plant"), ("policies", "policy")):
+            if saved.get(key, marker[key]) != marker[key]:
+                raise ValueError(f"{folder} holds a study of another {what}; choose another name")
+
+
+def _compared(study: Study) -> dict[str, Any]:
+    """Settings that decide what is computed, but for where a plant or a policy lies."""
+    settings = json_ready(study.model_dump(exclude=FREE))
+    settings["plant"] = study.plant.rpartition(":")[2]
+    for method in settings["methods"].values():
+        if method["excitation"].endswith((POLICY_ENDING, *SIGNAL_ENDINGS)):
+            method["excitation"] = Path(method["excitation"]).name
+    return settings
+
+
+def _is_finished(study: Study, plant: AbstractPlant, target: _Target, folder: Path) -> bool:
+    """Whether a task's results are there; ValueError where they are of another training."""
+    kind, agent, seed = target
+    if kind != "seed":
+        return (folder / f"{kind}.json").is_file()
+    path = seed_folder(folder, agent, seed) / "metrics.json"
+    if not path.is_file():
+        return False
+    if read_json(path, "rows", "fingerprint")["fingerprint"] != fingerprint(study, plant, agent):
+        raise ValueError(
+            f"{folder} holds another study: {path} is of other settings of {agent!r}"
+            f"{_differing(study, plant, agent, path)}; choose another name"
+        )
+    return True
+
+
+def _differing(study: Study, plant: AbstractPlant, agent: str, metrics: Path) -> str:
+    """Names of those settings, as far as the seed's policy tells them."""
+
+    def flat(settings: Mapping[str, Any]) -> dict[str, Any]:
+        parts = (settings, settings.get("decision", {}), settings.get("training", {}))
+        return {k: v for part in parts for k, v in part.items() if v not in parts[1:]}
+
+    try:
+        before = flat(read_policy(metrics.with_name("policy.safetensors")).provenance)
+    except (ValueError, AttributeError):
+        return ""
+    own = flat(json_ready(agent_settings(study, plant, agent)))
+    names = [name for name, value in own.items() if name in before and before[name] != value]
+    return f" ({', '.join(names)})" if names else ""
+
+
+def run_study(
+    study: Study,
+    folder: Path,
+    engine: Engine,
+    progress: Progress = lambda *_: None,
+    on_done: Callable[[str], None] = lambda _: None,
+    command: str = "",
+) -> dict[str, Exception]:
+    """Computes what the run folder lacks.
+
+    Args:
+        progress: called about once a second, in thousandths of a task.
+        on_done: called with the name of every task that was finished.
+        command: that runs it, kept in `run.json` for those who want to do it again.
+
+    Returns:
+        Why, for every task that failed in spite of all tries.
+    """
+    with opened(study, folder, command) as tasks:
+        targets = _names(study)
+        if tasks:  # a table of before is not that of this study
+            (folder / "table.json").unlink(missing_ok=True)
+        before = len(targets) - len(tasks)
+
+        def finished(name: str, result: Any) -> None:
+            _keep(targets[name], folder, result)
+            on_done(name)
+
+        def tick() -> None:
+            live = {n: _live(study, targets[n], folder) for n in tasks}
+            done = before + sum(fraction for fraction, _ in live.values())
+            text = next((text for _, text in reversed(live.values()) if text), "")
+            progress(text, int(1000 * done), 1000 * len(targets))
+
+        failures = {}
+        for kind, target in _TASKS.items():
+            chosen = {n: t for n, t in tasks.items() if targets[n][0] == kind}
+            failures |= run(target, chosen, engine, on_done=finished, on_tick=tick)
+        return failures
+
+
+def _names(study: Study) -> dict[str, _Target]:
+    """Kind, agent and seed of every task by name."""
+    names: dict[str, _Target] = {"methods": ("methods", "", 0)} if study.methods else {}
+    if study.clairvoyant is not None:
+        names["clairvoyant"] = ("clairvoyant", "", 0)
+    for seed in range(study.seeds):
+        names |= {f"{agent} seed {seed}": ("seed", agent, seed) for agent in study.agents}
+    return names
+
+
+def _missing(
+    study: Study, plant: AbstractPlant, folder: Path, checkpoint_seconds: float
+) -> dict[str, dict[str, Any]]:
+    """The tasks that are not finished, with the arguments that are each one's own."""
+    tasks = {}
+    for name, (kind, agent, seed) in _names(study).items():
+        if _is_finished(study, plant, (kind, agent, seed), folder):
+            continue
+        own = {}
+        if kind == "seed":
+            place = seed_folder(folder, agent, seed)
+            for path in (place, *place.parents):
+                if path.is_file():
+                    raise ValueError(f"{path} is a file where a folder is needed; move it away")
+            own = {"agent": agent, "seed": seed, "folder": str(place.absolute())}
+            own["checkpoint_seconds"] = checkpoint_seconds
+        tasks[name] = own
+    return tasks
+
+
+def _keep(target: _Target, folder: Path, result: Any) -> None:
+    """Writes what a task returned; the file that marks it as finished last."""
+    kind, agent, seed = target
+    if kind != "seed":
+        write_json(folder / f"{kind}.json", result)
+        return
+    place = seed_folder(folder, agent, seed)
+    write_bytes(place / "policy.safetensors", result["policy"])
+    columns = {name: [row[name] for row in result["curve"]] for name in result["curve"][0]}
+    write_bytes(place / "curve.csv", csv_text(columns).encode())
+    write_json(place / "metrics.json", result["metrics"])
+    for name in ("checkpoint.safetensors", "progress.json"):
+        (place / name).unlink(missing_ok=True)
+
+
+def _live(study: Study, target: _Target, folder: Path) -> tuple[float, str]:
+    """How far a task is, and what its newest look at the policy showed."""
+    kind, agent, seed = target
+    if kind != "seed":
+        return float((folder / f"{kind}.json").is_file()), ""
+    place = seed_folder(folder, agent, seed)
+    if (place / "metrics.json").is_file():
+        return 1.0, ""
+    try:  # it is there to be looked at, and may be anything
+        row = read_json(place / "progress.json")
+        total = study.agent(agent).total_steps(study.num_steps)
+        return row["steps"] / total, _looks(agent, seed, row)
+    except (ValueError, KeyError, TypeError, AttributeError):
+        return 0.0, ""
+
+
+def _looks(agent: str, seed: int, row: dict[str, float]) -> str:
+    errors = ", ".join(
+        f"{name.removeprefix('relative_error_')} {100 * value:.3g} %"
+        for name, value in row.items()
+        if name.startswith("relative_error_")
+    )
+    return (
+        f"{agent} seed {seed}: return {row['return']:.3g}, {errors}, "
+        f"violations {100 * row['violation_rate']:.0f} %"
+    )

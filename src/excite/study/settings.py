@@ -1,0 +1,108 @@
+"""Tables of a study file: base models, and pydantic's complaints as sentences."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import re
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Annotated, Any, TypeVar
+
+import pydantic
+from pydantic import BaseModel, ConfigDict, Field
+
+from ..description import unknown
+
+_T = TypeVar("_T")
+
+
+class Settings(BaseModel):
+    """A table of a study file: keys that do not exist are refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Choice(Settings):
+    """One of several kinds, and its options."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """All but the kind."""
+        return dict(self.model_extra or {})
+
+
+Count = Annotated[int, Field(gt=0, strict=True)]
+Magnitude = Annotated[float, Field(ge=0, strict=True, allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, strict=True, allow_inf_nan=False)]
+
+
+class EstimatorSettings(Choice):
+    """One estimator: a kind and its options."""
+
+    kind: str
+
+
+def checked(
+    kind: type[_T],
+    values: Mapping[str, Any],
+    where: str,
+    tables: Mapping[str, type[BaseModel]] = MappingProxyType({}),
+) -> _T:
+    """Settings of one kind from a table of the study; ValueError for what is not allowed."""
+    fields = [f.name for f in dataclasses.fields(kind)] if dataclasses.is_dataclass(kind) else []
+    fields = fields or list(getattr(kind, "model_fields", {}))
+    for name in values:
+        if name not in fields:
+            raise unknown(f"{where} setting", name, fields)
+    try:
+        # As JSON, because a strict check of Python's own types would want tuples for lists.
+        content = json.dumps(dict(values), default=str)
+        return pydantic.TypeAdapter(kind).validate_json(content, strict=True)
+    except pydantic.ValidationError as error:
+        raise ValueError(f"{where}: {sentence(error, tables)}") from None
+
+
+_ALLOWED = {
+    "bool": "true or false",
+    "int": "a whole number",
+    "float": "a number",
+    "string": "a string",
+    "list": "a list",
+    "tuple": "a list",
+    "dict": "a table",
+    "model": "a table",
+}
+"""What is allowed where pydantic misses a type, by the first word of its complaint."""
+
+
+def sentence(
+    error: pydantic.ValidationError, tables: Mapping[str, type[BaseModel]] = MappingProxyType({})
+) -> str:
+    """One of pydantic's complaints as a sentence: a mistyped key before the one it misses.
+
+    Args:
+        tables: the settings in each table of the file, those of the file itself under "".
+    """
+    first = min(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
+    location = ".".join(str(part) for part in first["loc"])
+    if first["type"] == "extra_forbidden":
+        table = str(first["loc"][0]) if len(first["loc"]) > 1 else ""
+        model = tables[table if table in tables else ""]
+        where, _, key = location.rpartition(".")
+        return f"{where}: " * bool(where) + str(unknown("key", key, model.model_fields))
+    if first["type"] == "missing":
+        return f"the key {location!r} is missing"
+    if first["type"] == "value_error" and "ctx" in first:  # our own sentence
+        return f"{location}: " * bool(location) + str(first["ctx"]["error"])
+    got = json.dumps(first["input"], default=str)
+    if isinstance(first["input"], float) and not math.isfinite(first["input"]):
+        got = str(first["input"])
+    msg, _, rest = first["msg"].partition("Input should be ")
+    kind = re.match(r"([a-z]+)_(type|parsing|from|attributes)", first["type"])
+    allowed = _ALLOWED.get(kind[1], rest) if kind else rest
+    what = f" must be {allowed}" if allowed else f": {msg}"
+    return f"{location}{what}, got {got}"

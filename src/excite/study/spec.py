@@ -1,0 +1,324 @@
+"""`Study`: every choice of a comparison, read from a TOML file and checked at the door."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import jax
+import pydantic
+import tomlkit
+import tomlkit.exceptions
+from pydantic import Field
+
+from ..description import names_of, unknown
+from ..environment import InformationGain
+from ..estimation import ARX, AbstractEstimator, Decrement
+from ..estimation.catalogue import ESTIMATORS, estimator_named
+from ..excitation import AbstractExcitation
+from ..excitation.catalogue import excitation_and_origin, excitation_named
+from ..files import folder_word
+from ..information import require_noise
+from ..plant import AbstractARXPlant, AbstractPlant
+from ..plant.catalogue import plant_named, with_sensor
+from ..policy import POLICY_ENDING
+from ..record.read import SIGNAL_ENDINGS
+from ..training.gradient import GradientSettings
+from ..training.settings import PPOSettings
+from .agent import REWARD_TABLES, Agent, AgentSettings, DecisionSettings
+from .settings import Choice, Count, EstimatorSettings, Magnitude, Settings, checked, sentence
+
+
+class SensorSettings(Settings):
+    """Sensor of one output, in its unit; what is left out stays the plant's."""
+
+    noise_sd: Magnitude | None = None
+    resolution: Magnitude | None = None
+
+
+class MethodSettings(Choice):
+    """One way to excite: a kind of excitation and its options."""
+
+    excitation: str
+
+
+class ClairvoyantSettings(Settings):
+    """Signals designed for known parameters, by which methods are measured.
+
+    Attributes:
+        plants: for how many of the evaluation episodes' plants.
+        starts: of the search for each.
+    """
+
+    plants: Count = 32
+    starts: Count = 4
+
+
+class RigSettings(Settings):
+    """Experiments on the plant's simulated rig (`excite.rig.simulated`), not on the plant.
+
+    Attributes:
+        latency, jitter: of an input's action [s], by default the rig's.
+        dropout: probability that a reading repeats the one before it.
+        filter: whether every method runs once more, behind the predictive safety filter.
+    """
+
+    latency: Magnitude | None = None
+    jitter: Magnitude | None = None
+    dropout: Annotated[float, Field(ge=0, lt=1, strict=True)] | None = None
+    filter: Annotated[bool, Field(strict=True)] = False
+
+    def numbers(self) -> dict[str, float]:
+        """Those of the rig that are set."""
+        return self.model_dump(exclude={"filter"}, exclude_none=True)
+
+
+class ReferenceRow(Settings):
+    """A published row of the same table: mean and standard deviation of each column."""
+
+    relative_error_percent: dict[str, tuple[float, float]]
+    max_abs_output: tuple[float, float]
+    violations: str
+    viable_seeds: str = ""
+
+
+class Study(Settings):
+    """Methods x estimators over common plants and noise.
+
+    Attributes:
+        name, title: a word, and a line for tables.
+        plant: name, or path/to/file.py:ClassName.
+        episodes: evaluation episodes of each method, each with a plant of its own.
+        num_steps: T, steps of an episode.
+        seed: of plants, noise and excitations.
+        spread: parameters are uniform in nominal value ± spread times their scale (by
+            default the nominal value itself).
+        sensor: by output, where it differs from the plant's.
+        methods, estimators: by the name that tables show.
+        agents: to be trained, by the name that tables show.
+        seeds: trainings of each agent, with the seeds 0, 1, ...
+        decision: settings of all agents.
+        training, gradient: hyper-parameters of all agents trained by PPO, and by gradient.
+        clairvoyant: signals to measure the methods by.
+        lengths: numbers of steps at which every method's Cramér-Rao bound is computed.
+        rig: where experiments are made on a simulated rig.
+        inferred: settings that the source of the study does not state, in words.
+        ours: settings that differ from the source's, in words.
+        reference: published rows by method, shown in tables for comparison.
+        source: where they were published.
+    """
+
+    name: str
+    title: str = ""
+    plant: str
+    episodes: Count = 100
+    num_steps: Count = 500
+    seed: Annotated[int, Field(ge=0, lt=2**63, strict=True)] = 0
+    spread: Annotated[float, Field(ge=0, lt=1, strict=True, allow_inf_nan=False)] = 0.3
+    sensor: dict[str, SensorSettings] = {}
+    methods: dict[str, MethodSettings] = {}
+    estimators: dict[str, EstimatorSettings]
+    agents: dict[str, AgentSettings] = {}
+    seeds: Count = 10
+    decision: dict[str, Any] = {}
+    training: dict[str, Any] = {}
+    gradient: dict[str, Any] = {}
+    clairvoyant: ClairvoyantSettings | None = None
+    lengths: list[Count] = []
+    rig: RigSettings | None = None
+    inferred: list[str] = []
+    ours: list[str] = []
+    reference: dict[str, ReferenceRow] = {}
+    source: str = ""
+
+    def build_plant(self) -> AbstractPlant:
+        """The plant behind the study's sensor.
+
+        Raises:
+            ValueError: for an unknown plant or output.
+        """
+        own = self.sensor.items()
+        return with_sensor(
+            plant_named(self.plant),
+            {n: s.noise_sd for n, s in own if s.noise_sd is not None},
+            {n: s.resolution for n, s in own if s.resolution is not None},
+        )
+
+    def build_methods(self, plant: AbstractPlant) -> dict[str, AbstractExcitation]:
+        """The study's excitations, checked against the plant and the number of steps."""
+        methods = {}
+        for length in self.lengths:
+            if not 2 <= length <= self.num_steps:
+                raise ValueError(f"lengths must lie between 2 and num_steps: got {length}")
+        for name, method in self.methods.items():
+            made = excitation_named(method.excitation, method.options, plant)
+            try:
+                jax.eval_shape(partial(made.init, plant, self.num_steps), jax.random.key(0))
+            except ValueError as error:
+                raise ValueError(f"{method.excitation}: {error}") from None
+            methods[name] = made
+        return methods
+
+    def warnings(self) -> list[str]:
+        """A sentence for every policy among the methods that was trained on another plant."""
+        origins = self.origins(self.build_plant())
+        found = {
+            self.methods[n].excitation: o["warning"] for n, o in origins.items() if "warning" in o
+        }
+        return [f"{path}: {warning}" for path, warning in found.items()]
+
+    def origins(self, plant: AbstractPlant) -> dict[str, dict[str, str]]:
+        """What a record must say of each method that is a policy, see `excitation_and_origin`."""
+        own = {
+            name: excitation_and_origin(m.excitation, m.options, plant)[1]
+            for name, m in self.methods.items()
+        }
+        return {name: origin for name, origin in own.items() if origin}
+
+    def build_estimators(self, plant: AbstractPlant) -> dict[str, AbstractEstimator]:
+        """The study's estimators.
+
+        Raises:
+            ValueError: also for an ARX estimator and a plant without inverse mapping.
+        """
+        estimators = {n: estimator_named(e.kind, e.options) for n, e in self.estimators.items()}
+        for name, estimator in estimators.items():
+            if isinstance(estimator, ARX | Decrement) and not isinstance(plant, AbstractARXPlant):
+                raise ValueError(
+                    f"estimator {name!r} needs a plant with a mapping from ARX coefficients; "
+                    f"{self.plant!r} has none, 'nls' needs none"
+                )
+        return estimators
+
+    def agent(self, name: str) -> Agent:
+        """An agent with all its settings; ValueError for one that is not allowed."""
+        own = self.agents[name]
+        shared = {"ppo": self.training, "gradient": self.gradient}[own.method]
+        return Agent.of(own, self.decision, shared, self.estimators)
+
+    def bound_curves(self) -> list[str]:
+        """Agents whose learning curves hold the Cramér-Rao bound in the place of errors."""
+        plant = self.build_plant()
+        envs = {
+            name: self.agent(name).env(plant, self.spread, self.num_steps) for name in self.agents
+        }
+        return [n for n, env in envs.items() if isinstance(env.objective, InformationGain)]
+
+    def checked(self, where: str) -> Study:
+        """Itself, checked down to every option; ValueError, naming `where`, for a mistake."""
+        try:
+            plant = self.build_plant()
+            self.build_methods(plant)
+            self.build_estimators(plant)
+            self.check_agents(plant)
+            self.check_reference(plant)
+        except ValueError as error:
+            raise ValueError(f"{where}: {error}") from None
+        return self
+
+    def check_agents(self, plant: AbstractPlant) -> None:
+        """Raises ValueError where an agent cannot be built, or its name is taken."""
+        checked(DecisionSettings, self.decision, "decision", REWARD_TABLES)
+        checked(PPOSettings, self.training, "training")
+        checked(GradientSettings, self.gradient, "gradient")
+        words: dict[str, str] = {}
+        for name in self.agents:
+            if name in self.methods:
+                raise ValueError(f"{name!r} is both a method and an agent")
+            other = words.setdefault(folder_word(name), name)
+            if other != name or not folder_word(name):
+                raise ValueError(
+                    f"the agent {name!r} needs a name of its own in letters and digits"
+                    + (f"; {other!r} has the same" if other != name else "")
+                )
+            try:
+                self.agent(name).env(plant, self.spread, self.num_steps)
+            except ValueError as error:
+                raise ValueError(f"agents.{name}: {error}") from None
+        if self.agents:
+            require_noise(plant)
+            if self.num_steps < 2:
+                raise ValueError("num_steps must be at least 2 where agents are trained, got 1")
+
+    def check_reference(self, plant: AbstractPlant) -> None:
+        """Raises ValueError for published rows of an unknown method or parameter."""
+        parameters = names_of(plant.definition.parameters)
+        for method, row in self.reference.items():
+            if method not in (known := [*self.methods, *self.agents]):
+                raise unknown("method in reference", method, known)
+            for name in row.relative_error_percent:
+                if name not in parameters:
+                    raise unknown(f"parameter in reference.{method}", name, parameters)
+
+    def changed(self, estimators: str | None = None, **values: Any) -> Study:
+        """The same study with other settings; None leaves a setting as it is.
+
+        Args:
+            estimators: names of the study's own or of any estimator, with commas between.
+        """
+        settings = {k: v for k, v in values.items() if v is not None}
+        if estimators is not None:
+            chosen = [name.strip() for name in estimators.split(",")]
+            known = {n: {"kind": n} for n in ESTIMATORS} | {
+                n: e.model_dump() for n, e in self.estimators.items()
+            }
+            for name in chosen:
+                if name not in known:
+                    raise unknown("estimator", name, known)
+            settings["estimators"] = {name: known[name] for name in chosen}
+        return study_from({**self.model_dump(), **settings}, "settings")
+
+
+_TABLES = {
+    "": Study,
+    "clairvoyant": ClairvoyantSettings,
+    "rig": RigSettings,
+    "sensor": SensorSettings,
+    "reference": ReferenceRow,
+    "agents": AgentSettings,
+}
+
+
+def read_study(path: Path) -> Study:
+    """The study in a TOML file, checked down to every option of every method.
+
+    Raises:
+        ValueError: one sentence for a file that cannot be read, a key that does not
+            exist (with the nearest that does), or a value that is not allowed.
+    """
+    try:
+        content = tomlkit.parse(path.read_text(encoding="utf-8")).unwrap()
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise ValueError(f"{path}: cannot be read ({reason})") from None
+    except tomlkit.exceptions.ParseError as error:
+        raise ValueError(f"{path}: not valid TOML: {error}") from None
+    study = study_from(content, str(path))
+    return _beside(study, path.parent).checked(str(path))
+
+
+def _beside(study: Study, folder: Path) -> Study:
+    """The study with the files it names, where they lie in its own folder."""
+    plant, methods = study.plant, study.model_dump()["methods"]
+    if ":" in plant and (folder / plant.rpartition(":")[0]).is_file():
+        plant = str(folder / plant)
+    for method in methods.values():
+        file = folder / method["excitation"]
+        if file.suffix in (POLICY_ENDING, *SIGNAL_ENDINGS) and file.is_file():
+            method["excitation"] = str(file)
+    return study.changed(plant=plant, methods=methods)
+
+
+def study_from(content: Mapping[str, Any], where: str) -> Study:
+    """A study from its settings; ValueError, naming `where`, for what is not allowed."""
+    try:
+        study = Study.model_validate(content)
+    except pydantic.ValidationError as error:
+        raise ValueError(f"{where}: {sentence(error, _TABLES)}") from None
+    if not (study.methods or study.agents):
+        raise ValueError(f"{where}: the study has no methods")
+    if not study.estimators:
+        raise ValueError(f"{where}: the study has no estimators")
+    return study

@@ -1,0 +1,256 @@
+"""What a worker does for a study: evaluates methods, designs signals, trains a seed.
+
+Every task takes and returns plain data, so that it runs in any process on any machine. A seed
+that was interrupted resumes from its checkpoint; a seed repeated gives the same result.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import importlib
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Key
+
+from .. import __version__
+from ..environment import Env, Episodes, run_episodes
+from ..excitation import PolicyExcitation, Replay
+from ..files import new_run_folder, write_bytes, write_json
+from ..plant import AbstractPlant
+from ..policy import Policy
+from ..training.checkpoint import Checkpoint, Trained
+from ..training.signals import clairvoyant_signals, signal_env
+from .agent import Agent
+from .evaluation import Progress, episode_keys, evaluate_method, num_chunks, outcome
+from .folder import agent_settings, fingerprint
+from .spec import Study, study_from
+from .statistics import table_row
+
+
+@contextlib.contextmanager
+def unpacked(
+    settings: Mapping[str, Any], source: Mapping[str, Any]
+) -> Iterator[tuple[Study, AbstractPlant]]:
+    """The study of a task and its plant; a user's plant file lies here while it is needed.
+
+    Args:
+        settings: of the study.
+        source: `text`, the source of a user's own plant or None, and the plant's `hash`.
+    """
+    settings = dict(settings)
+    with tempfile.TemporaryDirectory() as folder:
+        if source["text"] is not None:
+            path, _, class_name = str(settings["plant"]).rpartition(":")
+            file = Path(folder) / Path(path).name
+            file.write_text(source["text"], encoding="utf-8")
+            settings["plant"] = f"{file}:{class_name}"
+        study = study_from(settings, "study")
+        plant = study.build_plant()
+        if plant.description.hash != source["hash"]:
+            raise ValueError(
+                f"the plant {plant.definition.name!r} of this worker is another one "
+                f"(hash {plant.description.hash[:8]}) than that of the study "
+                f"({source['hash'][:8]})"
+            )
+        yield study, plant
+
+
+COLLAPSED = 0.01
+"""An agent whose RMS input over the evaluation is below this fraction of its limit."""
+
+
+def seed_task(
+    study: Mapping[str, Any],
+    plant: Mapping[str, Any],
+    agent: str,
+    seed: int,
+    folder: str | None,
+    checkpoint_seconds: float,
+) -> dict[str, Any]:
+    """A trained policy, its learning curve, and how it does in the evaluation.
+
+    Args:
+        study: its settings.
+        plant: `text`, the source of a user's own plant or None, and the plant's `hash`.
+        agent, seed: what to train.
+        folder: for checkpoints and logs, where this machine sees it.
+        checkpoint_seconds: least time between two checkpoints.
+    """
+    with unpacked(study, plant) as (chosen, built):
+        mark, own = fingerprint(chosen, built, agent), chosen.agent(agent)
+        place = Path(folder) if folder and Path(folder).is_dir() else None
+        keeper = _Keeper(place, mark, checkpoint_seconds)
+        env = own.env(built, chosen.spread, chosen.num_steps)
+        trained = _trained(env, own, seed, keeper)
+        seconds = keeper.seconds()
+        provenance = {
+            "excite": __version__,
+            "study": chosen.name,
+            "agent": agent,
+            "seed": seed,
+            **agent_settings(chosen, built, agent),
+        }
+        policy = Policy(built.description, env.layout, trained.weights, provenance)
+        metrics = {
+            "agent": agent,
+            "seed": seed,
+            **_evaluated(chosen, built, agent, policy),
+            "validation": trained.validation,
+            "train_seconds": seconds,
+            "resumed_at_steps": keeper.resumed_at_steps,
+            "fingerprint": mark,
+        }
+        return {"policy": policy.to_bytes(), "curve": trained.curve, "metrics": metrics}
+
+
+def _trained(env: Env, agent: Agent, seed: int, keeper: _Keeper) -> Trained:
+    """By name, because the libraries of one trainer come with an extra."""
+    own = {"log_folder": keeper.log_folder} if agent.method == "ppo" else {}
+    train = importlib.import_module(f"excite.training.{agent.method}").train
+    return train(env, agent.training, seed, resume=keeper.saved(), on_boundary=keeper.keep, **own)
+
+
+def _evaluated(study: Study, plant: AbstractPlant, agent: str, policy: Policy) -> dict[str, Any]:
+    rows, rms = evaluate_method(study, plant, agent, PolicyExcitation.of(policy))
+    limit = np.array(policy.layout.input_half)
+    return {
+        "rows": rows,
+        "rms_input_fraction": float(np.max(rms / limit)),
+        "viable": bool(np.any(rms >= COLLAPSED * limit)),
+    }
+
+
+class _Keeper:
+    """Writes checkpoints and progress of one seed into its folder, if there is one."""
+
+    def __init__(self, folder: Path | None, fingerprint: str, every: float) -> None:
+        self.folder, self.fingerprint, self.every = folder, fingerprint, every
+        self.resumed_at_steps: int | None = None
+        self.path = None if folder is None else folder / "checkpoint.safetensors"
+        self.log_folder = None if folder is None else str(folder / "tensorboard")
+        self.before, self.start, self.last = 0.0, time.monotonic(), time.monotonic()
+
+    def seconds(self) -> float:
+        """Training time so far [s], that before an interruption included."""
+        return self.before + time.monotonic() - self.start
+
+    def saved(self) -> Checkpoint | None:
+        """The checkpoint to go on from."""
+        if self.path is None or not self.path.is_file():
+            return None
+        try:
+            checkpoint = Checkpoint.from_bytes(self.path.read_bytes(), str(self.path))
+            if checkpoint.state["fingerprint"] != self.fingerprint:
+                raise ValueError(f"{self.path} is of another training")
+            self.before = float(checkpoint.state["seconds"])
+            self.resumed_at_steps = int(checkpoint.state["num_steps"])
+        except (ValueError, KeyError, TypeError) as error:
+            what = error if type(error) is ValueError else f"{self.path} is damaged"
+            raise ValueError(f"{what}; delete it to train this seed from the beginning") from None
+        return checkpoint
+
+    def keep(self, checkpoint: Callable[[], Checkpoint], row: dict[str, float] | None) -> None:
+        """At every boundary."""
+        if self.folder is None or self.path is None:
+            return
+        if row is not None:
+            write_json(self.folder / "progress.json", row)
+        if time.monotonic() - self.last >= self.every:
+            made = checkpoint()
+            own = {"seconds": self.seconds(), "fingerprint": self.fingerprint}
+            state = {**made.state, **own}
+            write_bytes(self.path, dataclasses.replace(made, state=state).to_bytes())
+            self.last = time.monotonic()
+
+
+def run_benchmark(study: Study, progress: Progress = lambda *_: None) -> list[dict[str, Any]]:
+    """Rows of the study's methods in order, each with all estimators."""
+    plant = study.build_plant()
+    methods, rows = study.build_methods(plant), []
+    parts = num_chunks(study)
+    for m, (name, excitation) in enumerate(methods.items()):
+
+        def in_method(c: int, name: str = name, before: int = m * parts) -> None:
+            progress(name, before + c, len(methods) * parts)
+
+        rows += evaluate_method(study, plant, name, excitation, in_method)[0]
+    progress("done", len(methods) * parts, len(methods) * parts)
+    return rows
+
+
+def methods_task(study: Mapping[str, Any], plant: Mapping[str, Any]) -> dict[str, Any]:
+    """Rows of a study's own methods; what a worker is called for."""
+    with unpacked(study, plant) as (chosen, _):
+        return {"rows": run_benchmark(chosen)}
+
+
+def write_benchmark(
+    study: Study,
+    rows: list[dict[str, Any]],
+    shown: Mapping[str, bytes],
+    path: Path,
+    overwrite: bool = False,
+    command: str = "",
+) -> None:
+    """Leaves a run folder: the study, its rows as JSON, and what people look at.
+
+    Args:
+        shown: tables, figures and episodes, ready made, by file name.
+        command: that made it, for those who want to do it again.
+
+    Raises:
+        ValueError: where `path` holds something else, or a run and not `overwrite`.
+    """
+    with new_run_folder(path, overwrite) as folder:
+        for name, content in shown.items():
+            (folder / name).write_bytes(content)
+        write_json(folder / "table.json", {"rows": rows})
+        plant = study.build_plant().description
+        write_json(folder / "study.json", study.model_dump())
+        about = {"kind": "excite benchmark", "excite": __version__, "command": command}
+        write_json(folder / "run.json", {**about, "plant": plant.to_dict()})
+
+
+METHOD = "clairvoyant"
+
+
+def clairvoyant_task(study: Mapping[str, Any], plant: Mapping[str, Any]) -> dict[str, Any]:
+    """Rows of the clairvoyant signals, and how well their starts agree."""
+    with unpacked(study, plant) as (chosen, built):
+        if chosen.clairvoyant is None:
+            raise ValueError("the study has no clairvoyant signals")
+        keys = episode_keys(chosen)[: chosen.clairvoyant.plants]
+        env = signal_env(built, chosen.num_steps, chosen.spread)
+        design = clairvoyant_signals(env, keys, chosen.clairvoyant.starts)
+        episodes = _played(built, jnp.asarray(design.inputs), chosen.spread, keys)
+        rows = [
+            table_row(chosen, built.description, (METHOD, name), outcome(built, e, episodes))
+            for name, e in chosen.build_estimators(built).items()
+        ]
+        spread = np.ptp(design.worth_by_start, axis=1)
+        return {"rows": rows, "log_det_spread_of_starts": spread.tolist()}
+
+
+@eqx.filter_jit
+def _played(
+    plant: AbstractPlant,
+    inputs: Float[Array, "episode time input"],
+    spread: float,
+    keys: Key[Array, " episode"],
+) -> Episodes:
+    """Each signal on its own plant."""
+
+    def one(own: Float[Array, "time input"], key: Key[Array, ""]) -> Episodes:
+        episodes = run_episodes(plant, Replay(own), len(own), spread, key[None])
+        return jax.tree.map(lambda leaf: leaf[0], episodes)
+
+    return jax.vmap(one)(inputs, keys)

@@ -1,0 +1,202 @@
+"""Open-loop signals by the gradient of the information they bring.
+
+`robust_signal` is designed for plants not known in advance, on average over the prior;
+`clairvoyant_signals` one for each plant as if its parameters were known: what no
+experiment can beat, and what others are measured by (L. Pronzato, A. Pazman, Design of
+Experiments in Nonlinear Models, 2013). Both search from several starts under the limits of
+inputs and outputs; a last line search along the amplitude takes a signal to the limit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Key, PRNGKeyArray
+
+from ..environment import Env, EnvState, InformationGain, prior_sd_of
+from ..excitation import Multisine
+from ..plant import AbstractPlant
+from ..policy import Layout
+from .gradient import Batch, GradientSettings, Progress, experiments, update_all
+
+
+def signal_env(plant: AbstractPlant, num_steps: int, spread: float, criterion: str = "D") -> Env:
+    """The decision process of a designer who sees nothing of the experiment.
+
+    All parameters count alike, as where information is reported.
+    """
+    every = (True,) * len(plant.definition.parameters)
+    objective = InformationGain(every, prior_sd_of(spread), criterion=criterion, dense=False)
+    layout = Layout.of(plant.description, window=1, num_steps=num_steps)
+    return Env.of(plant, objective=objective, layout=layout, spread=spread)
+
+
+Report = Callable[[int, int], None]
+"""Called with the number of updates done, and of all."""
+
+CLAIRVOYANT = GradientSettings(num_updates=1500, learning_rate=0.03, margin=0.97, near=0.9975)
+"""Its outputs may come as near to the critical level as 0.9975 of it (39.9 of 40 degrees)."""
+
+ROBUST = GradientSettings(num_updates=1000, num_plants=32, learning_rate=0.03)
+
+NUM_JUDGES = 1000
+"""Plants that a robust signal is never trained on and must be safe for."""
+
+AMPLITUDES = np.linspace(0.8, 1.04, 25)
+"""Factors of the line search."""
+
+
+class OpenLoop(eqx.Module):
+    """A signal being designed: the hyperbolic tangent of free numbers."""
+
+    latent: Float[Array, "*search time input"]
+
+    def __call__(self, state: EnvState) -> Float[Array, " input"]:
+        """The action of this step."""
+        return jnp.tanh(self.latent[state.k])
+
+
+class _Played(eqx.Module):
+    """A signal as it is, within the input limits."""
+
+    actions: Float[Array, "*search time input"]
+
+    def __call__(self, state: EnvState) -> Float[Array, " input"]:
+        return self.actions[state.k]
+
+
+@dataclass(frozen=True)
+class Design:
+    """Designed signals; the leading axis is the plant, a single one for a robust signal.
+
+    Attributes:
+        inputs: in input units.
+        worth: gain of the criterion over the prior, mean over its plants.
+        nearness: largest output over its critical level.
+        worth_by_start: of the safe signal of each start; minus infinity where none was.
+    """
+
+    inputs: Float[np.ndarray, "plant time input"]
+    worth: Float[np.ndarray, " plant"]
+    nearness: Float[np.ndarray, " plant"]
+    worth_by_start: Float[np.ndarray, "plant start"]
+
+
+def clairvoyant_signals(
+    env: Env,
+    keys: Key[Array, " plant"],
+    num_starts: int,
+    settings: GradientSettings = CLAIRVOYANT,
+    report: Report = lambda *_: None,
+    *,
+    seed: int = 0,
+) -> Design:
+    """The best signal for each plant that these keys draw; the seed is that of the starts.
+
+    Raises:
+        ValueError: where no safe signal was found for a plant.
+    """
+    own = jnp.repeat(keys, num_starts)[:, None]
+    starts = _first_signals(env, jax.random.split(jax.random.key(seed), len(own)))
+    found = _search(env, settings, starts, lambda _: own, report)
+    return _at_the_limit(env, found, own, settings.near, len(keys))
+
+
+def robust_signal(
+    env: Env,
+    seed: int,
+    num_starts: int = 4,
+    settings: GradientSettings = ROBUST,
+    report: Report = lambda *_: None,
+) -> Design:
+    """The signal that is best on average over plants drawn at random, and safe for them.
+
+    Raises:
+        ValueError: where no safe signal was found.
+    """
+    first, second, key = jax.random.split(jax.random.key(seed), 3)
+
+    def fresh(i: int) -> Key[Array, "start plant"]:
+        drawn = jax.random.split(jax.random.fold_in(key, i), settings.num_plants)
+        return jnp.tile(drawn[None], (num_starts, 1))
+
+    starts = _first_signals(env, jax.random.split(first, num_starts))
+    found = _search(env, settings, starts, fresh, report)
+    judges = jnp.tile(jax.random.split(second, NUM_JUDGES)[None], (num_starts, 1))
+    return _at_the_limit(env, found, judges, settings.near, 1)
+
+
+def _search(
+    env: Env,
+    settings: GradientSettings,
+    player: OpenLoop,
+    keys: Callable[[int], Key[Array, "search plant"]],
+    report: Report,
+) -> Float[Array, "search time input"]:
+    """Actions at the end of all searches, side by side."""
+    now = eqx.filter_vmap(lambda p: Progress.start(p, settings))(player)
+    for i in range(settings.num_updates):
+        now, _ = update_all(env, settings, now, keys(i))
+        report(i + 1, settings.num_updates)
+    return jnp.tanh(now.player.latent)
+
+
+@eqx.filter_jit
+def _played(
+    env: Env, actions: Float[Array, "search time input"], keys: Key[Array, "search plant"]
+) -> Batch:
+    return jax.vmap(lambda own, plants: experiments(env, _Played(own), plants, 0.9))(actions, keys)
+
+
+def _at_the_limit(
+    env: Env,
+    actions: Float[Array, "search time input"],
+    keys: Key[Array, "search plant"],
+    limit: float,
+    num_plants: int,
+) -> Design:
+    """Every signal at its best safe amplitude, and of every plant the best of its starts."""
+    worth = np.full(len(actions), -np.inf)
+    nearness, factors = np.zeros(len(actions)), np.ones(len(actions))
+    for factor in AMPLITUDES:
+        batch = _played(env, jnp.clip(factor * actions, -1, 1), keys)
+        own, nearest = np.mean(batch.worth, axis=1), np.max(batch.nearness, axis=1)
+        is_better = (nearest < limit) & (own > worth)
+        worth = np.where(is_better, own, worth)
+        nearness = np.where(is_better, nearest, nearness)
+        factors = np.where(is_better, factor, factors)
+    by_start = worth.reshape(num_plants, -1)
+    if np.any(np.isneginf(by_start.max(axis=1))):
+        raise ValueError(
+            "no safe signal was found: each breaks a critical level on some plant; a smaller "
+            "spread, a shorter experiment or a longer search may help"
+        )
+    num_starts = by_start.shape[1]
+    best = np.arange(num_plants) * num_starts + np.argmax(by_start, axis=1)
+    chosen = np.clip(factors[best, None, None] * np.asarray(actions)[best], -1, 1)
+    middle, half = np.array(env.layout.input_middle), np.array(env.layout.input_half)
+    return Design(middle + half * chosen, by_start.max(axis=1), nearness[best], by_start)
+
+
+def _first_signals(env: Env, keys: Key[Array, " search"]) -> OpenLoop:
+    """Sums of sines in the plant's band with random phases, a fifth of its usual amplitude."""
+    plant, steps = env.plant, env.layout.num_steps
+    usual = np.array([i.amplitude for i in plant.definition.inputs]) / env.layout.input_half
+
+    def one(key: PRNGKeyArray) -> Float[Array, "time input"]:
+        smooth = Multisine().shape(plant, steps, key)
+        noise = jax.random.normal(key, smooth.shape)
+        spectrum = jnp.abs(jnp.fft.rfft(smooth, axis=0)) * jnp.exp(
+            2j * math.pi * jax.random.uniform(key, (steps // 2 + 1, smooth.shape[1]))
+        )
+        drawn = jnp.fft.irfft(spectrum, steps, axis=0)
+        unit = drawn / jnp.maximum(jnp.max(jnp.abs(drawn), axis=0), 1e-12)[None]
+        return 0.2 * jnp.asarray(usual)[None] * (unit + 0.01 * noise)
+
+    return OpenLoop(jax.vmap(one)(keys))

@@ -1,0 +1,73 @@
+"""A look at the policy being trained: validation episodes without exploration noise."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray
+
+from ..description import names_of
+from ..environment import Env
+from ..policy import Weights, forward
+
+WATCH_SEED = 0x7A11DA7E
+"""Validation episodes, the same for all seeds, apart from training and every evaluation."""
+
+
+class Watched(eqx.Module):
+    """Episodes of a policy without exploration noise; the leading axis is the episode.
+
+    Attributes:
+        total_reward: undiscounted return.
+        relative_errors: of the parameters, as the objective knows them.
+        is_violation: whether a critical level was reached.
+        rms_action: root mean square action of each episode, 1 is the input limit.
+    """
+
+    total_reward: Float[Array, "*episode"]
+    relative_errors: Float[Array, "*episode param"]
+    is_violation: Bool[Array, "*episode"]
+    rms_action: Float[Array, "*episode"]
+
+
+@eqx.filter_jit
+def watch(env: Env, weights: Weights, keys: Key[Array, " episode"]) -> Watched:
+    """One episode of the deterministic policy for every key."""
+
+    def episode(key: PRNGKeyArray) -> Watched:
+        state, observation = env.reset(key)
+
+        def advance(carry: tuple, _: None) -> tuple[tuple, tuple]:
+            state, observation = carry
+            action = forward(jnp, weights, observation)
+            state, t = env.step(state, action)
+            kept = t.reward, t.relative_errors, t.is_violation, jnp.mean(action**2)
+            return (state, t.observation), kept
+
+        start = state, observation
+        _, kept = jax.lax.scan(advance, start, None, length=env.layout.num_steps)
+        rewards, errors, violations, squares = kept
+        rms = jnp.sqrt(jnp.mean(squares))
+        return Watched(jnp.sum(rewards), errors[-1], violations[-1], rms)
+
+    return jax.vmap(episode)(keys)
+
+
+def watch_keys(num_episodes: int) -> Key[Array, " episode"]:
+    """Keys of the validation episodes."""
+    return jax.random.split(jax.random.key(WATCH_SEED), num_episodes)
+
+
+def look(env: Env, weights: Weights, num_episodes: int) -> dict[str, float]:
+    """What a learning curve shows of the deterministic policy, in the validation episodes."""
+    seen = watch(env, weights, watch_keys(num_episodes))
+    names = names_of(env.plant.definition.parameters)
+    errors = np.asarray(seen.relative_errors).mean(axis=0)
+    return {
+        "return": float(np.mean(seen.total_reward)),
+        "violation_rate": float(np.mean(np.asarray(seen.is_violation), dtype=float)),
+        "rms_action": float(np.sqrt(np.mean(np.asarray(seen.rms_action) ** 2))),
+        **{f"relative_error_{n}": float(e) for n, e in zip(names, errors, strict=True)},
+    }

@@ -1,0 +1,373 @@
+"""What the bench page asks for: experiments told as they happen, files identified, reports.
+
+Every function here is a generator of JSON-ready events, so that whoever asked can show the
+first while the next is computed, and can stop in between. Plants, excitations and policies
+are taken by their shipped names only: a name from a browser must never become a file.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import shlex
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .. import __version__
+from ..description import HALF_95, PlantDescription, display_unit, unknown
+from ..estimation import NLS, Experiments, Status, stack_experiments
+from ..estimation.catalogue import ESTIMATORS, estimator_named
+from ..estimation.identify import identify
+from ..estimation.result import Identification, write_run
+from ..excitation import AbstractExcitation, PolicyExcitation
+from ..excitation.catalogue import EXCITATIONS, LOOP, excitation_and_origin
+from ..files import json_ready, write_bytes
+from ..information import (
+    cramer_rao_bound,
+    d_optimality,
+    relative_size,
+    require_noise,
+    running_information,
+)
+from ..plant import AbstractPlant, Params, params_from
+from ..plant.catalogue import PLANTS, with_sensor
+from ..policy import mismatch, read_policy, shipped_policies
+from ..record import Record, columns_in, read_record
+from ..report import kept_samples, report_html
+from ..safety import critical_levels, is_violation, max_abs_output
+from ..simulation import Trajectory, run_episode
+
+Event = dict[str, Any]
+NUM_ESTIMATES = 20
+_FIRST = 40  # samples before the first estimate, the shortest horizon of the estimator
+_RECORD = "record.csv"  # name of a simulated record, here and in the command that makes it
+_MAX_POINTS = 2000  # more cannot be told apart on a screen
+_MAX_COLUMNS, _MAX_NAME = 500, 200  # of an uploaded file, and characters of a column's name
+
+
+# ------------------------------------------------------------------------- what there is
+
+
+def catalogue() -> Iterator[Event]:
+    """Plants, excitations, policies and estimators that can be chosen."""
+    policies = {name: read_policy(path) for name, path in shipped_policies().items()}
+    names = [*EXCITATIONS, *(LOOP + name for name in EXCITATIONS)]
+    plants = {}
+    for name, plant_class in PLANTS.items():
+        description = plant_class().description
+        fitting = {n: p.layout.num_steps for n, p in policies.items() if _fits(p, description)}
+        plants[name] = {**_shown(description), "policies": fitting}
+    yield {
+        "kind": "catalogue",
+        "version": __version__,
+        "plants": plants,
+        "excitations": names,
+        "estimators": list(ESTIMATORS),
+    }
+
+
+def warm_up() -> Iterator[Event]:
+    """Compiles what the page offers first, so that a worker's first run starts at once."""
+    plant = PLANTS["aero2"]().definition
+    asked = {
+        "plant": plant.name, "excitation": "chirp", "amplitude": plant.inputs[0].amplitude,
+        "noise": {}, "params": {}, "steps": 500, "seed": 0, "others": ["prbs", plant.name],
+    }  # fmt: skip
+    yield from episode(asked)
+    with tempfile.TemporaryDirectory() as folder:
+        yield from followed(asked, f"{folder}/run")
+
+
+def _fits(policy: Any, description: PlantDescription) -> bool:
+    try:
+        mismatch(policy, description)
+    except ValueError:
+        return False
+    return True
+
+
+def _shown(description: PlantDescription) -> dict[str, Any]:
+    """A description, with the unit in which people read each quantity, and its factor."""
+    data = description.to_dict()
+    for part in (*data["inputs"], *data["outputs"]):
+        part["shown_unit"], part["factor"] = display_unit(part["unit"])
+    return data
+
+
+# --------------------------------------------------------------------------- experiments
+
+
+@dataclasses.dataclass(frozen=True)
+class Experiment:
+    """One simulated experiment as it was asked for.
+
+    Attributes:
+        plant: with the sensor of this experiment.
+        params: true ones.
+        origin: what the record must say of a policy.
+        num_steps, seed: its length, and what its noise depends on.
+    """
+
+    plant: AbstractPlant
+    params: Params
+    excitation: AbstractExcitation
+    name: str
+    origin: Mapping[str, str]
+    num_steps: int
+    seed: int
+
+    @classmethod
+    def of(cls, asked: Mapping[str, Any], name: str) -> Experiment:
+        """With another excitation than the one asked for, the rest is the same.
+
+        Raises:
+            ValueError: for anything that is not known or not allowed.
+        """
+        plant = with_sensor(_plant(asked["plant"]), asked["noise"], {})
+        require_noise(plant)
+        allowed = [*EXCITATIONS, *(LOOP + n for n in EXCITATIONS), *shipped_policies()]
+        if name not in allowed:
+            raise unknown("excitation", name, allowed)
+        # An amplitude is in units of the input, that of a loop in units of the output.
+        amplitude = asked["amplitude"] if name in EXCITATIONS else None
+        settings = {} if amplitude is None else {"amplitude": amplitude}
+        excitation, origin = excitation_and_origin(name, settings, plant)
+        steps = asked["steps"]
+        if isinstance(excitation, PolicyExcitation) and steps > excitation.layout.num_steps:
+            raise ValueError(
+                f"{name} was made for {excitation.layout.num_steps} steps; {steps} are asked for"
+            )
+        params = params_from(plant, asked["params"])
+        return cls(plant, params, excitation, name, origin, steps, asked["seed"])
+
+    def run(self) -> Trajectory:
+        """Input and output of every sample.
+
+        Raises:
+            ValueError: where the simulation leaves the finite numbers.
+        """
+        key = jax.random.key(self.seed)
+        run = run_episode(self.plant, self.params, self.excitation, self.num_steps, key)
+        if not np.all(np.isfinite(run.outputs)):
+            raise ValueError(
+                "the simulation left the finite numbers: these parameters make the plant too "
+                "fast for its integration step, or unstable"
+            )
+        return run
+
+
+def _plant(name: str) -> AbstractPlant:
+    """A shipped plant; never a file."""
+    if name not in PLANTS:
+        raise unknown("plant", name, PLANTS)
+    return PLANTS[name]()
+
+
+def simulated_record(
+    run: Trajectory, plant: AbstractPlant, params: Params, provenance: Mapping[str, Any]
+) -> Record:
+    """The record of a simulated experiment, as `excite simulate` writes it."""
+    return Record.of_episode(
+        run.time,
+        run.inputs,
+        run.measured,
+        {
+            "params": _by_name(plant.definition.parameters, params),
+            "starts_at_initial_state": True,
+            "provenance": {"excite": __version__, "simulated": True, **provenance},
+        },
+    )
+
+
+def episode(asked: Mapping[str, Any]) -> Iterator[Event]:
+    """All samples of the experiment asked for: what there is to be shown first."""
+    own = Experiment.of(asked, asked["excitation"])
+    run, d = own.run(), own.plant.description
+    yield {
+        "kind": "episode",
+        "plant": _shown(d),
+        "excitation": own.name,
+        "warning": own.origin.get("warning"),
+        "params": _by_name(d.parameters, own.params),
+        "time": run.time,
+        "inputs": run.inputs,
+        "outputs": run.measured,
+    }
+
+
+def followed(asked: Mapping[str, Any], folder: str) -> Iterator[Event]:
+    """Estimates on the way, then the result, then two other excitations beside it.
+
+    The run folder of the identification is left at `folder`, the same as that of
+    `excite simulate` and `excite identify` one after the other.
+    """
+    own = Experiment.of(asked, asked["excitation"])
+    run = own.run()
+    information = running_information(own.plant, own.params, run.inputs)
+    yield from _estimates(own, run, information)
+    row, result = _outcome(own, run, information[-1])
+    if result is not None:
+        write_run(result, Path(folder), command=_experiment_again(asked))
+    identification = None if result is None else result.to_dict()
+    yield {"kind": "result", "row": row, "identification": identification}
+    for name in asked["others"]:
+        try:
+            other = Experiment.of(asked, name)
+            its_run = other.run()
+        except ValueError as error:  # the experiment asked for stands without it
+            yield {"kind": "left_out", "excitation": name, "sentence": str(error)}
+            continue
+        its = running_information(other.plant, other.params, its_run.inputs)[-1]
+        yield {"kind": "other", "row": _outcome(other, its_run, its)[0]}
+
+
+def _estimates(own: Experiment, run: Trajectory, information: Any) -> Iterator[Event]:
+    """The estimate from the first samples, from more of them, and at last from all."""
+    plant, size = _plant(own.plant.definition.name), relative_size(own.plant, own.params)
+    data = stack_experiments(plant, [run.inputs], [run.measured], True)
+    free = jnp.ones(len(own.params), bool)
+    counts = np.linspace(min(_FIRST, own.num_steps + 1), own.num_steps + 1, NUM_ESTIMATES)
+    for count in np.unique(counts.astype(int)):
+        estimate = NLS()(plant, _first(data, int(count)), plant.nominal, free)
+        is_good = int(estimate.status) == Status.SUCCESSFUL
+        variance = np.diag(np.asarray(estimate.covariance))
+        half = HALF_95 * np.sqrt(np.where(is_good, variance, np.nan))
+        bound = HALF_95 * np.asarray(cramer_rao_bound(information[count - 2]) * size)
+        parts = plant.definition.parameters
+        yield {
+            "kind": "estimate",
+            "k": int(count) - 1,
+            "estimate": _by_name(parts, estimate.params if is_good else bound * np.nan),
+            "half": _by_name(parts, half),
+            "bound": _by_name(parts, bound),
+        }
+
+
+def _experiment_again(asked: Mapping[str, Any]) -> str:
+    """The commands that make the same run folder, one a line."""
+    has_amplitude = asked["amplitude"] is not None and asked["excitation"] in EXCITATIONS
+    simulate = [
+        "excite", "simulate", asked["plant"], "--excitation", asked["excitation"],
+        *_given("--set", {"amplitude": asked["amplitude"]} if has_amplitude else {}),
+        "--steps", str(asked["steps"]), *_given("--params", asked["params"]),
+        *_given("--noise", asked["noise"]), "--seed", str(asked["seed"]), "--out", _RECORD,
+    ]  # fmt: skip
+    identify = ["excite", "identify", _RECORD, "--plant", asked["plant"], "--out", "run"]
+    return f"{shlex.join(simulate)}\n{shlex.join(identify)}"
+
+
+def _identification_again(asked: Mapping[str, Any], name: str) -> str:
+    """The command that makes the same run folder of a file."""
+    words = [
+        "excite", "identify", f"./{name}" if name[0] == "-" else name,
+        "--plant", asked["plant"], "--estimator", asked["estimator"],
+        "--initial-state", asked["initial_state"], *_given("--column", asked["columns"]),
+        *_given("--scale", asked["scales"]), "--out", "run",
+    ]  # fmt: skip
+    return shlex.join(words)
+
+
+def _given(option: str, values: Mapping[str, Any]) -> list[str]:
+    """An option with its assignments, numbers in full; nothing where there are none."""
+    pairs = [f"{name}={value}".replace(",", "\\,") for name, value in values.items()]
+    return [option, ",".join(pairs)] if pairs else []
+
+
+def _first(data: Experiments, count: int) -> Experiments:
+    """The experiment when so many samples were measured; nothing compiles again."""
+    return dataclasses.replace(data, valid=jnp.arange(data.valid.shape[1])[None] < count)
+
+
+def _outcome(
+    own: Experiment, run: Trajectory, information: Any
+) -> tuple[Event, Identification | None]:
+    """A row of the comparison, and what was identified, unless nothing could be."""
+    plant, d = _plant(own.plant.definition.name), own.plant.description
+    provenance = {"excitation": own.name, "seed": own.seed, **own.origin}
+    record = simulated_record(run, own.plant, own.params, provenance)
+    # The estimator knows the plant as shipped: it is told nothing of this one's noise.
+    metadata = {**record.metadata, "plant": d.to_dict(), "plant_hash": d.hash}
+    record = dataclasses.replace(record, metadata=json_ready(metadata), source=_RECORD)
+    result, sentence = None, ""
+    try:
+        result = identify(plant, [record])
+    except ValueError as error:
+        sentence = str(error)
+    bound = np.asarray(cramer_rao_bound(information) * relative_size(own.plant, own.params))
+    params = {}
+    for p, true, least in zip(d.parameters, map(float, own.params), bound, strict=True):
+        found = None if result is None or p.name in result.held else result.params[p.name]
+        half = None if found is None or result is None else HALF_95 * result.std_error[p.name]
+        per = abs(true) or p.scale
+        params[p.name] = {
+            "estimate": found,
+            "true": true,
+            "error_percent": None if found is None else 100 * abs(found - true) / per,
+            "half_percent": None if half is None else 100 * half / per,
+            "cramer_rao_bound": float(least),
+            "cramer_rao_percent": float(100 * least / per),
+            "unit": p.unit,
+        }
+    return {
+        "excitation": own.name,
+        "status": result.status if result else sentence,
+        "params": params,
+        "is_violation": bool(is_violation(run.outputs, critical_levels(d))),
+        "max_abs_output": _by_name(d.outputs, max_abs_output(run.outputs)),
+        "log_det_information": float(d_optimality(information)),
+    }, result
+
+
+def _by_name(parts: Any, values: Any) -> dict[str, float]:
+    return {part.name: float(value) for part, value in zip(parts, values, strict=True)}
+
+
+# --------------------------------------------------------------------------------- files
+
+
+def columns(folder: str, name: str) -> Iterator[Event]:
+    """The columns of an uploaded file, and how many samples each has."""
+    with contextlib.chdir(folder):  # so that sentences say the file's name, not where it lies
+        table = columns_in(Path(name))
+    if not table:
+        raise ValueError(f"{name} has no column of numbers")
+    if len(table) > _MAX_COLUMNS or max(map(len, table)) > _MAX_NAME:
+        raise ValueError(
+            f"{name} has {len(table)} columns, the longest name has {max(map(len, table))} "
+            f"characters; at most {_MAX_COLUMNS} columns of {_MAX_NAME} characters are taken"
+        )
+    yield {"kind": "columns", "columns": {word: len(values) for word, values in table.items()}}
+
+
+def identified(asked: Mapping[str, Any], source: str, name: str, folder: str) -> Iterator[Event]:
+    """Parameters from an uploaded file; leaves a run folder as `excite identify` does."""
+    plant, estimator = _plant(asked["plant"]), estimator_named(asked["estimator"])
+    with contextlib.chdir(source):
+        record = read_record(Path(name), plant.description, asked["columns"], asked["scales"])
+    result = identify(plant, [record], estimator, initial_state=asked["initial_state"])
+    write_run(result, Path(folder), command=_identification_again(asked, name))
+    fitted = result.fitted[0]
+    signals = [*record.inputs.T, *record.outputs.T, *fitted.simulated.T]
+    kept = kept_samples(signals, _MAX_POINTS)
+    yield {
+        "kind": "identified",
+        "plant": _shown(result.plant),
+        "identification": result.to_dict(),
+        "time": record.time[kept],
+        "inputs": record.inputs[kept],
+        "outputs": record.outputs[kept],
+        "simulated": fitted.simulated[kept],
+    }
+
+
+def reported(folders: Sequence[str], out: str) -> Iterator[Event]:
+    """A self-contained report of run folders, written to `out`."""
+    text = report_html([Path(folder) for folder in folders])
+    write_bytes(Path(out), text.encode())
+    yield {"kind": "reported", "bytes": len(text)}

@@ -1,0 +1,85 @@
+"""What a browser asks, checked: words, numbers and limits; a refusal is one sentence."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from typing import Any
+
+MAX_UPLOAD = 32 * 2**20
+"""Bytes of an uploaded file."""
+MAX_STEPS = 5000
+"""Samples of a simulated experiment."""
+MAX_BODY = 64 * 2**10
+"""Bytes of a request that is no upload."""
+
+_FOLDERS = re.compile(r"(?<![\w.:/])/(?:[^\s/:'\"]+/)+")
+_WORD = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
+
+
+def without_folders(sentence: str) -> str:
+    """A sentence that names files, and not where on this computer they lie."""
+    return _FOLDERS.sub("", sentence)
+
+
+class RefusedError(Exception):
+    """A request that is refused: an HTTP status and one sentence for the user."""
+
+    def __init__(self, status: int, sentence: str) -> None:
+        super().__init__(sentence)
+        self.status, self.sentence = status, sentence
+
+
+# ------------------------------------------------------------- what a browser may ask for
+
+
+def word(asked: Mapping[str, Any], key: str) -> str:
+    """A name without dots, slashes and colons: never a path, never a file."""
+    value = asked.get(key)
+    if not (isinstance(value, str) and _WORD.fullmatch(value)):
+        raise RefusedError(400, f"{key}: the name of something that is shipped is needed")
+    return value
+
+
+def number(asked: Mapping[str, Any], key: str, lower: float, upper: float) -> float:
+    """A finite number of a range."""
+    value = asked.get(key)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not _is_finite(value):
+        raise RefusedError(400, f"{key}: a number is needed")
+    if not lower <= value <= upper:
+        raise RefusedError(400, f"{key} must lie between {lower:g} and {upper:g}: got {value:g}")
+    return float(value)
+
+
+def _is_finite(value: float) -> bool:
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # a whole number of very many digits
+        return False
+
+
+def whole(asked: Mapping[str, Any], key: str, lower: int, upper: int) -> int:
+    """A whole number of a range."""
+    value = number(asked, key, lower, upper)
+    if value != int(value):
+        raise RefusedError(400, f"{key} must be a whole number: got {value:g}")
+    return int(value)
+
+
+def numbers(asked: Mapping[str, Any], key: str) -> dict[str, float]:
+    """Numbers by name; at most 32."""
+    value = asked.get(key, {})
+    if not isinstance(value, dict) or len(value) > 32:
+        raise RefusedError(400, f"{key}: numbers by name are needed")
+    return {str(name): number(value, name, -1e12, 1e12) for name in value}
+
+
+def texts(asked: Mapping[str, Any], key: str) -> dict[str, str]:
+    """Short texts by name; at most 32."""
+    value = asked.get(key, {})
+    if not isinstance(value, dict) or len(value) > 32:
+        raise RefusedError(400, f"{key}: texts by name are needed")
+    if not all(isinstance(text, str) and len(text) <= 200 for text in value.values()):
+        raise RefusedError(400, f"{key}: texts by name are needed")
+    return value
