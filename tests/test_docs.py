@@ -58,7 +58,7 @@ def test_names_on_the_command_line_are_in_the_readme():
 
 
 def test_every_study_loads_and_stands_in_the_index_with_its_result():
-    index = (ROOT / "studies" / "README.md").read_text()
+    index = (ROOT / "docs" / "studies.md").read_text()
     for path in sorted((ROOT / "studies").glob("*.toml")):
         assert read_study(path).name == path.stem
         assert f"`{path.name}`" in index

@@ -16,6 +16,7 @@ from excite.plant import AbstractPlant, Aero2, CartPole, DCMotor
 from excite.plant.catalogue import PLANTS, plant_named, with_sensor
 from excite.policy import Layout, Policy
 from excite.study import Study, read_study
+from excite.study.catalogue import studies, study_path
 
 STUDIES = Path(__file__).parent.parent / "studies"
 
@@ -743,3 +744,20 @@ def test_an_agent_has_a_range_and_plants_of_its_own(tmp_path):
     env = study.agent("a").env(study.build_plant(), study.spread, study.num_steps)
     assert env.layout.input_half == (7.2,)
     assert env.spread == 0.1
+
+
+# Shipped studies
+
+
+def test_shipped_studies_are_found_by_name_and_an_unknown_one_names_the_nearest():
+    assert set(studies()) == {path.stem for path in STUDIES.glob("*.toml")}
+    assert study_path("table1") == studies()["table1"]
+    assert study_path("no/such.toml") == Path("no/such.toml")  # refused where it is read
+    with pytest.raises(ValueError, match=r"unknown study 'tabel1'; did you mean 'table1'\?"):
+        study_path("tabel1")
+
+
+def test_the_files_of_a_shipped_study_are_found_from_any_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    named = read_study(study_path("frontier")).methods["robust"].excitation
+    assert Path(named) == studies()["frontier"].with_name("frontier_robust.csv")

@@ -23,7 +23,7 @@ from .options import (
 
 
 @click.command()
-@click.argument("study", type=OUT_FILE, metavar="STUDY.toml")
+@click.argument("study", metavar="STUDY")
 @click.option("--episodes", type=click.IntRange(min=1), help="Instead of the study's.")
 @click.option("--seed", type=click.IntRange(0, 2**63 - 1), help="Instead of the study's.")
 @click.option("--estimators", metavar="NAME,...", help="Instead of the study's.")
@@ -33,9 +33,9 @@ from .options import (
 @json_option
 @computing
 def benchmark(
-    study: Path, out: Path | None, plot: Path | None, as_json: bool, **options: Any
+    study: str, out: Path | None, plot: Path | None, as_json: bool, **options: Any
 ) -> None:
-    """Compare the methods of STUDY.toml under identical conditions."""
+    """Compare the methods of STUDY, a shipped study or a file, under identical conditions."""
     from ..files import require_free_run_folder
     from ..report import benchmark_figure, save
     from ..study.episodes import example_episodes
@@ -63,11 +63,12 @@ def benchmark(
         show_comparison(rows, settings, out)
 
 
-def study_in(path: Path) -> Any:
-    """The study in a file, its warnings on stderr; shared with `study`."""
+def study_in(name: str) -> Any:
+    """A shipped study or one in a file, its warnings on stderr; shared with `study`."""
     from ..study import read_study
+    from ..study.catalogue import study_path
 
-    return warned(read_study(path))
+    return warned(read_study(study_path(name)))
 
 
 def warned(study: Any) -> Any:

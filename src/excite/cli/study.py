@@ -19,6 +19,7 @@ from .options import (
     json_option,
     progress_bar,
     show_json,
+    show_table,
 )
 
 
@@ -28,7 +29,7 @@ def study() -> None:
 
 
 @study.command()
-@click.argument("study_file", type=OUT_FILE, metavar="STUDY.toml")
+@click.argument("study_name", metavar="STUDY")
 @click.option("--out", type=OUT_FILE, required=True, metavar="FOLDER", help="Its run folder.")
 @click.option(
     "--engine",
@@ -44,14 +45,16 @@ def study() -> None:
 @json_option
 @computing
 def run(
-    study_file: Path, out: Path, engine: str, address: str | None, workers: int | None,
+    study_name: str, out: Path, engine: str, address: str | None, workers: int | None,
     as_json: bool,
 ) -> None:  # fmt: skip
-    """Train what STUDY.toml lacks in its run folder, then write its table and figures.
+    """Train what STUDY lacks in its run folder, then write its table and figures.
+
+    STUDY is the name of a shipped study (`excite study list`) or a file, path/to/study.toml.
 
     Interrupted at any moment, the same command goes on where it was.
     """
-    chosen = study_in(study_file)
+    chosen = study_in(study_name)
     run_study_here(chosen, out, as_json, engine, address, workers)
 
 
@@ -97,6 +100,25 @@ def _failed(failures: dict[str, Exception], out: Path) -> Exception:
         f"{len(failures)} task{'s' * (len(failures) > 1)} failed ({reasons}); what is finished "
         f"is kept in {out}, the same command tries the rest again"
     )
+
+
+@study.command("list")
+@json_option
+def list_studies(as_json: bool) -> None:
+    """List the studies that come with the package."""
+    import tomllib
+
+    from ..study.catalogue import studies
+
+    found = [
+        {"name": name, "title": tomllib.loads(path.read_text("utf-8"))["title"], "file": str(path)}
+        for name, path in studies().items()
+    ]
+    if as_json:
+        show_json({"studies": found})
+    else:
+        rows = [[study["name"], study["title"]] for study in found]
+        show_table("shipped studies: excite study run NAME --out FOLDER", ["name", "title"], rows)
 
 
 @study.command()
