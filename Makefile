@@ -3,19 +3,36 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo test lint types docs results agents policies evaluations clean
+PYTEST := $(BIN)/python -m pytest -n 2 --dist loadscope
+
+.PHONY: help demo test test-pages test-science test-all check-results lint types docs results \
+    agents policies evaluations clean
+
+help: ## this list
+	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 16
 
 demo: .venv/core ## the baseline rows of the paper's Table 1, with three estimators, in runs/baselines
 	$(BIN)/excite benchmark studies/baselines.toml --out runs/baselines --overwrite
 
-test: lint types ## the whole test suite
-	$(BIN)/python -m pytest -n 2 --dist loadscope
+test: lint types ## style, types, unit and command-line tests
+	$(PYTEST)
 
-lint: .venv/dev
+test-pages: .venv/dev ## commands of the documentation, and the bench page in a browser
+	$(PYTEST) tests/pages
+
+test-science: .venv/dev ## promises of the shipped policies, baselines, trainings from end to end
+	$(PYTEST) tests/science
+
+check-results: .venv/dev ## the committed results are what the documentation says of them
+	$(BIN)/python -m pytest tests/results
+
+test-all: test test-pages test-science check-results ## all tests
+
+lint: .venv/dev ## style
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
-types: .venv/dev
+types: .venv/dev ## types
 	$(BIN)/basedpyright --pythonpath $(BIN)/python
 
 docs: .venv/dev ## this documentation as a site, in site/ (open site/index.html)
@@ -67,5 +84,5 @@ evaluations: .venv/core ## the shipped policies on plants they have never met, i
 	$(INSTALL) --editable '.[dev,docs,ppo,dask,tune,fmu,onnx,web]'
 	touch $@
 
-clean:
+clean: ## removes the installation
 	rm -rf .venv

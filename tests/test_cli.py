@@ -826,7 +826,6 @@ def test_a_cache_that_cannot_be_written_is_no_remark(here):
     assert (answer.code, answer.err) == (0, "")
 
 
-@pytest.mark.slow
 def test_an_interrupt_that_a_library_has_swallowed_is_not_lost():
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:

@@ -550,7 +550,6 @@ def emps_record() -> Record:
     return read_record(path, EMPS.definition, columns, {"force": gain})
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "signs", [(1, -1, 1, -1), (1, 1, 1, 1)], ids=["alternating", "all too large"]
 )

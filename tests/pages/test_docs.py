@@ -13,6 +13,7 @@ from pathlib import Path
 
 import click
 import pytest
+from experiments import ROOT
 
 import excite
 from excite.cli import cli
@@ -21,7 +22,6 @@ from excite.excitation.catalogue import EXCITATIONS
 from excite.plant.catalogue import PLANTS
 from excite.study import read_study
 
-ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
 
 
