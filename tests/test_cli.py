@@ -27,7 +27,7 @@ from excite.plant import Aero2
 from excite.plant.catalogue import PLANTS
 from excite.policy import Layout, Policy, read_policy
 from excite.record import read_record
-from excite.report import number
+from excite.report.numbers import number
 
 TESTS = Path(__file__).parent
 COMMANDS = tuple(cli.commands)

@@ -17,13 +17,13 @@ import numpy as np
 import pytest
 
 from excite.cli import main
-from excite.report import (
+from excite.report.html import report_html
+from excite.report.numbers import number
+from excite.report.tables import (
     all_cells,
     differences_cells,
     footnotes,
-    number,
     parameter_cells,
-    report_html,
     residual_cells,
     residual_in_words,
     table_header,
@@ -224,7 +224,7 @@ def test_the_same_runs_make_the_same_page(made):
 
 def test_no_jax_is_needed(made):
     program = (
-        "import sys; from pathlib import Path; from excite.report import report_html\n"
+        "import sys; from pathlib import Path; from excite.report.html import report_html\n"
         "report_html([Path(p) for p in sys.argv[1:]])\n"
         "sys.exit('jax' in sys.modules or 'equinox' in sys.modules)"
     )

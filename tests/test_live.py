@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from excite.cli import main
-from excite.report import report_html
+from excite.report.html import report_html
 from excite.web import jobs as live
 
 ASKED: dict[str, Any] = {

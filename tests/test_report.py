@@ -15,31 +15,30 @@ from catalogue import TwoMasses
 from excite.description import HALF_95, PlantDescription
 from excite.plant import EMPS, Aero2, CartPole
 from excite.record import Record
-from excite.report import (
-    PLOT_ENDINGS,
-    agents_figure,
-    all_cells,
+from excite.report.figure import PLOT_ENDINGS, kept_samples, require_plot_path, save
+from excite.report.figures import (
     autocorrelation_figure,
-    benchmark_csv,
     benchmark_figure,
-    benchmark_markdown,
     correlation_figure,
-    curves_figure,
-    differences_markdown,
-    digits_for,
     episode_figure,
     episodes_figure,
-    fitting_tables,
-    footnotes,
     identification_figure,
     information_figure,
-    kept_samples,
-    number,
+)
+from excite.report.numbers import digits_for, number
+from excite.report.study_figures import agents_figure, curves_figure
+from excite.report.tables import (
+    all_cells,
+    benchmark_csv,
+    benchmark_markdown,
+    differences_markdown,
+    fitting_tables,
+    footnotes,
+    html_table,
     reference_cells,
-    require_plot_path,
-    save,
     table_cells,
     table_header,
+    text_table,
 )
 
 AERO2 = Aero2.definition
@@ -189,9 +188,25 @@ def test_a_table_is_broken_between_columns_where_it_is_too_wide():
             assert names[:2] == header[:2]
             assert names[2] != "bound %"
             lines = zip(names, *part, strict=True)
-            assert sum(3 + max(map(len, line)) for line in lines) <= max(width, 60)
+            assert sum(2 + max(map(len, line)) for line in lines) - 2 <= max(width, 60)
         for i, row in enumerate(cells):
             assert [cell for _, part in tables for cell in part[i][2:]] == row[2:]
+
+
+def test_a_table_as_text_fits_and_breaks_no_name_and_no_interval():
+    text = text_table("all", table_header(ROWS), all_cells(ROWS, STUDY["reference"]), labels=2)
+    assert max(map(len, text.splitlines())) <= 80
+    long = "a mean of 0.0249998 ± 2.8e-7 is as good as 0.024999 to 0.025001, " * 3
+    text = text_table("", ["name", "words"], [["J_p", long.strip()]], width=44)
+    assert max(map(len, text.splitlines())) <= 44
+    assert text.count("0.0249998 ± 2.8e-7") == 3 == text.count("0.024999 to 0.025001")
+    assert " ".join(text.split("─\n")[1].split()) == "J_p " + long.strip()
+    assert text_table("", ["", ""], [["a", "1"], ["bb", "22"]]) == "a    1\nbb  22"
+
+
+def test_a_table_in_a_notebook_shows_signs_of_markup_as_they_are():
+    assert "<td>a &lt; b</td>" in html_table("t", ["x"], [["a < b"]])
+    assert html_table("t & u", ["x"], []).startswith("<table>\n<caption>t &amp; u</caption>")
 
 
 def test_footnotes_tell_what_was_inferred_and_where_rows_were_published():
@@ -562,7 +577,7 @@ def test_a_figure_for_no_folder_is_refused_beforehand(tmp_path):
 
 
 def test_report_needs_no_jax():
-    program = "import excite.report, sys; sys.exit('jax' in sys.modules)"
+    program = "import excite.report.html, sys; sys.exit('jax' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
 
 

@@ -29,7 +29,7 @@ from starlette.testclient import TestClient
 
 from excite.cli.train import Objective
 from excite.files import write_json
-from excite.report import report_html
+from excite.report.html import report_html
 from excite.web import application
 from excite.web.places import _file_name, _receive
 from excite.web.requests import MAX_UPLOAD, RefusedError

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +35,8 @@ def benchmark(
 ) -> None:
     """Compare the methods of STUDY, a shipped study or a file, under identical conditions."""
     from ..files import require_free_run_folder
-    from ..report import benchmark_figure, save
+    from ..report.figure import save
+    from ..report.figures import benchmark_figure
     from ..study.episodes import example_episodes
     from ..study.tasks import run_benchmark, write_benchmark
 
@@ -80,7 +79,9 @@ def warned(study: Any) -> Any:
 
 def comparison_files(rows: Any, settings: Any) -> dict[str, bytes]:
     """Table and figure of a study's rows, by file name; shared with `study`."""
-    from ..report import benchmark_csv, benchmark_figure, benchmark_markdown, image
+    from ..report.figure import image
+    from ..report.figures import benchmark_figure
+    from ..report.tables import benchmark_csv, benchmark_markdown
 
     figure = benchmark_figure(rows, settings["title"] or settings["name"])
     return {
@@ -101,14 +102,10 @@ def episodes_file(study: Any, episodes: Any) -> bytes:
 
 def show_comparison(rows: Any, settings: Any, out: Path | None) -> None:
     """A study's table and footnotes on stdout; shared with `study`."""
-    from ..report import all_cells, fitting_tables, footnotes, table_header
+    from ..report.tables import all_cells, footnotes, table_header
 
     title = settings["title"] or settings["name"]
-    width = shutil.get_terminal_size().columns if sys.stdout.isatty() else 200
-    cells = all_cells(rows, settings["reference"])
-    for header, part in fitting_tables(table_header(rows), cells, width):
-        show_table(title, header, part)
-        title = ""
+    show_table(title, table_header(rows), all_cells(rows, settings["reference"]), labels=2)
     for note in footnotes(settings):
         click.echo(note)
     if out is not None:

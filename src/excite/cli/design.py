@@ -75,7 +75,8 @@ def design(
     from ..information import d_optimality, require_noise
     from ..plant.catalogue import plant_named, with_sensor
     from ..record import require_record_path, write_record
-    from ..report import episode_figure, save
+    from ..report.figure import save
+    from ..report.figures import episode_figure
     from ..training.signals import signal_env
 
     require_record_path(out, overwrite)

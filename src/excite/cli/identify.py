@@ -94,7 +94,8 @@ def identify(
     from ..files import require_free_run_folder
     from ..plant.catalogue import plant_named
     from ..record import read_record
-    from ..report import identification_figure, save
+    from ..report.figure import save
+    from ..report.figures import identification_figure
 
     if out is not None:
         require_free_run_folder(out, options["overwrite"])
@@ -131,9 +132,9 @@ def identify(
 
 
 def _show(description: Any, data: dict[str, Any], out: Path | None) -> None:
-    from ..report import (
+    from ..report.numbers import number
+    from ..report.tables import (
         largest_correlation,
-        number,
         parameter_cells,
         parameter_header,
         residual_in_words,

@@ -44,7 +44,8 @@ def information(
 
     from ..information import best_possible
     from ..record import Record
-    from ..report import information_figure, save
+    from ..report.figure import save
+    from ..report.figures import information_figure
     from ..simulation import run_episode
 
     job = prepared(options, plant, input_file)
@@ -71,7 +72,7 @@ def information(
 
 
 def _show(description: Any, result: dict[str, Any], job: dict[str, Any]) -> None:
-    from ..report import number
+    from ..report.numbers import number
 
     show_table(
         f"{description.name}, {job['excitation_name']}, {job['steps']} steps, "

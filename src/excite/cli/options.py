@@ -8,9 +8,10 @@ import json
 import os
 import re
 import shlex
+import shutil
 import signal
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -116,7 +117,7 @@ def computing(command: Callable[..., Any]) -> Callable[..., Any]:
             ) from None
         plot = kwargs.get("plot")
         if plot is not None:
-            from ..report import require_plot_path
+            from ..report.figure import require_plot_path
 
             require_plot_path(plot)
         return command(*args, **kwargs)
@@ -200,17 +201,15 @@ def show_json(value: Any) -> None:
     click.echo(json_text(value))
 
 
-def show_table(title: str, header: list[str], rows: Iterable[list[str]]) -> None:
-    """A line and a table on stdout, as wide as its content where it is not a terminal."""
-    from rich.box import SIMPLE_HEAD
-    from rich.console import Console
-    from rich.table import Table
+def show_table(
+    title: str, header: Sequence[str], rows: Iterable[Sequence[str]], labels: int = 1
+) -> None:
+    """A line and a table on stdout, as wide as the terminal, or 80 columns.
 
-    click.echo(title)  # not the table's own title, which is broken to the table's width
-    table = Table(box=SIMPLE_HEAD, pad_edge=False)
-    for i, name in enumerate(header):
-        table.add_column(name, justify="left" if i == 0 else "right", overflow="fold")
-    for row in rows:
-        table.add_row(*row)
-    width = None if sys.stdout.isatty() else 200
-    Console(width=width, highlight=False, markup=False).print(table)
+    Args:
+        labels: how many columns begin every part of a table that is continued below.
+    """
+    from ..report.tables import text_table
+
+    width = shutil.get_terminal_size().columns if sys.stdout.isatty() else 80
+    click.echo(text_table(title, header, list(rows), width, labels) + "\n")

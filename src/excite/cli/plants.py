@@ -95,7 +95,8 @@ def _plot(plant: Any, path: Path) -> None:
 
     from ..excitation.catalogue import EXCITATIONS
     from ..record import Record
-    from ..report import episodes_figure, save
+    from ..report.figure import save
+    from ..report.figures import episodes_figure
     from ..simulation import run_episode
 
     responses = {}

@@ -21,7 +21,7 @@ def report(runs: tuple[Path, ...], out: Path, overwrite: bool, as_json: bool) ->
     with its sidecar; several are shown side by side.
     """
     from ..files import require_new_file, write_bytes
-    from ..report import report_html
+    from ..report.html import report_html
 
     if out.suffix.lower() != ".html":
         raise ValueError(f"{out}: reports end in .html")

@@ -141,7 +141,8 @@ def simulate(
 
     from ..excitation import crest_factor
     from ..record import require_record_path, write_record
-    from ..report import episode_figure, save
+    from ..report.figure import save
+    from ..report.figures import episode_figure
     from ..safety import critical_levels, is_violation, max_abs_output
     from ..simulation import run_episode
 
@@ -192,7 +193,7 @@ def _record(run: Any, job: dict[str, Any], seed: int) -> Any:
 
 def _show(description: Any, summary: dict[str, Any]) -> None:
     from ..description import display_unit
-    from ..report import number
+    from ..report.numbers import number
 
     rows = [
         [f"crest factor of {name}", number(value), ""]

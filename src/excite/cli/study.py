@@ -163,16 +163,10 @@ def _engine(engine: str, address: str | None, workers: int | None) -> Any:
 def _finish(chosen: Any, folder: Path) -> None:
     """Writes the table and the figures into the run folder."""
     from ..files import write_bytes, write_json
-    from ..report import (
-        agents_figure,
-        benchmark_latex,
-        curves_figure,
-        differences_csv,
-        differences_markdown,
-        frontier_figure,
-        image,
-        lengths_figure,
-    )
+    from ..report.figure import image
+    from ..report.frontier import frontier_figure, lengths_figure
+    from ..report.study_figures import agents_figure, curves_figure
+    from ..report.tables import benchmark_latex, differences_csv, differences_markdown
     from ..study.episodes import example_episodes
     from ..study.table import best_seeds, learning_curves, study_table
 

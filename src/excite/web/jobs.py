@@ -39,7 +39,8 @@ from ..plant import AbstractPlant, Params, params_from
 from ..plant.catalogue import PLANTS, with_sensor
 from ..policy import mismatch, read_policy, shipped_policies
 from ..record import Record, columns_in, read_record
-from ..report import kept_samples, report_html
+from ..report.figure import kept_samples
+from ..report.html import report_html
 from ..safety import critical_levels, is_violation, max_abs_output
 from ..simulation import Trajectory, run_episode
 
