@@ -16,8 +16,8 @@ from excite.excitation import PRBS, Chirp, Random
 from excite.files import json_ready
 from excite.information import best_possible
 from excite.plant import EMPS, Aero2, draw_params
-from excite.study import Study, study_from
 from excite.study import evaluation as benchmark
+from excite.study.spec import Study, study_from
 from excite.study.statistics import wilson
 from excite.study.tasks import run_benchmark, write_benchmark
 

@@ -15,8 +15,8 @@ from excite.excitation.catalogue import EXCITATIONS, excitation_named
 from excite.plant import AbstractPlant, Aero2, CartPole, DCMotor
 from excite.plant.catalogue import PLANTS, plant_named, with_sensor
 from excite.policy import Layout, Policy
-from excite.study import Study, read_study
 from excite.study.catalogue import studies, study_path
+from excite.study.spec import Study, read_study
 
 STUDIES = Path(__file__).parent.parent / "studies"
 

@@ -20,7 +20,7 @@ from excite.cli import cli
 from excite.estimation.catalogue import ESTIMATORS
 from excite.excitation.catalogue import EXCITATIONS
 from excite.plant.catalogue import PLANTS
-from excite.study import read_study
+from excite.study.spec import read_study
 
 README = (ROOT / "README.md").read_text()
 

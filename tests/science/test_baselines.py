@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from experiments import ROOT
 
-from excite.study import Study, read_study
+from excite.study.spec import Study, read_study
 from excite.study.tasks import run_benchmark
 
 PARAMETERS = ("J_p", "K_pu", "D_p")

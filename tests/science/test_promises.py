@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from excite.study import study_from
+from excite.study.spec import study_from
 from excite.study.tasks import run_benchmark
 
 POLICIES = ("aero2", "aero2-goals", "aero2-damping")

@@ -18,9 +18,10 @@ from cluster import Cluster, wait_for
 
 from excite.cli.study import _require_trainer
 from excite.policy import read_policy
-from excite.study import read_study, study_from, table
+from excite.study import table
 from excite.study.folder import seed_folder, study_of
 from excite.study.run import _live, opened, run_study
+from excite.study.spec import read_study, study_from
 from excite.study.table import (
     across_seeds,
     best_seeds,

@@ -64,8 +64,8 @@ def benchmark(
 
 def study_in(name: str) -> Any:
     """A shipped study or one in a file, its warnings on stderr; shared with `study`."""
-    from ..study import read_study
     from ..study.catalogue import study_path
+    from ..study.spec import read_study
 
     return warned(read_study(study_path(name)))
 

@@ -102,7 +102,7 @@ def _study(policy: str, own: Any, options: dict[str, Any]) -> Any:
     """The study of one method that these options mean."""
     from ..plant import AbstractARXPlant
     from ..plant.catalogue import plant_named
-    from ..study import study_from
+    from ..study.spec import study_from
 
     if options["filtered"] and not options["on_rig"]:
         raise ValueError("--filter is a part of a rig; it needs --rig")

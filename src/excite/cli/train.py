@@ -91,7 +91,7 @@ def train(plant: str, out: Path, as_json: bool, **options: Any) -> None:  # fmt:
     The run folder is that of a study with one agent: FOLDER/seeds/METHOD_OBJECTIVE/0 holds
     policy.safetensors. Interrupted at any moment, the same command goes on where it was.
     """
-    from ..study import study_from
+    from ..study.spec import study_from
 
     chosen = study_from(_study(plant, out, options), "train").checked("train")
     run_study_here(chosen, out, as_json)

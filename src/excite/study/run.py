@@ -9,7 +9,6 @@ any moment and started again. The table is made from those files alone.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import hashlib
 import os
 from collections.abc import Callable, Iterator, Mapping
@@ -17,12 +16,13 @@ from pathlib import Path
 from typing import Any
 
 from .. import __version__
-from ..files import csv_text, json_ready, write_bytes, write_json
+from ..files import csv_text, json_ready, took_lock, write_bytes, write_json
 from ..plant import AbstractPlant
 from ..policy import POLICY_ENDING, read_policy
 from ..record.read import SIGNAL_ENDINGS
 from .evaluation import Progress
 from .folder import agent_settings, fingerprint, read_json, seed_folder, study_of
+from .progress import read_progress, remove_progress
 from .spec import Study
 from .workers import Engine, run
 
@@ -82,10 +82,8 @@ def _locked(folder: Path) -> Iterator[None]:
     except OSError as error:
         raise ValueError(f"{folder}: cannot be written ({error.strerror})") from None
     with lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            raise ValueError(f"{folder}: another process is working on this study") from None
+        if not took_lock(lock):
+            raise ValueError(f"{folder}: another process is working on this study")
         yield
 
 
@@ -262,8 +260,8 @@ def _keep(target: _Target, folder: Path, result: Any) -> None:
     columns = {name: [row[name] for row in result["curve"]] for name in result["curve"][0]}
     write_bytes(place / "curve.csv", csv_text(columns).encode())
     write_json(place / "metrics.json", result["metrics"])
-    for name in ("checkpoint.safetensors", "progress.json"):
-        (place / name).unlink(missing_ok=True)
+    (place / "checkpoint.safetensors").unlink(missing_ok=True)
+    remove_progress(place)
 
 
 def _live(study: Study, target: _Target, folder: Path) -> tuple[float, str]:
@@ -274,21 +272,22 @@ def _live(study: Study, target: _Target, folder: Path) -> tuple[float, str]:
     place = seed_folder(folder, agent, seed)
     if (place / "metrics.json").is_file():
         return 1.0, ""
-    try:  # it is there to be looked at, and may be anything
-        row = read_json(place / "progress.json")
-        total = study.agent(agent).total_steps(study.num_steps)
-        return row["steps"] / total, _looks(agent, seed, row)
-    except (ValueError, KeyError, TypeError, AttributeError):
+    row = read_progress(place)
+    if row is None:
         return 0.0, ""
+    total = study.agent(agent).total_steps(study.num_steps)
+    return (row["steps"] or 0.0) / total, _looks(agent, seed, row)
 
 
-def _looks(agent: str, seed: int, row: dict[str, float]) -> str:
-    errors = ", ".join(
+def _looks(agent: str, seed: int, row: Mapping[str, float | None]) -> str:
+    """What is known of the newest look; a number that is not finite is left out."""
+    known = {name: value for name, value in row.items() if value is not None}
+    parts = [f"return {known['return']:.3g}"] if "return" in known else []
+    parts += [
         f"{name.removeprefix('relative_error_')} {100 * value:.3g} %"
-        for name, value in row.items()
+        for name, value in known.items()
         if name.startswith("relative_error_")
-    )
-    return (
-        f"{agent} seed {seed}: return {row['return']:.3g}, {errors}, "
-        f"violations {100 * row['violation_rate']:.0f} %"
-    )
+    ]
+    if "violation_rate" in known:
+        parts.append(f"violations {100 * known['violation_rate']:.0f} %")
+    return f"{agent} seed {seed}: {', '.join(parts)}"

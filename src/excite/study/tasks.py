@@ -32,6 +32,7 @@ from ..training.signals import clairvoyant_signals, signal_env
 from .agent import Agent
 from .evaluation import Progress, episode_keys, evaluate_method, num_chunks, outcome
 from .folder import agent_settings, fingerprint
+from .progress import write_progress
 from .spec import Study, study_from
 from .statistics import table_row
 
@@ -163,7 +164,7 @@ class _Keeper:
         if self.folder is None or self.path is None:
             return
         if row is not None:
-            write_json(self.folder / "progress.json", row)
+            write_progress(self.folder, row)
         if time.monotonic() - self.last >= self.every:
             made = checkpoint()
             own = {"seconds": self.seconds(), "fingerprint": self.fingerprint}

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
 import os
 import secrets
 import signal
@@ -21,6 +20,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse
 from starlette.routing import Route
 
+from ..study.progress import read_progress
 from .requests import RefusedError, number, whole, without_folders, word
 
 MAX_TRAININGS = 2
@@ -44,7 +44,7 @@ class Training:
 
     def __init__(self, name: str, folder: Path, words: list[str]) -> None:
         self.name, self.folder, self.words = name, folder, words
-        self.curve: list[dict[str, Any]] = []
+        self.curve: list[dict[str, float | None]] = []
         self.state, self.sentence = "starting", ""
         self._process: asyncio.subprocess.Process | None = None
         self._followed: asyncio.Task | None = None
@@ -96,14 +96,14 @@ class Training:
             self.sentence = without_folders((last or ["it ended without a word"])[0])
 
     def _look(self) -> None:
-        for path in self.folder.glob("seeds/*/0/progress.json"):
-            with contextlib.suppress(OSError, ValueError):
-                row = json.loads(path.read_text(encoding="utf-8"))
-                if isinstance(row, dict) and row not in self.curve[-1:]:
-                    self.curve.append(row)
-                    if len(self.curve) > _MAX_ROWS:
-                        del self.curve[1:-1:2]
-                    self.state = "training" if self.state == "starting" else self.state
+        for place in self.folder.glob("seeds/*/0"):
+            look = read_progress(place)
+            if look is None or look in self.curve[-1:]:
+                continue
+            self.curve.append(look)
+            if len(self.curve) > _MAX_ROWS:
+                del self.curve[1:-1:2]
+            self.state = "training" if self.state == "starting" else self.state
 
     def told(self) -> dict[str, Any]:
         """What the page shows."""

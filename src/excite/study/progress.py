@@ -1,0 +1,43 @@
+"""How far a training is: `progress.json` beside the checkpoint of every seed that runs.
+
+The worker that trains writes it; the command line and the bench page, which do not load JAX
+for it, read it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+from ..files import write_json
+
+_NAME = "progress.json"
+
+
+def write_progress(seed_folder: Path, look: Mapping[str, float]) -> None:
+    """Keeps the newest row of a learning curve: `steps` so far, `return`, errors, violations."""
+    write_json(seed_folder / _NAME, look)
+
+
+def read_progress(seed_folder: Path) -> dict[str, float | None] | None:
+    """That row; None where there is none yet, or it cannot be read.
+
+    A number that was not finite is None.
+    """
+    try:
+        look = json.loads((seed_folder / _NAME).read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return None
+    if not isinstance(look, dict) or not all(_is_number(value) for value in look.values()):
+        return None
+    return look if _is_number(look.get("steps")) and look["steps"] is not None else None
+
+
+def _is_number(value: object) -> bool:
+    return value is None or isinstance(value, int | float)
+
+
+def remove_progress(seed_folder: Path) -> None:
+    """After the training."""
+    (seed_folder / _NAME).unlink(missing_ok=True)
