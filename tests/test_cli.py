@@ -380,7 +380,7 @@ def test_doctor_names_packages_devices_and_extras(run):
     assert "dev" in found["extras"]
     for name, extra in found["extras"].items():
         assert extra["installed"] == (extra["missing"] == [])
-        assert extra["install"] == f"python -m pip install -e '.[{name}]'"
+        assert extra["install"] == f"pip install 'excite[{name}]'"
     shown = run("doctor").out
     assert all(word in shown for word in ("jax", "extras", "dev", found["python"]))
 

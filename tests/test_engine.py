@@ -91,7 +91,7 @@ def test_less_than_one_worker_is_refused():
 
 def test_without_dask_the_extra_is_named(monkeypatch):
     monkeypatch.setattr(engine, "distributed", None)
-    with pytest.raises(ValueError, match=r"pip install -e '.\[dask\]'"):
+    with pytest.raises(ValueError, match=r"pip install 'excite\[dask\]'"):
         engine.dask_engine("tcp://127.0.0.1:8786")
 
 

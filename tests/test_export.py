@@ -179,7 +179,7 @@ def test_refusals_are_sentences_and_change_nothing(
     monkeypatch.setattr(export_module, "onnx", None)
     code, _, err = export("aero2", "--onnx", tmp_path / "a.onnx")
     assert code == 2
-    assert "exporting needs onnx: python -m pip install -e '.[onnx]'" in err
+    assert "exporting needs onnx: pip install 'excite[onnx]'" in err
     assert kept.read_text() == "mine"
     assert {p.name for p in tmp_path.iterdir()} == {"kept.onnx", "broken.safetensors"}
 

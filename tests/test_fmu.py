@@ -260,7 +260,7 @@ def test_variables_that_are_not_there(unit: Path, options: dict, sentence: str):
 
 def test_without_fmpy_the_sentence_says_what_to_type(unit: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(fmu_module, "fmpy", None)
-    assert refusal(unit) == "an FMU needs FMPy: python -m pip install -e '.[fmu]'"
+    assert refusal(unit) == "an FMU needs FMPy: pip install 'excite[fmu]'"
 
 
 def test_a_library_that_cannot_be_loaded_leaves_nothing_behind(unit: Path, tmp_path: Path):

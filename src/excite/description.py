@@ -11,7 +11,6 @@ All values are in SI units and radians.
 
 from __future__ import annotations
 
-import dataclasses
 import difflib
 import hashlib
 import json
@@ -291,23 +290,3 @@ def unknown(kind: str, word: str, allowed: Iterable[str]) -> ValueError:
     nearest = difflib.get_close_matches(word, allowed, n=1, cutoff=0.5)
     hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
     return ValueError(f"unknown {kind} {word!r}{hint} (there is {', '.join(allowed)})")
-
-
-def with_options(default: Any, name: str, options: Mapping[str, Any]) -> Any:
-    """`default` with other options, their names and types checked."""
-    hidden = ("name", "horizons", "inputs", "signal", "known")
-    fields = {f.name: f for f in dataclasses.fields(default) if f.name not in hidden}
-    for option, value in options.items():
-        if option not in fields:
-            raise unknown(f"{name} option", option, fields)
-        several = (int, float, list) if option == "amplitude" else (int, float)
-        expected = {"bool": bool, "int": int}.get(str(fields[option].type), several)
-        is_wrong = not isinstance(value, expected) or (
-            isinstance(value, bool) and expected is not bool
-        )
-        if is_wrong or (
-            isinstance(value, list) and not all(isinstance(v, int | float) for v in value)
-        ):
-            word = {bool: "true or false", int: "a whole number"}.get(expected, "a number")  # pyright: ignore[reportArgumentType, reportCallIssue]
-            raise ValueError(f"{option} of {name!r} must be {word}: got {value!r}")
-    return dataclasses.replace(default, **options)

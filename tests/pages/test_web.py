@@ -929,7 +929,7 @@ def test_without_the_extra_one_sentence_says_what_to_install(tmp_path: Path):
     command = [sys.executable, "-c", program, "serve", "--runs", str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 2
-    assert "pip install -e '.[web]'" in done.stderr
+    assert "pip install 'excite[web]'" in done.stderr
 
 
 def test_other_computers_need_a_token_that_is_printed(tmp_path: Path):

@@ -27,7 +27,7 @@ def doctor(as_json: bool) -> None:
             extra: {
                 "installed": not (missing := [n for n in names if _version(n) is None]),
                 "missing": missing,
-                "install": f"python -m pip install -e '.[{extra}]'",
+                "install": f"pip install 'excite[{extra}]'",
             }
             for extra, names in extras.items()
         },

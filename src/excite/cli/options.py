@@ -113,7 +113,7 @@ def computing(command: Callable[..., Any]) -> Callable[..., Any]:
             prepare_jax()
         except ImportError:
             raise ValueError(
-                "this command needs JAX, which is not installed: python -m pip install -e ."
+                "this command needs JAX, which is not installed: pip install excite"
             ) from None
         plot = kwargs.get("plot")
         if plot is not None:

@@ -62,9 +62,7 @@ def serve(
         from ..web.security import is_loopback
         from ..web.sessions import Settings
     except ImportError:
-        raise ValueError(
-            "the bench page needs the extra: python -m pip install -e '.[web]'"
-        ) from None
+        raise ValueError("the bench page needs the extra: pip install 'excite[web]'") from None
 
     if token is not None and len(token) < 8:
         raise ValueError("a token needs eight characters or more")

@@ -142,7 +142,7 @@ def _require_trainer(chosen: Any, out: Path) -> None:
         return
     missing = [n for n in ("stable_baselines3", "torch", "tensorboard") if find_spec(n) is None]
     if missing:
-        raise ValueError(f"training needs {', '.join(missing)}: python -m pip install -e '.[ppo]'")
+        raise ValueError(f"training needs {', '.join(missing)}: pip install 'excite[ppo]'")
 
 
 def _engine(engine: str, address: str | None, workers: int | None) -> Any:

@@ -11,6 +11,7 @@ from ..estimation import ARX
 from ..estimation.arx import RLSState, physical_params, regressor
 from ..information import relative_size
 from ..plant import AbstractARXPlant, AbstractPlant, Params
+from ..plant.fields import floats
 from .objective import (
     MAX_SENSITIVITY,
     AbstractError,
@@ -18,7 +19,6 @@ from .objective import (
     Sample,
     bounded,
     next_knowledge,
-    number,
     prior_knowledge,
 )
 
@@ -98,8 +98,8 @@ class OutputError(AbstractError):
         max_sensitivity: larger ones are scaled down, see MAX_SENSITIVITY.
     """
 
-    prior_sd: Float[Array, ""] = eqx.field(converter=number, default=0.3)
-    max_sensitivity: Float[Array, ""] = eqx.field(converter=number, default=MAX_SENSITIVITY)
+    prior_sd: Float[Array, ""] = eqx.field(converter=floats, default=0.3)
+    max_sensitivity: Float[Array, ""] = eqx.field(converter=floats, default=MAX_SENSITIVITY)
 
     def init(self, plant: AbstractPlant, measured: Float[Array, " output"]) -> OutputErrorMemory:
         """The prior's information; the initial state is known."""

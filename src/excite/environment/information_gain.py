@@ -9,13 +9,13 @@ from jaxtyping import Array, Float, Int
 
 from ..information import relative_size
 from ..plant import AbstractPlant, Params
+from ..plant.fields import floats
 from .objective import (
     MAX_SENSITIVITY,
     AbstractObjective,
     Knowledge,
     Sample,
     next_knowledge,
-    number,
     prior_knowledge,
 )
 
@@ -46,11 +46,11 @@ class InformationGain(AbstractObjective):
     """
 
     targets: tuple[bool, ...] = eqx.field(static=True)
-    prior_sd: Float[Array, ""] = eqx.field(converter=number)
-    weight: Float[Array, ""] = eqx.field(converter=number, default=1.0)
+    prior_sd: Float[Array, ""] = eqx.field(converter=floats)
+    weight: Float[Array, ""] = eqx.field(converter=floats, default=1.0)
     criterion: str = eqx.field(static=True, default="D")
     dense: bool = eqx.field(static=True, default=True)
-    max_sensitivity: Float[Array, ""] = eqx.field(converter=number, default=MAX_SENSITIVITY)
+    max_sensitivity: Float[Array, ""] = eqx.field(converter=floats, default=MAX_SENSITIVITY)
 
     def __check_init__(self) -> None:
         """Raises ValueError for an unknown criterion."""

@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..description import PlantDescription, names_of
-from ..excitation import optional_array
 from ..information import relative_size
 from ..plant import AbstractPlant, Params
+from ..plant.fields import floats, optional_floats
 from ..safety import critical_levels
 from ..simulation import step
 
@@ -28,11 +28,6 @@ MAX_SENSITIVITY = 30.0
 Where a plant turns chaotic sensitivities grow without bound, and what they promise no
 estimator can find.
 """
-
-
-def number(value: Any) -> Array:
-    """An array of floating-point numbers, also from whole ones; converts fields."""
-    return jnp.asarray(value, float)
 
 
 class Sample(eqx.Module):
@@ -114,9 +109,9 @@ class AbstractError(AbstractObjective):
     """
 
     targets: tuple[bool, ...] = eqx.field(static=True)
-    goals: Float[Array, " param"] | None = eqx.field(converter=optional_array, default=None)
+    goals: Float[Array, " param"] | None = eqx.field(converter=optional_floats, default=None)
     form: str = eqx.field(static=True, default="relative")
-    weight: Float[Array, ""] = eqx.field(converter=number, default=1.0)
+    weight: Float[Array, ""] = eqx.field(converter=floats, default=1.0)
 
     def __check_init__(self) -> None:
         """Raises ValueError for an unknown form."""

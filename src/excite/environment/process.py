@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray
 
 from ..plant import AbstractARXPlant, AbstractPlant, Params, draw_params
+from ..plant.fields import floats
 from ..policy import (
     Layout,
     Window,
@@ -34,7 +35,7 @@ from ..safety import critical_levels, penalty, watched_levels
 from ..simulation import measure, step
 from .errors import EstimationError
 from .information_gain import InformationGain
-from .objective import AbstractObjective, Sample, number, prior_sd_of, target_mask
+from .objective import AbstractObjective, Sample, prior_sd_of, target_mask
 
 
 class EnvState(eqx.Module):
@@ -98,8 +99,8 @@ class Env(eqx.Module):
     plant: AbstractPlant
     objective: AbstractObjective
     layout: Layout = eqx.field(static=True)
-    spread: Float[Array, ""] = eqx.field(converter=number, default=0.3)
-    penalty_weight: Float[Array, ""] = eqx.field(converter=number, default=1.0)
+    spread: Float[Array, ""] = eqx.field(converter=floats, default=0.3)
+    penalty_weight: Float[Array, ""] = eqx.field(converter=floats, default=1.0)
     constants: tuple[Any, Any] | None = None
 
     @classmethod

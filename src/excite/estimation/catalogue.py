@@ -6,7 +6,8 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from ..description import unknown, with_options
+from ..description import unknown
+from ..plant.fields import with_options
 from .arx import ARX
 from .contract import AbstractEstimator
 from .decrement import Decrement

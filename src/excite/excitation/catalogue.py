@@ -10,8 +10,9 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from ..description import unknown, with_options
+from ..description import unknown
 from ..plant import AbstractPlant
+from ..plant.fields import with_options
 from ..policy import POLICY_ENDING, mismatch, policy_path, read_policy, shipped_policies
 from ..record import read_signal
 from ..record.read import SIGNAL_ENDINGS

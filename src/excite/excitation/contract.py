@@ -18,14 +18,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..plant import AbstractPlant
+from ..plant.fields import optional_floats
 
 Sequence: TypeAlias = Float[Array, "time input"]
 SignalState: TypeAlias = Any
-
-
-def optional_array(value: Any) -> Array | None:
-    """An array of numbers, or None as it is; converts fields."""
-    return None if value is None else jnp.asarray(value, float)
 
 
 class AbstractExcitation(eqx.Module):
@@ -75,7 +71,7 @@ class AbstractShape(AbstractSignal):
             each; by default that of the plant's description for classical signals.
     """
 
-    amplitude: Float[Array, "..."] | None = eqx.field(converter=optional_array, default=None)
+    amplitude: Float[Array, "..."] | None = eqx.field(converter=optional_floats, default=None)
 
     @abc.abstractmethod
     def shape(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> Sequence:

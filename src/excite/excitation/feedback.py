@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..plant import AbstractPlant
+from ..plant.fields import floats, optional_floats
 from ..policy import (
     Layout,
     Policy,
@@ -21,7 +22,7 @@ from ..policy import (
     with_measurement,
 )
 from ..safety import watched_output
-from .contract import AbstractExcitation, AbstractShape, optional_array
+from .contract import AbstractExcitation, AbstractShape
 
 
 class PositionLoop(AbstractExcitation):
@@ -40,9 +41,9 @@ class PositionLoop(AbstractExcitation):
     """
 
     signal: AbstractShape
-    amplitude: Float[Array, ""] | None = eqx.field(converter=optional_array, default=None)
-    gain: Float[Array, ""] | None = eqx.field(converter=optional_array, default=None)
-    damping: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=0.0)
+    amplitude: Float[Array, ""] | None = eqx.field(converter=optional_floats, default=None)
+    gain: Float[Array, ""] | None = eqx.field(converter=optional_floats, default=None)
+    damping: Float[Array, ""] = eqx.field(converter=floats, default=0.0)
 
     def init(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> Any:
         """The reference, and what a step needs of the plant.

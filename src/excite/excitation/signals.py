@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..plant import AbstractPlant
-from .contract import AbstractShape, AbstractSignal, Sequence, optional_array
+from ..plant.fields import floats, optional_floats
+from .contract import AbstractShape, AbstractSignal, Sequence
 
 # Feedback taps of maximum-length shift registers (period 2^bits - 1), counted from 1;
 # S. W. Golomb, Shift Register Sequences, 1967.
@@ -114,8 +115,8 @@ class Chirp(AbstractShape):
         logarithmic: whether equal times are spent on equal frequency ratios.
     """
 
-    start_frequency: Float[Array, ""] | None = eqx.field(converter=optional_array, default=None)
-    stop_frequency: Float[Array, ""] | None = eqx.field(converter=optional_array, default=None)
+    start_frequency: Float[Array, ""] | None = eqx.field(converter=optional_floats, default=None)
+    stop_frequency: Float[Array, ""] | None = eqx.field(converter=optional_floats, default=None)
     logarithmic: bool = eqx.field(static=True, default=False)
 
     def shape(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> Sequence:
@@ -148,8 +149,8 @@ class Multisine(AbstractShape):
         phases: 0 for Schroeder's; any other number is the seed of random ones.
     """
 
-    start_frequency: Float[Array, ""] | None = eqx.field(converter=optional_array, default=None)
-    stop_frequency: Float[Array, ""] | None = eqx.field(converter=optional_array, default=None)
+    start_frequency: Float[Array, ""] | None = eqx.field(converter=optional_floats, default=None)
+    stop_frequency: Float[Array, ""] | None = eqx.field(converter=optional_floats, default=None)
     phases: int = eqx.field(static=True, default=0)
 
     def shape(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> Sequence:
@@ -179,7 +180,7 @@ class Square(AbstractShape):
         frequency: of the first input [Hz], default the geometric mean of the plant's band.
     """
 
-    frequency: Float[Array, ""] | None = eqx.field(converter=optional_array, default=None)
+    frequency: Float[Array, ""] | None = eqx.field(converter=optional_floats, default=None)
 
     def shape(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> Sequence:
         """The same wave for every key, beginning with its upper value."""
@@ -204,8 +205,8 @@ class Decay(AbstractShape):
         pump: fraction of the experiment for which the plant is driven.
     """
 
-    frequency: Float[Array, ""] | None = eqx.field(converter=optional_array, default=None)
-    pump: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=0.3)
+    frequency: Float[Array, ""] | None = eqx.field(converter=optional_floats, default=None)
+    pump: Float[Array, ""] = eqx.field(converter=floats, default=0.3)
 
     def shape(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> Sequence:
         """The wave, then zero."""

@@ -37,7 +37,7 @@ def to_onnx(policy: Policy) -> bytes:
         ValueError: one sentence where onnx is not installed.
     """
     if onnx is None:
-        raise ValueError("exporting needs onnx: python -m pip install -e '.[onnx]'")
+        raise ValueError("exporting needs onnx: pip install 'excite[onnx]'")
     nodes, constants = _network(policy)
     graph = helper.make_graph(
         nodes,

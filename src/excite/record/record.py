@@ -84,9 +84,7 @@ def require_record_path(path: Path, overwrite: bool) -> None:
 def require_matlab(path: Path) -> Any:
     """SciPy's reader and writer of MAT files; ValueError where SciPy is not installed."""
     if matlab is None:
-        raise ValueError(
-            f"{path}: MAT files need SciPy (python -m pip install scipy); CSV does not"
-        )
+        raise ValueError(f"{path}: MAT files need SciPy (pip install scipy); CSV does not")
     return matlab
 
 

@@ -194,7 +194,7 @@ def simulate_fmu(
 def _read(path: Path) -> tuple[Any, str]:
     """FMPy's description of a co-simulation unit that runs on this machine, the file's hash."""
     if fmpy is None:
-        raise ValueError("an FMU needs FMPy: python -m pip install -e '.[fmu]'")
+        raise ValueError("an FMU needs FMPy: pip install 'excite[fmu]'")
     try:
         with path.open("rb") as file:
             digest = hashlib.file_digest(file, "sha256").hexdigest()

@@ -275,7 +275,7 @@ def dask_engine(address: str, on_wait: Callable[[], Any] = lambda: None) -> Engi
         ValueError: for a malformed address, or where Dask is not installed.
     """
     if distributed is None:
-        raise ValueError("the engine 'dask' needs the extra: python -m pip install -e '.[dask]'")
+        raise ValueError("the engine 'dask' needs the extra: pip install 'excite[dask]'")
     is_good, url = False, address if "://" in address else f"tcp://{address}"
     with contextlib.suppress(ValueError):  # of a port that is no number, a host that is no name
         parts = urlsplit(url)
