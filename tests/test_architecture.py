@@ -253,6 +253,7 @@ READS = (
     "excitation/catalogue",
     "estimation/identify",
     "estimation/result",
+    "training/design",
 )
 """Modules of the pure packages that take a file's name from their caller."""
 

@@ -121,8 +121,8 @@ class Bomb(AbstractPlant):
         return state
 
 
-def test_a_tuning_that_finds_nothing_of_use_says_so():
-    with pytest.raises(ValueError, match="no setting of 'chirp' was found that is of use"):
+def test_a_tuning_that_finds_no_usable_setting_says_so():
+    with pytest.raises(ValueError, match="tuning 'chirp' found no usable setting"):
         tuned_signal(signal_env(Bomb(), 20, 0.3), "chirp", trials=2)
 
 

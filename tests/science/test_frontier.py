@@ -96,7 +96,7 @@ def test_a_designed_signal_is_what_its_summary_says(folder):
 def test_a_tuned_loop_is_what_its_options_say(tmp_path):
     done = excite(
         *("design", "aero2", "--kind", "loop-square", "--out", tmp_path / "loop.csv"),
-        *("--steps", 40, "--updates", 3, "--json"),
+        *("--steps", 40, "--trials", 3, "--json"),
     )
     assert done.returncode == 0, done.stderr
     said = json.loads(done.stdout)
@@ -195,7 +195,7 @@ def test_a_policy_file_is_scored_with_the_row_of_a_study(folder):
         (("design", "aero3", "--out", "x.csv"), "unknown plant 'aero3'; did you mean 'aero2'"),
         (("design", "aero2", "--out", "x.txt"), "x.txt"),
         (("design", "aero2", "--kind", "chrip", "--out", "x.csv"), "did you mean 'chirp'"),
-        (("design", "aero2", "--spread", 1, "--out", "x.csv"), "--spread must lie in [0, 1)"),
+        (("design", "aero2", "--spread", 1, "--out", "x.csv"), "spread must lie in [0, 1)"),
     ],
 )
 def test_what_is_not_allowed_is_a_sentence(arguments, words, tmp_path):

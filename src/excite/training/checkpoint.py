@@ -1,4 +1,4 @@
-"""Where a training can be interrupted: checkpoints, and what a training returns."""
+"""What a training reports: progress, checkpoints from which it is resumed, its result."""
 
 from __future__ import annotations
 
@@ -12,6 +12,9 @@ from ..files import tensors_from_bytes, tensors_to_bytes
 from ..policy import Weights
 
 FORMAT = "excite checkpoint 1"
+
+Progress: TypeAlias = Callable[[str, int, int], None]
+"""Called with what is being computed, how much of it is done, and how much there is."""
 
 
 @dataclass(frozen=True)

@@ -93,7 +93,7 @@ class Network(eqx.Module):
         return forward(jnp, self.weights, observe(jnp, self.layout, state.window, state.k))
 
 
-class Batch(eqx.Module):
+class Scores(eqx.Module):
     """Experiments of one policy or signal on a batch of plants.
 
     Attributes:
@@ -117,7 +117,7 @@ def experiments(
     act: Callable[[EnvState], Float[Array, " input"]],
     keys: Key[Array, " plant"],
     margin: Float[Array, ""] | float,
-) -> Batch:
+) -> Scores:
     """One experiment for every key, differentiable in what `act` holds.
 
     Only the states at every step are kept for the backward pass; the rest of a step is
@@ -132,7 +132,7 @@ def experiments(
         over = jnp.maximum(size - margin, 0.0) / (1 - margin)
         return state, (gain, jnp.sum(over**2), jnp.max(size, initial=0.0))
 
-    def experiment(key: PRNGKeyArray) -> Batch:
+    def experiment(key: PRNGKeyArray) -> Scores:
         start, _ = env.reset(key)
         state, (gains, excess, sizes) = jax.lax.scan(
             advance, start, None, length=env.layout.num_steps
@@ -141,12 +141,12 @@ def experiments(
         worth = jnp.sum(gains) + final
         outcome = env.objective.outcome(env.plant, state.memory, state.params, worth)
         nearness = jnp.where(state.is_finite, jnp.max(sizes), jnp.inf)
-        return Batch(worth, outcome, jnp.mean(excess), nearness)
+        return Scores(worth, outcome, jnp.mean(excess), nearness)
 
     return jax.vmap(experiment)(keys)
 
 
-class Progress(eqx.Module):
+class Optimisation(eqx.Module):
     """What changes from update to update.
 
     Attributes:
@@ -160,18 +160,18 @@ class Progress(eqx.Module):
     penalty_weight: Float[Array, "*training"]
 
     @classmethod
-    def start(cls, player: Any, settings: GradientSettings) -> Progress:
+    def start(cls, player: Any, settings: GradientSettings) -> Optimisation:
         """Before the first update."""
         adam = _optimiser(settings).init(eqx.filter(player, eqx.is_array))
         return cls(player, adam, jnp.asarray(settings.penalty_weight, float))
 
 
 def update(
-    env: Env, settings: GradientSettings, now: Progress, keys: Key[Array, " plant"]
-) -> tuple[Progress, Batch]:
+    env: Env, settings: GradientSettings, now: Optimisation, keys: Key[Array, " plant"]
+) -> tuple[Optimisation, Scores]:
     """One step of Adam on the plants of these keys, and their experiments before it."""
 
-    def loss(player: Any) -> tuple[Array, Batch]:
+    def loss(player: Any) -> tuple[Array, Scores]:
         batch = experiments(env, player, keys, settings.margin)
         worth = env.objective.of_batch(batch.outcome)
         return now.penalty_weight * jnp.mean(batch.excess) - worth, batch
@@ -183,7 +183,7 @@ def update(
     change = jnp.where(is_near, settings.penalty_growth, -settings.penalty_decay)
     player = eqx.apply_updates(now.player, step)
     weight = jnp.maximum(now.penalty_weight * jnp.exp(change), settings.penalty_weight)
-    return Progress(player, adam, weight), batch
+    return Optimisation(player, adam, weight), batch
 
 
 update_all = eqx.filter_jit(
@@ -257,7 +257,7 @@ class _Course:
         num_updates: done.
     """
 
-    now: Progress
+    now: Optimisation
     best: Any
     rank: Float[np.ndarray, "seed 2"]
     curves: list[list[dict[str, float]]]
@@ -292,8 +292,8 @@ def started(
     """Trainings at their beginning, and the keys of the plants of an update."""
     pairs = jax.vmap(jax.random.split)(jnp.stack([jax.random.key(seed) for seed in seeds]))
 
-    def start(key: PRNGKeyArray) -> Progress:
-        return Progress.start(Network(_first_weights(env, settings, key), env.layout), settings)
+    def start(key: PRNGKeyArray) -> Optimisation:
+        return Optimisation.start(Network(_first_weights(env, settings, key), env.layout), settings)
 
     def keys(i: int) -> Key[Array, "seed plant"]:
         own = jax.vmap(jax.random.fold_in, (0, None))(pairs[:, 1], i)
@@ -362,7 +362,7 @@ def _first_weights(env: Env, settings: GradientSettings, key: PRNGKeyArray) -> W
     )
 
 
-def _require_finite(now: Progress, settings: GradientSettings, num_updates: int) -> None:
+def _require_finite(now: Optimisation, settings: GradientSettings, num_updates: int) -> None:
     in_a_row = int(np.max(now.adam.notfinite_count))
     if in_a_row >= min(settings.watch_every, settings.num_updates) and num_updates:
         raise ValueError(
@@ -381,7 +381,7 @@ def _require_computable(row: Mapping[str, float]) -> None:
         )
 
 
-def _state(now: Progress) -> dict[str, float]:
+def _state(now: Optimisation) -> dict[str, float]:
     return {
         "penalty_weight": float(now.penalty_weight),
         "not_finite": float(now.adam.total_notfinite),

@@ -23,7 +23,8 @@ from ..environment import Env, EnvState, InformationGain, prior_sd_of
 from ..excitation import Multisine
 from ..plant import AbstractPlant
 from ..policy import Layout
-from .gradient import Batch, GradientSettings, Progress, experiments, update_all
+from .checkpoint import Progress
+from .gradient import GradientSettings, Optimisation, Scores, experiments, update_all
 
 
 def signal_env(plant: AbstractPlant, num_steps: int, spread: float, criterion: str = "D") -> Env:
@@ -36,9 +37,6 @@ def signal_env(plant: AbstractPlant, num_steps: int, spread: float, criterion: s
     layout = Layout.of(plant.description, window=1, num_steps=num_steps)
     return Env.of(plant, objective=objective, layout=layout, spread=spread)
 
-
-Report = Callable[[int, int], None]
-"""Called with the number of updates done, and of all."""
 
 CLAIRVOYANT = GradientSettings(num_updates=1500, learning_rate=0.03, margin=0.97, near=0.9975)
 """Its outputs may come as near to the critical level as 0.9975 of it (39.9 of 40 degrees)."""
@@ -72,7 +70,7 @@ class _Played(eqx.Module):
 
 
 @dataclass(frozen=True)
-class Design:
+class FoundSignals:
     """Designed signals; the leading axis is the plant, a single one for a robust signal.
 
     Attributes:
@@ -93,10 +91,10 @@ def clairvoyant_signals(
     keys: Key[Array, " plant"],
     num_starts: int,
     settings: GradientSettings = CLAIRVOYANT,
-    report: Report = lambda *_: None,
+    report: Progress = lambda *_: None,
     *,
     seed: int = 0,
-) -> Design:
+) -> FoundSignals:
     """The best signal for each plant that these keys draw; the seed is that of the starts.
 
     Raises:
@@ -113,8 +111,8 @@ def robust_signal(
     seed: int,
     num_starts: int = 4,
     settings: GradientSettings = ROBUST,
-    report: Report = lambda *_: None,
-) -> Design:
+    report: Progress = lambda *_: None,
+) -> FoundSignals:
     """The signal that is best on average over plants drawn at random, and safe for them.
 
     Raises:
@@ -137,20 +135,20 @@ def _search(
     settings: GradientSettings,
     player: OpenLoop,
     keys: Callable[[int], Key[Array, "search plant"]],
-    report: Report,
+    report: Progress,
 ) -> Float[Array, "search time input"]:
     """Actions at the end of all searches, side by side."""
-    now = eqx.filter_vmap(lambda p: Progress.start(p, settings))(player)
+    now = eqx.filter_vmap(lambda p: Optimisation.start(p, settings))(player)
     for i in range(settings.num_updates):
         now, _ = update_all(env, settings, now, keys(i))
-        report(i + 1, settings.num_updates)
+        report(f"updating {i + 1:,} of {settings.num_updates:,}", i + 1, settings.num_updates)
     return jnp.tanh(now.player.latent)
 
 
 @eqx.filter_jit
 def _played(
     env: Env, actions: Float[Array, "search time input"], keys: Key[Array, "search plant"]
-) -> Batch:
+) -> Scores:
     return jax.vmap(lambda own, plants: experiments(env, _Played(own), plants, 0.9))(actions, keys)
 
 
@@ -160,7 +158,7 @@ def _at_the_limit(
     keys: Key[Array, "search plant"],
     limit: float,
     num_plants: int,
-) -> Design:
+) -> FoundSignals:
     """Every signal at its best safe amplitude, and of every plant the best of its starts."""
     worth = np.full(len(actions), -np.inf)
     nearness, factors = np.zeros(len(actions)), np.ones(len(actions))
@@ -181,7 +179,7 @@ def _at_the_limit(
     best = np.arange(num_plants) * num_starts + np.argmax(by_start, axis=1)
     chosen = np.clip(factors[best, None, None] * np.asarray(actions)[best], -1, 1)
     middle, half = np.array(env.layout.input_middle), np.array(env.layout.input_half)
-    return Design(middle + half * chosen, by_start.max(axis=1), nearness[best], by_start)
+    return FoundSignals(middle + half * chosen, by_start.max(axis=1), nearness[best], by_start)
 
 
 def _first_signals(env: Env, keys: Key[Array, " search"]) -> OpenLoop:

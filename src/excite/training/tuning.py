@@ -7,21 +7,24 @@ plants drawn from the prior, among signals that break no critical level.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optuna
 from jaxtyping import Array, Key
+from optuna.trial import FrozenTrial
 
 from ..environment import Env, run_episodes
 from ..excitation.catalogue import LOOP, excitation_named
 from ..information import a_optimality, d_optimality, e_optimality
 from ..plant import AbstractPlant
 from ..safety import critical_levels, watched_output
+from .checkpoint import Progress
 
 VIOLATION_COST = 5000.0
 """What the criterion loses when every experiment of a signal is a violation."""
@@ -31,6 +34,9 @@ NEAR = 0.97
 
 NUM_FINALISTS = 60
 """Settings that are judged again on fresh plants, best first, until one is safe there too."""
+
+Options: TypeAlias = dict[str, float | bool | list[float]]
+"""Options of an excitation, as study files have them."""
 
 _CRITERIA = {
     "D": d_optimality,
@@ -52,11 +58,19 @@ class Tuned:
     """
 
     excitation: str
-    options: Mapping[str, Any]
+    options: Options
     value: float
     violations: int
     episodes: int
     trials: int
+
+    def __str__(self) -> str:
+        """How to use it as an excitation on the command line, and what that is worth."""
+        settings = ",".join(f"{k}={json.dumps(v)}" for k, v in self.options.items())
+        return (
+            f"as an excitation, drawn or closed anew each time: --excitation {self.excitation} "
+            f"--set {settings}; {self.violations} violations on {self.episodes} fresh plants"
+        )
 
 
 def tuned_signal(
@@ -66,7 +80,7 @@ def tuned_signal(
     criterion: str = "D",
     trials: int = 400,
     seed: int = 0,
-    report: Callable[[int, int], None] = lambda *_: None,
+    report: Progress = lambda *_: None,
 ) -> Tuned:
     """The best options of a classical excitation, judged again on plants it was not tuned on.
 
@@ -82,20 +96,18 @@ def tuned_signal(
     tuning, judging = jax.random.split(jax.random.key(seed))
     keys = jax.random.split(tuning, 500)
 
-    def scored(
-        options: Mapping[str, Any], keys: Key[Array, " episode"], limit: float
-    ) -> tuple[float, int]:
+    def scored(options: Options, keys: Key[Array, " episode"], limit: float) -> tuple[float, int]:
         built = excitation_named(excitation, options, plant)
         episodes = run_episodes(plant, built, num_steps, float(env.spread), keys)
         values = np.asarray(jax.vmap(_CRITERIA[criterion])(episodes.information))
         nearness = episodes.max_abs_output / critical_levels(plant.definition)[None]
         return float(np.mean(values)), int(np.sum(~np.all(nearness < limit, axis=1)))
 
-    def objective(trial: Any) -> float:
+    def objective(trial: optuna.Trial) -> float:
         options = _suggested(trial, plant, excitation, num_steps)
         trial.set_user_attr("options", options)
         value, violations = scored(options, keys, NEAR)
-        report(trial.number + 1, trials)
+        report(f"trial {trial.number + 1:,} of {trials:,}", trial.number + 1, trials)
         value = value if np.isfinite(value) else -VIOLATION_COST
         return value - VIOLATION_COST * violations / len(keys)
 
@@ -113,19 +125,19 @@ def tuned_signal(
     best = min(judged, key=lambda tuned: tuned.violations)
     if best.violations == best.episodes or not np.isfinite(best.value):
         raise ValueError(
-            f"no setting of {excitation!r} was found that is of use: the best has "
-            f"{best.violations} violations on {best.episodes} plants; a smaller spread, a "
-            "shorter experiment or more trials may help"
+            f"tuning {excitation!r} found no usable setting: the best has {best.violations} "
+            f"violations on {best.episodes} plants; a smaller spread, a shorter experiment or "
+            "more trials may help"
         )
     return best
 
 
-def _cost(trial: Any) -> float:
+def _cost(trial: FrozenTrial) -> float:
     """What is sorted by: a trial without a value comes last."""
     return np.inf if trial.value is None else -trial.value
 
 
-def _usual(plant: AbstractPlant, num_steps: int) -> dict[str, Any]:
+def _usual(plant: AbstractPlant, num_steps: int) -> Options:
     """What the excitations do where nothing is said, the first trial of every search."""
     d = plant.description
     halves = [(i.upper - i.lower) / 2 for i in d.inputs]
@@ -140,14 +152,16 @@ def _usual(plant: AbstractPlant, num_steps: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _suggested(trial: Any, plant: AbstractPlant, excitation: str, num_steps: int) -> dict[str, Any]:
+def _suggested(
+    trial: optuna.Trial, plant: AbstractPlant, excitation: str, num_steps: int
+) -> Options:
     """Options of one trial, within what the plant and the experiment allow."""
     shape = excitation.removeprefix(LOOP)
     own = _OPTIONS[shape](trial, plant, num_steps)
     return own | (_loop(trial, plant) if shape != excitation else _amplitude(trial, plant))
 
 
-def _amplitude(trial: Any, plant: AbstractPlant) -> dict[str, Any]:
+def _amplitude(trial: optuna.Trial, plant: AbstractPlant) -> Options:
     """One amplitude an input, from a hundredth of half the limits to all of it."""
     halves = [(i.upper - i.lower) / 2 for i in plant.definition.inputs]
     values = [
@@ -157,7 +171,7 @@ def _amplitude(trial: Any, plant: AbstractPlant) -> dict[str, Any]:
     return {"amplitude": values[0] if len(values) == 1 else values}
 
 
-def _loop(trial: Any, plant: AbstractPlant) -> dict[str, Any]:
+def _loop(trial: optuna.Trial, plant: AbstractPlant) -> Options:
     d, level = plant.definition, critical_levels(plant.definition)[watched_output(plant.definition)]
     output = d.outputs[watched_output(d)]
     size = float(level) if np.isfinite(level) else output.scale
@@ -169,18 +183,18 @@ def _loop(trial: Any, plant: AbstractPlant) -> dict[str, Any]:
     }
 
 
-def _frequency(trial: Any, plant: AbstractPlant, name: str, num_steps: int) -> float:
+def _frequency(trial: optuna.Trial, plant: AbstractPlant, name: str, num_steps: int) -> float:
     """Between one period an experiment and the sampling theorem."""
     longest, nyquist = 1 / (num_steps * float(plant.dt)), 0.5 / float(plant.dt)
     return trial.suggest_float(name, longest, nyquist, log=True)
 
 
-def _band(trial: Any, plant: AbstractPlant, num_steps: int) -> dict[str, Any]:
+def _band(trial: optuna.Trial, plant: AbstractPlant, num_steps: int) -> Options:
     names = ("start_frequency", "stop_frequency")
     return {name: _frequency(trial, plant, name, num_steps) for name in names}
 
 
-def _multisine(trial: Any, plant: AbstractPlant, num_steps: int) -> dict[str, Any]:
+def _multisine(trial: optuna.Trial, plant: AbstractPlant, num_steps: int) -> Options:
     """Its band must hold a harmonic: two of them at least."""
     low, high = sorted(_band(trial, plant, num_steps).values())
     high = min(max(high, 2 * low), 0.5 / float(plant.dt))
@@ -190,7 +204,7 @@ def _multisine(trial: Any, plant: AbstractPlant, num_steps: int) -> dict[str, An
 
 _HOLDS = (1, 2, 3, 5, 8, 12, 20, 35, 60)
 
-_OPTIONS: Mapping[str, Callable[[Any, AbstractPlant, int], dict[str, Any]]] = {
+_OPTIONS: Mapping[str, Callable[[optuna.Trial, AbstractPlant, int], Options]] = {
     "random": lambda trial, plant, _: {"hold": trial.suggest_categorical("hold", _HOLDS)},
     "prbs": lambda trial, plant, _: {
         "clock": trial.suggest_categorical("clock", _HOLDS),
