@@ -123,8 +123,16 @@ def inner_imports(module: str) -> frozenset[str]:
 
 
 def outer_imports(module: str) -> Iterator[str]:
-    """Dotted names of what a module imports from outside the package."""
+    """Dotted names of what a module imports from outside the package when it runs."""
+    for_checkers = [
+        node
+        for branch in ast.walk(tree_of(module))
+        if isinstance(branch, ast.If) and ast.unparse(branch.test) == "TYPE_CHECKING"
+        for node in branch.body
+    ]
     for node in ast.walk(tree_of(module)):
+        if node in for_checkers:
+            continue
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and not node.level:
@@ -193,8 +201,9 @@ def test_imports_stand_at_the_top_but_for_the_command_line(module):
     if room_of(module) != "cli":
         imports = (ast.Import, ast.ImportFrom)
         functions = [n for n in ast.walk(tree_of(module)) if isinstance(n, ast.FunctionDef)]
-        hidden = [n.lineno for f in functions for n in ast.walk(f) if isinstance(n, imports)]
-        assert not hidden
+        hidden = [n for f in functions for n in ast.walk(f) if isinstance(n, imports)]
+        # Figures load Matplotlib, which only those who draw one wait for.
+        assert all(ast.unparse(n).startswith("from ..report.figure") for n in hidden)
 
 
 @modules

@@ -20,6 +20,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse
 from starlette.routing import Route
 
+from ..study.objectives import OBJECTIVES, is_information
 from ..study.progress import read_progress
 from .requests import RefusedError, number, whole, without_folders, word
 
@@ -34,9 +35,6 @@ if sys.platform == "linux":  # a server that is killed interrupts its trainings
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGINT)
 os.execv(sys.executable, [sys.executable, "-m", "excite", *sys.argv[1:]])
 """
-_INFORMATION = ("D", "A", "E")
-OBJECTIVES = (*_INFORMATION, "goals", "relative", "log", "nls")
-"""What the page offers to train for."""
 
 
 class Training:
@@ -113,7 +111,7 @@ class Training:
             "state": self.state,
             "sentence": self.sentence,
             "curve": self.curve,
-            "is_bound": self.words[self.words.index("--objective") + 1] in _INFORMATION,
+            "is_bound": is_information(self.words[self.words.index("--objective") + 1]),
             "command": " ".join(["excite", *self.words, "--out", self.folder.name]),
         }
 

@@ -1,0 +1,71 @@
+"""Objectives of a training by the name that people type, and what each is in a study.
+
+Needs no JAX, so that the command line and the page name them at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+from ..description import unknown
+
+OBJECTIVES: Mapping[str, Mapping[str, str]] = {
+    "D": {"reward": "information", "criterion": "D"},
+    "A": {"reward": "information", "criterion": "A"},
+    "E": {"reward": "information", "criterion": "E"},
+    "goals": {"reward": "goals"},
+    "relative": {"reward": "relative"},
+    "log": {"reward": "log"},
+    "nls": {"reward": "relative", "estimator": "nls"},
+}
+"""Settings of a reward: criteria of the Fisher information, or errors of an estimator."""
+
+
+def rewards_of(
+    objectives: str | Sequence[str] | Mapping[str, float], goals: Mapping[str, float]
+) -> dict[str, dict[str, object]]:
+    """Settings of the reward of each objective, by name.
+
+    Args:
+        objectives: a name, names, each perhaps with a weight (`log=2`), or weights by name.
+        goals: by parameter; they belong to objectives that know errors.
+
+    Raises:
+        ValueError: for an unknown name, one that repeats, or a weight that is not a number.
+    """
+    given = [objectives] if isinstance(objectives, str) else objectives
+    weights = list(given.items() if isinstance(given, Mapping) else map(_weighted, given))
+    names = [name for name, _ in weights]
+    for name in names:
+        if name not in OBJECTIVES:
+            raise unknown("objective", name, OBJECTIVES)
+    if len(set(names)) < len(names) or not names:
+        raise ValueError(f"objectives must differ from each other, got {', '.join(names)}")
+    with_goals = [name for name in names if not is_information(name)] or names
+    return {
+        name: {
+            **OBJECTIVES[name],
+            **({"goals": dict(goals)} if goals and name in with_goals else {}),
+            **({} if weight is None else {"weight": weight}),
+        }
+        for name, weight in weights
+    }
+
+
+def is_information(name: str) -> bool:
+    """Whether an objective is a criterion of the Fisher information."""
+    return OBJECTIVES[name]["reward"] == "information"
+
+
+def _weighted(word: str) -> tuple[str, float | None]:
+    name, has_weight, weight = word.partition("=")
+    try:
+        return name, float(weight) if has_weight else None
+    except ValueError:
+        raise ValueError(f"the weight of {name!r} must be a number, got {weight!r}") from None
+
+
+def decision_of(rewards: Iterable[Mapping[str, object]]) -> dict[str, object]:
+    """The part of a decision process that rewards: a single reward, or several that are added."""
+    rewards = [dict(reward) for reward in rewards]
+    return rewards[0] if len(rewards) == 1 else {"terms": rewards}
