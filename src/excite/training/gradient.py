@@ -27,59 +27,8 @@ from ..environment import Env, EnvState
 from ..policy import Layout, Weights, forward, observe
 from ..safety import watched_levels
 from .checkpoint import Checkpoint, OnBoundary, Trained
-from .settings import (
-    check_counts,
-    check_fractions,
-    check_not_negative,
-    check_positive,
-    check_widths,
-)
+from .settings import GradientSettings
 from .validation import look, watch_keys
-
-
-@dataclass(frozen=True)
-class GradientSettings:
-    """Hyper-parameters of training by gradient.
-
-    Attributes:
-        num_updates: steps of Adam.
-        num_plants: plants of each step.
-        learning_rate: of Adam, decaying to zero by a cosine.
-        max_grad_norm: a longer gradient is scaled down to this norm.
-        hidden: widths of the hidden layers, tanh.
-        last_gain: scale of the last layer's first weights; a loud first policy runs away.
-        margin: the penalty begins at this fraction of a critical level.
-        penalty_weight: of the penalty, at the beginning and at least.
-        near: fraction of a critical level that counts as too near to it.
-        penalty_growth, penalty_decay: what is added to the weight's logarithm after a batch
-            of which more than `violation_rate` came too near, and taken away after another.
-        violation_rate: allowed on held-out plants.
-        watch_every: updates between two looks at the policy.
-        watch_episodes: episodes of such a look.
-    """
-
-    num_updates: int = 1000
-    num_plants: int = 64
-    learning_rate: float = 3e-3
-    max_grad_norm: float = 1.0
-    hidden: tuple[int, ...] = (64, 64)
-    last_gain: float = 0.02
-    margin: float = 0.95
-    penalty_weight: float = 30.0
-    near: float = 0.97
-    penalty_growth: float = 0.02
-    penalty_decay: float = 0.02
-    violation_rate: float = 0.0
-    watch_every: int = 50
-    watch_episodes: int = 500
-
-    def __post_init__(self) -> None:
-        """Raises ValueError for a value that is not allowed."""
-        check_counts(self, "num_updates", "num_plants", "watch_every", "watch_episodes")
-        check_positive(self, "learning_rate", "max_grad_norm", "last_gain", "penalty_weight")
-        check_not_negative(self, "penalty_growth", "penalty_decay")
-        check_fractions(self, "margin", "near", "violation_rate")
-        check_widths(self)
 
 
 class Network(eqx.Module):
@@ -375,9 +324,8 @@ def _require_finite(now: Optimisation, settings: GradientSettings, num_updates: 
 def _require_computable(row: Mapping[str, float]) -> None:
     if row["not_computable"] == 1:
         raise ValueError(
-            "no experiment on this plant can be computed to its end: its state leaves the finite "
-            "numbers under this policy; give it a critical level, a shorter experiment or a "
-            "smaller spread"
+            "every simulation of this plant diverges (NaN or infinity) under this policy; a critical "
+            "level, a shorter experiment or a smaller spread may help"
         )
 
 

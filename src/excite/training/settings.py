@@ -1,49 +1,89 @@
-"""Hyper-parameters of PPO, and checks that all trainers' settings share."""
+"""Hyper-parameters of both trainers; each field's type says what it may be."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Annotated, NamedTuple, TypeAlias, get_args, get_type_hints
 
 
-def check_counts(settings: Any, *names: str) -> None:
-    """Raises ValueError for a setting below one."""
-    for name in names:
-        if getattr(settings, name) < 1:
-            raise ValueError(f"{name} must be at least 1: got {getattr(settings, name)}")
+class Rule(NamedTuple):
+    """What a hyper-parameter must be, in words and as a test."""
+
+    words: str
+    holds: Callable[..., bool]
 
 
-def check_positive(settings: Any, *names: str) -> None:
-    """Raises ValueError for a setting that is not positive and finite; None is allowed."""
-    for name in names:
-        value = getattr(settings, name)
-        if value is not None and not 0 < value < math.inf:
-            raise ValueError(f"{name} must be positive and finite: got {value:g}")
+Count: TypeAlias = Annotated[int, Rule("must be at least 1", lambda n: n >= 1)]
+Positive: TypeAlias = Annotated[
+    float, Rule("must be positive and finite", lambda x: 0 < x < math.inf)
+]
+NotNegative: TypeAlias = Annotated[float, Rule("must not be negative", lambda x: 0 <= x < math.inf)]
+Fraction: TypeAlias = Annotated[float, Rule("must lie in [0, 1)", lambda x: 0 <= x < 1)]
+Share: TypeAlias = Annotated[float, Rule("must be above 0 and at most 1", lambda x: 0 < x <= 1)]
+Widths: TypeAlias = Annotated[
+    tuple[int, ...],
+    Rule("needs widths of at least 1", lambda widths: min(widths, default=0) >= 1),
+]
 
 
-def check_not_negative(settings: Any, *names: str) -> None:
-    """Raises ValueError for a setting that is negative or not finite."""
-    for name in names:
-        if not 0 <= getattr(settings, name) < math.inf:
-            raise ValueError(f"{name} must not be negative: got {getattr(settings, name):g}")
+class _Checked:
+    """Hyper-parameters that are checked by the rules of their types."""
 
-
-def check_fractions(settings: Any, *names: str) -> None:
-    """Raises ValueError for a setting that is not in [0, 1)."""
-    for name in names:
-        if not 0 <= getattr(settings, name) < 1:
-            raise ValueError(f"{name} must lie in [0, 1): got {getattr(settings, name):g}")
-
-
-def check_widths(settings: Any) -> None:
-    """Raises ValueError where the hidden layers have no widths of at least one."""
-    if not settings.hidden or min(settings.hidden) < 1:
-        raise ValueError(f"hidden needs widths of at least 1: got {list(settings.hidden)}")
+    def __post_init__(self) -> None:
+        """Raises ValueError for a value that is not allowed; None is, where it is a default."""
+        types = get_type_hints(type(self), include_extras=True)
+        for field in fields(self):  # pyright: ignore[reportArgumentType]
+            value, kind = getattr(self, field.name), types[field.name]
+            if value is None:
+                continue
+            first = get_args(kind)[0]
+            rule = (getattr(kind, "__metadata__", None) or first.__metadata__)[0]
+            if not rule.holds(value):
+                got = list(value) if isinstance(value, tuple) else format(value, "g")
+                raise ValueError(f"{field.name} {rule.words}: got {got}")
 
 
 @dataclass(frozen=True)
-class PPOSettings:
+class GradientSettings(_Checked):
+    """Hyper-parameters of training by gradient.
+
+    Attributes:
+        num_updates: steps of Adam.
+        num_plants: plants of each step.
+        learning_rate: of Adam, decaying to zero by a cosine.
+        max_grad_norm: a longer gradient is scaled down to this norm.
+        hidden: widths of the hidden layers, tanh.
+        last_gain: scale of the last layer's first weights; a loud first policy runs away.
+        margin: the penalty begins at this fraction of a critical level.
+        penalty_weight: of the penalty, at the beginning and at least.
+        near: fraction of a critical level that counts as too near to it.
+        penalty_growth, penalty_decay: what is added to the weight's logarithm after a batch
+            of which more than `violation_rate` came too near, and taken away after another.
+        violation_rate: allowed on held-out plants.
+        watch_every: updates between two looks at the policy.
+        watch_episodes: episodes of such a look.
+    """
+
+    num_updates: Count = 1000
+    num_plants: Count = 64
+    learning_rate: Positive = 3e-3
+    max_grad_norm: Positive = 1.0
+    hidden: Widths = (64, 64)
+    last_gain: Positive = 0.02
+    margin: Fraction = 0.95
+    penalty_weight: Positive = 30.0
+    near: Fraction = 0.97
+    penalty_growth: NotNegative = 0.02
+    penalty_decay: NotNegative = 0.02
+    violation_rate: Fraction = 0.0
+    watch_every: Count = 50
+    watch_episodes: Count = 500
+
+
+@dataclass(frozen=True)
+class PPOSettings(_Checked):
     """Hyper-parameters, named as in Stable-Baselines3 and with its defaults where it has one.
 
     Attributes:
@@ -65,40 +105,29 @@ class PPOSettings:
         watch_episodes: episodes of such a look.
     """
 
-    total_steps: int = 1_000_000
-    num_envs: int = 1
-    n_steps: int = 2048
-    batch_size: int = 64
-    n_epochs: int = 10
-    gamma: float = 0.99
-    gae_lambda: float = 0.95
-    clip_range: float = 0.2
-    ent_coef: float = 0.0
-    vf_coef: float = 0.5
-    max_grad_norm: float = 0.5
-    learning_rate: float = 3e-4
-    learning_rate_end: float | None = None
-    noise_sd: float = 1.0
-    noise_sd_end: float | None = None
-    average_last: float = 0.0
-    hidden: tuple[int, ...] = (64, 64)
-    watch_every: int = 10
-    watch_episodes: int = 100
+    total_steps: Count = 1_000_000
+    num_envs: Count = 1
+    n_steps: Count = 2048
+    batch_size: Count = 64
+    n_epochs: Count = 10
+    gamma: Share = 0.99
+    gae_lambda: Share = 0.95
+    clip_range: Positive = 0.2
+    ent_coef: NotNegative = 0.0
+    vf_coef: NotNegative = 0.5
+    max_grad_norm: Positive = 0.5
+    learning_rate: Positive = 3e-4
+    learning_rate_end: Positive | None = None
+    noise_sd: Positive = 1.0
+    noise_sd_end: Positive | None = None
+    average_last: Fraction = 0.0
+    hidden: Widths = (64, 64)
+    watch_every: Count = 10
+    watch_episodes: Count = 100
 
     def __post_init__(self) -> None:
         """Raises ValueError for a value that is not allowed."""
-        check_counts(self, "total_steps", "num_envs", "n_steps", "batch_size", "n_epochs")
-        check_counts(self, "watch_every", "watch_episodes")
-        check_positive(self, "learning_rate", "learning_rate_end", "noise_sd", "noise_sd_end")
-        check_positive(self, "clip_range", "max_grad_norm")
-        check_not_negative(self, "ent_coef", "vf_coef")
-        for name in ("gamma", "gae_lambda"):
-            if not 0 < getattr(self, name) <= 1:
-                raise ValueError(
-                    f"{name} must be above 0 and at most 1: got {getattr(self, name):g}"
-                )
-        check_fractions(self, "average_last")
-        check_widths(self)
+        super().__post_init__()
         rollout = self.num_envs * self.n_steps
         if self.batch_size < 2 or rollout % self.batch_size:
             raise ValueError(
