@@ -324,8 +324,8 @@ def _require_finite(now: Optimisation, settings: GradientSettings, num_updates: 
 def _require_computable(row: Mapping[str, float]) -> None:
     if row["not_computable"] == 1:
         raise ValueError(
-            "every simulation of this plant diverges (NaN or infinity) under this policy; a critical "
-            "level, a shorter experiment or a smaller spread may help"
+            "every simulation of this plant diverges (NaN or infinity) under this policy; a "
+            "critical level, a shorter experiment or a smaller spread may help"
         )
 
 
