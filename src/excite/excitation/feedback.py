@@ -10,17 +10,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..plant import AbstractPlant
 from ..plant.fields import floats, optional_floats
-from ..policy import (
-    Layout,
-    Policy,
-    Window,
-    empty_window,
-    forward,
-    observe,
-    scaled_action,
-    with_input,
-    with_measurement,
-)
+from ..policy import Layout, Policy, Window, empty_window, respond, with_input
 from ..safety import watched_output
 from .contract import AbstractExcitation, AbstractShape
 
@@ -111,9 +101,7 @@ class PolicyExcitation(AbstractExcitation):
     ) -> tuple[tuple[Window, Array], Float[Array, " input"]]:
         """The network's input for the window that ends with this measurement."""
         window, k = state
-        window = with_measurement(jnp, self.layout, window, measurement)
-        action = forward(jnp, self.weights, observe(jnp, self.layout, window, k))
-        input = scaled_action(jnp, self.layout, action.astype(float))
+        window, input = respond(jnp, self.layout, self.weights, window, k, measurement)
         return (with_input(jnp, self.layout, window, input), k + 1), input
 
     def applied(

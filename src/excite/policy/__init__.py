@@ -6,11 +6,13 @@ from .contract import Layout as Layout
 from .contract import Policy as Policy
 from .contract import Weights as Weights
 from .contract import Window as Window
+from .contract import act as act
 from .contract import empty_window as empty_window
 from .contract import forward as forward
 from .contract import mismatch as mismatch
 from .contract import network as network
 from .contract import observe as observe
+from .contract import respond as respond
 from .contract import scaled_action as scaled_action
 from .contract import with_input as with_input
 from .contract import with_measurement as with_measurement

@@ -14,6 +14,7 @@ import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import ModuleType
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -89,7 +90,7 @@ class Window(NamedTuple):
     inputs: AnyArray
 
 
-def empty_window(xp: Any, layout: Layout) -> Window:
+def empty_window(xp: ModuleType, layout: Layout) -> Window:
     """The window before the first measurement."""
     return Window(
         outputs=xp.zeros((layout.window, len(layout.output_scale))),
@@ -97,19 +98,19 @@ def empty_window(xp: Any, layout: Layout) -> Window:
     )
 
 
-def with_measurement(xp: Any, layout: Layout, window: Window, measured: AnyArray) -> Window:
+def with_measurement(xp: ModuleType, layout: Layout, window: Window, measured: AnyArray) -> Window:
     """The window after one more measurement, in output units."""
     newest = measured / xp.asarray(layout.output_scale)
     return window._replace(outputs=xp.concatenate([window.outputs[1:], newest[None]]))
 
 
-def with_input(xp: Any, layout: Layout, window: Window, input: AnyArray) -> Window:
+def with_input(xp: ModuleType, layout: Layout, window: Window, input: AnyArray) -> Window:
     """The window after one more input was applied, in input units."""
     newest = (input - xp.asarray(layout.input_middle)) / xp.asarray(layout.input_half)
     return window._replace(inputs=xp.concatenate([window.inputs[1:], newest[None]]))
 
 
-def observe(xp: Any, layout: Layout, window: Window, k: AnyArray) -> AnyArray:
+def observe(xp: ModuleType, layout: Layout, window: Window, k: AnyArray) -> AnyArray:
     """Observation of step k, in single precision: outputs, inputs, k / T, sines, cosines."""
     progress = xp.reshape(xp.asarray(k / layout.num_steps), (1,))
     parts = [xp.ravel(window.outputs), xp.ravel(window.inputs), progress]
@@ -119,7 +120,7 @@ def observe(xp: Any, layout: Layout, window: Window, k: AnyArray) -> AnyArray:
     return xp.concatenate(parts).astype(xp.float32)
 
 
-def network(xp: Any, weights: Weights, observation: AnyArray) -> AnyArray:
+def network(xp: ModuleType, weights: Weights, observation: AnyArray) -> AnyArray:
     """Hyperbolic tangents and a linear last layer."""
     x = observation
     for matrix, bias in weights[:-1]:
@@ -128,15 +129,58 @@ def network(xp: Any, weights: Weights, observation: AnyArray) -> AnyArray:
     return matrix @ x + bias
 
 
-def forward(xp: Any, weights: Weights, observation: AnyArray) -> AnyArray:
-    """Action in [-1, 1]: what the network says, clipped; 0 if not finite."""
+def forward(
+    xp: ModuleType, weights: Weights, observation: AnyArray, if_not_finite: float = 0.0
+) -> AnyArray:
+    """Action in [-1, 1]: the network's output, clipped; `if_not_finite` where it is no number."""
     action = network(xp, weights, observation)
-    return xp.where(xp.isfinite(action), xp.clip(action, -1.0, 1.0), 0.0)
+    return xp.where(xp.isfinite(action), xp.clip(action, -1.0, 1.0), if_not_finite)
 
 
-def scaled_action(xp: Any, layout: Layout, action: AnyArray) -> AnyArray:
+def act(
+    xp: ModuleType,
+    layout: Layout,
+    weights: Weights,
+    window: Window,
+    k: AnyArray,
+    if_not_finite: float = 0.0,
+) -> AnyArray:
+    """Action in [-1, 1] of step k, for a window that ends with the measurement of step k."""
+    return forward(xp, weights, observe(xp, layout, window, k), if_not_finite)
+
+
+def scaled_action(xp: ModuleType, layout: Layout, action: AnyArray) -> AnyArray:
     """Input, in its unit, that an action in [-1, 1] stands for."""
     return xp.asarray(layout.input_middle) + xp.asarray(layout.input_half) * action
+
+
+def respond(
+    xp: ModuleType,
+    layout: Layout,
+    weights: Weights,
+    window: Window,
+    k: AnyArray,
+    measured: AnyArray,
+    if_not_finite: float = 0.0,
+) -> tuple[Window, AnyArray]:
+    """One step of a policy: the window with this measurement, and the input to apply.
+
+    Which input was applied is told afterwards by `with_input`.
+
+    Args:
+        layout: what the policy observes.
+        weights: of its network.
+        window: with the inputs and measurements of all earlier steps.
+        k: index of this step.
+        measured: outputs, in their units.
+        if_not_finite: action where the network's output is NaN or infinite.
+
+    Returns:
+        The window, and the input in its unit, in double precision.
+    """
+    window = with_measurement(xp, layout, window, measured)
+    action = act(xp, layout, weights, window, k, if_not_finite)
+    return window, scaled_action(xp, layout, action.astype(float))
 
 
 @dataclass(frozen=True)

@@ -3,21 +3,14 @@
 from __future__ import annotations
 
 import abc
+import math
 import time
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from ..policy import (
-    Policy,
-    empty_window,
-    network,
-    observe,
-    scaled_action,
-    with_input,
-    with_measurement,
-)
+from ..policy import Policy, empty_window, respond, with_input
 
 
 class AbstractPlayer(abc.ABC):
@@ -70,13 +63,13 @@ class PolicyPlayer(AbstractPlayer):
 
     def __call__(self, k: int, measured: np.ndarray) -> np.ndarray:
         """The network's input for the window that ends with this measurement."""
-        self._window = with_measurement(np, self._layout, self._window, measured)
-        observation = observe(np, self._layout, self._window, k)
+        weights, window = self._policy.weights, self._window
         with np.errstate(over="ignore", invalid="ignore"):
-            action = network(np, self._policy.weights, observation).astype(float)
-        # Not zero, as in training: for what is no number the supervisor ends the experiment.
-        action = np.where(np.isfinite(action), np.clip(action, -1.0, 1.0), np.nan)
-        return scaled_action(np, self._layout, action)
+            # Not zero, as in training: the supervisor ends an experiment where the input is NaN.
+            self._window, input = respond(
+                np, self._layout, weights, window, k, measured, if_not_finite=math.nan
+            )
+        return input
 
     def applied(self, input: np.ndarray) -> None:
         """The window remembers what was applied."""

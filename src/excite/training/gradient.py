@@ -24,7 +24,7 @@ import optax
 from jaxtyping import Array, Float, Key, PRNGKeyArray
 
 from ..environment import Env, EnvState
-from ..policy import Layout, Weights, forward, observe
+from ..policy import Layout, Weights, act
 from ..safety import watched_levels
 from .checkpoint import Checkpoint, OnBoundary, Trained
 from .settings import GradientSettings
@@ -39,7 +39,7 @@ class Network(eqx.Module):
 
     def __call__(self, state: EnvState) -> Float[Array, " input"]:
         """The policy's action in this state."""
-        return forward(jnp, self.weights, observe(jnp, self.layout, state.window, state.k))
+        return act(jnp, self.layout, self.weights, state.window, state.k)
 
 
 class Scores(eqx.Module):
