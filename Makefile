@@ -38,7 +38,7 @@ types: .venv/dev ## types
 docs: .venv/dev ## this documentation as a site, in site/ (open site/index.html)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
-results: .venv/core ## the committed results, afresh (minutes in docs/studies.md)
+results: .venv/core ## the committed results, afresh (minutes in docs/reference/studies.md)
 	for study in baselines nls nls_quantised decay damping damping_encoder damping_noise_free; do \
 	  $(BIN)/excite benchmark studies/$$study.toml --out results/$$study --overwrite || exit 1; \
 	done

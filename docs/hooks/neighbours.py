@@ -1,7 +1,7 @@
 """Pages and files that stand beside `docs/` and are linked from it become part of the site.
 
 A link that works in the repository (`../results/nls/table.md`) works on the site, too, and nothing
-is written twice: the README is the site's first page.
+is written twice. A link to a notebook leads to the page that `notebooks.py` makes of it.
 """
 
 from __future__ import annotations
@@ -13,18 +13,18 @@ from typing import Any
 
 from mkdocs.structure.files import File, Files
 
-_ROOT = Path(__file__).parent.parent
+_ROOT = Path(__file__).parents[2]
 _LINK = re.compile(r"(?P<image>!?)\[(?P<text>[^\]]*)\]\((?P<path>[^)#\s]*)(?P<anchor>#[^)\s]*)?\)")
 
 
 def on_files(files: Files, *, config: Any) -> Files:
     """Adds what the pages link to, and what these pages link to in turn."""
-    waiting = [_ROOT / "README.md", *sorted((_ROOT / "docs").rglob("*.md"))]
+    waiting = sorted((_ROOT / "docs").rglob("*.md"))
     seen = set(waiting)
     while waiting:
         path = waiting.pop()
         uri = _uri(path)
-        if files.get_file_from_path(uri) is None:
+        if path.suffix != ".ipynb" and files.get_file_from_path(uri) is None:
             files.append(File.generated(config, uri, abs_src_path=str(path)))
         targets = _targets(path) if path.suffix == ".md" else set()
         waiting += sorted(targets - seen)
@@ -35,8 +35,8 @@ def on_files(files: Files, *, config: Any) -> Files:
 def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
     """Links between pages of the site instead of files; a folder is no page, its name remains."""
     here = _ROOT / "docs" / page.file.src_uri
-    if page.file.generated_by:
-        here = _ROOT / ("README.md" if page.file.src_uri == "index.md" else page.file.src_uri)
+    if (_ROOT / page.file.src_uri).exists():
+        here = _ROOT / page.file.src_uri
     if page.file.src_uri.startswith("results/"):
         page.meta["search"] = {"exclude": True}  # rows of numbers would be found before words
     if page.file.src_uri == "index.md":
@@ -62,5 +62,5 @@ def _targets(page: Path) -> set[Path]:
 
 def _uri(path: Path) -> str:
     """Where a file stands in the site."""
-    place = path.relative_to(_ROOT).as_posix()
-    return "index.md" if place == "README.md" else place.removeprefix("docs/")
+    place = path.relative_to(_ROOT).as_posix().removeprefix("docs/")
+    return place.removesuffix(".ipynb") + ".md" if place.endswith(".ipynb") else place
