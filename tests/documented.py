@@ -7,8 +7,8 @@ ROOT = Path(__file__).parent.parent
 
 
 def section(command: str) -> str:
-    """What docs/machine-readable.md says of `excite COMMAND --json`."""
-    page = (ROOT / "docs" / "machine-readable.md").read_text()
+    """What docs/reference/machine-readable.md says of `excite COMMAND --json`."""
+    page = (ROOT / "docs" / "reference" / "machine-readable.md").read_text()
     return page.split(f"## `excite {command} --json`")[1].split("\n## ")[0]
 
 

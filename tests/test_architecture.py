@@ -1,4 +1,4 @@
-"""The rules of `docs/architecture.md`, kept by a walk over the syntax trees of the sources.
+"""The rules of `docs/explanation/architecture.md`, kept by a walk over the syntax trees.
 
 Packages stand in one order, and a module imports only what stands above its own package.
 """

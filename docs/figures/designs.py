@@ -9,9 +9,9 @@ import numpy as np
 ROOT = Path(__file__).parents[2]
 METHODS = {  # of the study: title
     "chirp": "chirp",
-    "chirp tuned": "chirp, tuned",
-    "robust signal": "robust signal",
-    "gradient D": "learned, `aero2`",
+    "chirp tuned": "tuned chirp",
+    "robust": "robust signal",
+    "gradient D": "policy aero2",
 }
 
 

@@ -39,17 +39,18 @@ def _command(name: str, command: click.Command) -> str:
     lines += [_prose(command.help or ""), "", "| option | meaning |", "| --- | --- |"]
     for option in command.get_params(context):
         record = option.get_help_record(context)
-        if record is not None and not getattr(option, "hidden", False):
+        if record is not None and record[1] and not getattr(option, "hidden", False):
             lines.append(f"| `{_cell(record[0])}` | {_cell(record[1])} |")
     return "\n".join(lines)
 
 
 def _prose(text: str) -> str:
-    """A help text as Markdown; what click leaves unwrapped is an example."""
+    """A help text as Markdown; a command that click leaves unwrapped is an example."""
     paragraphs = []
     for part in re.split(r"\n\s*\n", text.split("\f")[0].strip()):
         kept = part.removeprefix("\b\n")
-        paragraphs.append(part if kept == part else f"```text\n{kept}\n```")
+        is_example = kept != part and "excite " in kept
+        paragraphs.append(f"```text\n{kept}\n```" if is_example else kept)
     return "\n\n".join(paragraphs)
 
 
@@ -64,7 +65,10 @@ def _sentence(thing: Any) -> str:
 
 def plants() -> str:
     """One row a plant."""
-    rows = ["| plant | what it is | inputs | outputs | parameters |", "| --- | --- | --- | --- | --- |"]
+    rows = [
+        "| plant | what it is | inputs | outputs | parameters |",
+        "| --- | --- | --- | --- | --- |",
+    ]
     for name, plant in PLANTS.items():
         d = plant_named(name).description
         named = (", ".join(f"{p.name} [{p.unit}]" for p in part) for part in (d.inputs, d.outputs))

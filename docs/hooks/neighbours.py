@@ -19,7 +19,8 @@ _LINK = re.compile(r"(?P<image>!?)\[(?P<text>[^\]]*)\]\((?P<path>[^)#\s]*)(?P<an
 
 def on_files(files: Files, *, config: Any) -> Files:
     """Adds what the pages link to, and what these pages link to in turn."""
-    waiting = sorted((_ROOT / "docs").rglob("*.md"))
+    waiting = [_ROOT / "CHANGELOG.md", _ROOT / "CONTRIBUTING.md"]
+    waiting += sorted((_ROOT / "docs").rglob("*.md"))
     seen = set(waiting)
     while waiting:
         path = waiting.pop()

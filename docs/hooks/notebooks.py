@@ -35,7 +35,9 @@ def executed(path: Path) -> tuple[str, dict[str, bytes]]:
     notebook = nbformat.read(path, as_version=4)
     with tempfile.TemporaryDirectory() as folder:
         resources = {"metadata": {"path": folder}}
-        NotebookClient(notebook, timeout=_SECONDS, kernel_name="python3", resources=resources).execute()
+        NotebookClient(
+            notebook, timeout=_SECONDS, kernel_name="python3", resources=resources
+        ).execute()
     names = {"output_files_dir": f"{path.stem}_files", "unique_key": path.stem}
     markdown, resources = MarkdownExporter().from_notebook_node(notebook, dict(names))
     return markdown, resources["outputs"]

@@ -1,5 +1,6 @@
 """Commands, options, files and examples that the documentation shows exist and run."""
 
+import importlib.util
 import math
 import os
 import re
@@ -16,13 +17,10 @@ import pytest
 from experiments import ROOT
 
 import excite
-from excite.cli import cli
 from excite.estimation.catalogue import ESTIMATORS
 from excite.excitation.catalogue import EXCITATIONS
 from excite.plant.catalogue import PLANTS
 from excite.study.spec import read_study
-
-README = (ROOT / "README.md").read_text()
 
 
 def shell(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
@@ -34,31 +32,30 @@ def shell(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
     )  # fmt: skip
 
 
-COMMANDS = {
-    f"{name} {sub}".strip(): command
-    for name, group in cli.commands.items()
-    for sub, command in (group.commands if isinstance(group, click.Group) else {"": group}).items()
-}
-
-
-@pytest.mark.parametrize("name", COMMANDS)
-def test_every_command_and_option_is_in_the_readme(name: str):
-    row = next(line for line in README.splitlines() if line.startswith(f"| `excite {name}"))
-    for option in COMMANDS[name].params:
-        if isinstance(option, click.Option) and option.name not in ("as_json", "plot"):
-            shown = option.opts[0] in row or name == "information"
-            assert shown, f"{option.opts[0]} of {name} is not in the README's table"
-
-
-def test_names_on_the_command_line_are_in_the_readme():
-    for name in (*EXCITATIONS, *ESTIMATORS):
-        assert f"`{name}`" in README
-    for name in PLANTS:
-        assert f"`{name}`" in README
+def test_the_generated_reference_has_every_command_option_and_name():
+    path = ROOT / "docs" / "hooks" / "generated.py"
+    spec = importlib.util.spec_from_file_location("generated", path)
+    assert spec is not None
+    assert spec.loader is not None
+    generated = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(generated)
+    sections = re.split(r"^## ", generated.commands(), flags=re.M)[1:]
+    commands = dict(generated.leaves())
+    assert [section.partition("\n")[0] for section in sections] == list(commands)
+    for section, command in zip(sections, commands.values(), strict=True):
+        for option in command.params:
+            if isinstance(option, click.Option) and not option.hidden:
+                assert f"`{option.opts[0]}" in section or f", {option.opts[0]}" in section
+    for names, table in (
+        (PLANTS, generated.plants()),
+        (EXCITATIONS, generated.excitations()),
+        (ESTIMATORS, generated.estimators()),
+    ):
+        assert all(f"`{name}`" in table for name in names)
 
 
 def test_every_study_loads_and_stands_in_the_index_with_its_result():
-    index = (ROOT / "docs" / "studies.md").read_text()
+    index = (ROOT / "docs" / "reference" / "studies.md").read_text()
     for path in sorted((ROOT / "studies").glob("*.toml")):
         assert read_study(path).name == path.stem
         assert f"`{path.name}`" in index
@@ -67,8 +64,8 @@ def test_every_study_loads_and_stands_in_the_index_with_its_result():
 
 def test_a_policy_runs_on_a_rig_as_documented(tmp_path: Path):
     """With NumPy alone, on a rig that does not move."""
-    page = (ROOT / "docs" / "learned-excitation.md").read_text()
-    [loop] = re.findall(r"```python\n(.*?)```", page, re.S)
+    page = (ROOT / "docs" / "how-to" / "run-on-a-rig.md").read_text()
+    _, loop = re.findall(r"```python\n(.*?)```", page, re.S)
     trained = ROOT / "results" / "table1" / "seeds" / "RL_all" / "0" / "policy.safetensors"
     shutil.copy(trained, tmp_path)
     (tmp_path / "rig.py").write_text(
@@ -85,7 +82,7 @@ def test_a_policy_runs_on_a_rig_as_documented(tmp_path: Path):
 
 
 def controller(server: socket.socket) -> None:
-    """Answers every line, as the rig in docs/real-time.md expects; its pitch is a slow swing."""
+    """Answers every line, as the rig in run-on-a-rig.md expects; its pitch is a slow swing."""
     start, (line, _) = time.monotonic(), server.accept()
     with line:
         while line.recv(64):
@@ -93,8 +90,8 @@ def controller(server: socket.socket) -> None:
 
 
 def test_a_rig_of_ones_own_is_short_and_runs_as_documented(tmp_path: Path):
-    page = (ROOT / "docs" / "real-time.md").read_text()
-    [rig] = re.findall(r"```python\n(.*?)```", page, re.S)
+    page = (ROOT / "docs" / "how-to" / "run-on-a-rig.md").read_text()
+    rig, _ = re.findall(r"```python\n(.*?)```", page, re.S)
     assert len(rig[rig.index("class ") :].splitlines()) <= 40
     with socket.create_server(("localhost", 0)) as server:
         (tmp_path / "seesaw.py").write_text(rig.replace("5000", str(server.getsockname()[1])))

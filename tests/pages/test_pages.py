@@ -82,13 +82,16 @@ def test_the_commands_of_a_page_run(page: Path, tmp_path: Path):
 @pytest.mark.parametrize("script", sorted(ROOT.glob("docs/figures/*.py")), ids=name)
 def test_the_figures_of_the_pages_are_made_by_their_scripts(script: Path, tmp_path: Path):
     """From the committed results; pixels depend on the fonts of a computer."""
-    (tmp_path / "results").symlink_to(ROOT / "results")
+    for folder in ("results", "examples", "studies"):
+        (tmp_path / folder).symlink_to(ROOT / folder)
     copy = tmp_path / script.relative_to(ROOT)
     copy.parent.mkdir(parents=True)
     shutil.copy(script, copy)
     subprocess.run([sys.executable, str(copy)], cwd=tmp_path, check=True, timeout=600)
-    [figure] = [path for path in copy.parent.iterdir() if path != copy]
-    assert (script.parent / figure.name).is_file()
+    made = [path for path in copy.parent.rglob("*.*") if path != copy]
+    assert made
+    for figure in made:
+        assert (script.parent / figure.relative_to(copy.parent)).is_file()
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name)
@@ -158,18 +161,23 @@ def test_the_site_builds_strictly_and_asks_nothing_of_the_network(tmp_path: Path
             r"<(?:script|link|img|iframe)\b[^>]*(?:src|href)=\"([^\"]*)", page.read_text()
         )
         assert not [url for url in loaded if "//" in url], page
-    reference = (tmp_path / "api" / "estimation.html").read_text()
+    reference = (tmp_path / "reference" / "python" / "estimation.html").read_text()
     assert 'id="excite.estimation.NLS"' in reference  # re-exported names are there
     assert 'href="results/baselines/table.html"' not in reference
     assert (tmp_path / "results" / "table1" / "table.html").is_file()
+    metrics = (tmp_path / "reference" / "metrics.html").read_text()
+    assert metrics.count("<math") > 10  # equations need no script
+    assert "arithmatex" not in metrics
+    commands = (tmp_path / "reference" / "commands.html").read_text()
+    assert 'id="excite-identify"' in commands  # made from the commands
 
 
 def test_every_room_has_its_place_in_the_reference():
-    pages = "".join(page.read_text() for page in sorted(ROOT.glob("docs/api/*.md")))
+    pages = "".join(page.read_text() for page in sorted(ROOT.glob("docs/reference/python/*.md")))
     rooms = {path.stem for path in (ROOT / "src" / "excite").iterdir() if path.stem[0] != "_"}
     shown = {room.split(".")[0] for room in re.findall(r"^::: excite\.([\w.]+)", pages, re.M)}
-    # Seen by its commands, by its page in the browser, or data.
-    assert rooms - shown <= {"cli", "web", "policies"}
+    # Seen by its commands, or by its page in the browser.
+    assert rooms - shown <= {"cli", "web"}
 
 
 def test_the_tutorial_shows_the_example_plant_as_it_is():

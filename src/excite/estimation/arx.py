@@ -5,7 +5,7 @@ fitted by recursive least squares (Ljung, System Identification, sec. 11.2), its
 mapped to continuous time by the logarithm. The innovations are taken as white although
 sensor noise enters past outputs too, which biases the damping; the start covariance acts
 as a ridge penalty towards zero coefficients, which biases it further
-(docs/choosing-an-estimator.md).
+(docs/how-to/choosing-an-estimator.md).
 """
 
 from __future__ import annotations

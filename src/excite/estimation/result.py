@@ -39,7 +39,7 @@ class Identification:
     Attributes:
         plant: the plant as it was fitted, sampled as the records are.
         estimator: its name on the command line.
-        status: in a few words; docs/machine-readable.md lists them.
+        status: in a few words; docs/reference/machine-readable.md lists them.
         params, std_error: by parameter, in its unit; the error of a held one is nan.
         held: parameters not estimated: unseen by the data and held where the search started,
             or held at a bound that they reached.
@@ -88,7 +88,7 @@ class Identification:
         return {n: fit_percent(measured[:, i], simulated[:, i]) for i, n in enumerate(outputs)}
 
     def to_dict(self) -> dict[str, Any]:
-        """The result as JSON-ready data; its keys are documented in docs/machine-readable.md."""
+        """The result as JSON-ready data; docs/reference/machine-readable.md lists its keys."""
         return {
             "plant": self.plant.name,
             "plant_hash": self.plant.hash,

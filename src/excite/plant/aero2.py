@@ -100,7 +100,7 @@ class Aero2Detailed(AbstractPlant):
 
     mixed with the linear v by `curvature` (1: all quadratic), and stronger by half the
     asymmetry for v > 0, weaker for v < 0. Edges are smooth within 0.1 V; stops are springs.
-    Numbers: docs/real-time.md. Here they are known; a rig's own may differ.
+    Numbers: docs/reference/real-time.md. Here they are known; a rig's own may differ.
     """
 
     definition = dataclasses.replace(

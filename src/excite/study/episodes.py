@@ -78,7 +78,7 @@ def _running(
 def episodes_data(
     description: PlantDescription, episodes: Mapping[str, tuple[Record, np.ndarray]]
 ) -> dict[str, Any]:
-    """Episodes as JSON-ready data; docs/machine-readable.md documents the keys."""
+    """Episodes as JSON-ready data; docs/reference/machine-readable.md documents the keys."""
 
     def columns(parts: Any, values: np.ndarray) -> dict[str, list[float]]:
         return dict(zip(names_of(parts), map(_rounded, np.transpose(values)), strict=True))

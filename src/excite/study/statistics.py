@@ -37,7 +37,7 @@ class Outcome(eqx.Module):
 def table_row(
     study: Study, description: PlantDescription, names: tuple[str, str], outcome: Outcome
 ) -> dict[str, Any]:
-    """One row of the table; its keys are documented in docs/machine-readable.md.
+    """One row of the table; its keys are documented in docs/reference/machine-readable.md.
 
     Args:
         names: of method and estimator.
