@@ -21,7 +21,7 @@ from excite.environment import (
     EnvState,
     EstimationError,
     InformationGain,
-    Sample,
+    StepData,
     Transition,
     default_objective,
     reset_batch,
@@ -253,7 +253,7 @@ def test_the_estimation_error_is_rewarded_at_the_end_only(targets, goals, form, 
     for error, goal, target in zip(errors, goals or (1, 1, 1), targets, strict=True):
         expected -= target * weight * (np.log(1 + error / goal) if form == "log" else error / goal)
     assert float(reward) == pytest.approx(expected, rel=1e-6)
-    sample = Sample(state.params, state.plant_state, jnp.ones(1), jnp.ones(1))
+    sample = StepData(state.params, state.plant_state, jnp.ones(1), jnp.ones(1))
     assert env.objective.update(AERO2, memory, sample, jnp.asarray(3))[1] == 0
 
 

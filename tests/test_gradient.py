@@ -18,7 +18,7 @@ from excite.environment import (
     EstimationError,
     InformationGain,
     OutputError,
-    Sample,
+    StepData,
     WeightedSum,
     prior_sd_of,
 )
@@ -97,7 +97,7 @@ def test_the_error_of_the_output_error_estimate_is_that_of_nls(seed):
     memory = objective.init(plant, measured[0])
     advance = eqx.filter_jit(objective.update)
     for k, input in enumerate(inputs):
-        sample = Sample(params, state, input, measured[k + 1])
+        sample = StepData(params, state, input, measured[k + 1])
         memory, _ = advance(plant, memory, sample, jnp.asarray(k))
         state = step(plant, state, input, params)
     found = NLS()(plant, stack_experiments(plant, [inputs], [measured], True))
@@ -116,7 +116,7 @@ def test_sensitivities_are_held_to_their_limit_and_below_it_left_alone():
         advance, sizes = eqx.filter_jit(objective.update), []
         for k, input in enumerate(inputs):
             before = memory.sensitivity
-            sample = Sample(plant.nominal, state, input, jnp.zeros(1))
+            sample = StepData(plant.nominal, state, input, jnp.zeros(1))
             memory, _ = advance(plant, memory, sample, jnp.asarray(k))
             sizes.append(np.abs(memory.sensitivity[0]).max())
             state = step(plant, state, input, plant.nominal)

@@ -16,7 +16,7 @@ from .objective import (
     MAX_SENSITIVITY,
     AbstractError,
     Knowledge,
-    Sample,
+    StepData,
     bounded,
     next_knowledge,
     prior_knowledge,
@@ -52,7 +52,7 @@ class EstimationError(AbstractError):
         return ARXMemory(self.estimator.init(), measured[0], zero, zero)
 
     def update(
-        self, plant: AbstractPlant, memory: ARXMemory, sample: Sample, k: Int[Array, ""]
+        self, plant: AbstractPlant, memory: ARXMemory, sample: StepData, k: Int[Array, ""]
     ) -> tuple[ARXMemory, Float[Array, ""]]:
         """One recursion; the first sample with a whole regressor is the third."""
         del plant
@@ -109,7 +109,7 @@ class OutputError(AbstractError):
         return OutputErrorMemory(*known, jnp.zeros(num_params))
 
     def update(
-        self, plant: AbstractPlant, memory: OutputErrorMemory, sample: Sample, k: Int[Array, ""]
+        self, plant: AbstractPlant, memory: OutputErrorMemory, sample: StepData, k: Int[Array, ""]
     ) -> tuple[OutputErrorMemory, Float[Array, ""]]:
         """One measurement more."""
         del k

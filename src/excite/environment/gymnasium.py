@@ -3,7 +3,7 @@
     gymnasium.make("excite.environment.gymnasium:excite/Aero2-v0")
     gymnasium.make_vec("excite.environment.gymnasium:excite/Aero2-v0", num_envs=64)
 
-Both run the same pure functions of `env`, compiled, in double precision whatever the
+Both run the same pure functions of `process`, compiled, in double precision whatever the
 program around them uses. Any choice of `Env.of` is a keyword argument (`objective`,
 `layout`, `spread`, `penalty_weight`), and `plant` another plant of the class.
 
@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 import multiprocessing
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import equinox as eqx
 import gymnasium
@@ -25,20 +25,34 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
+from jaxtyping import Array, Float, PyTree
 
 from ..description import names_of
 from ..plant import EMPS, AbstractPlant, Aero2, CartPole, DCMotor
-from .process import Env, EnvState, Transition, reset_batch, step_batch
+from ..policy import Layout
+from .objective import AbstractObjective
+from .process import Batch, Env, EnvState, Transition, reset_batch, step_batch
 
 Observation = np.ndarray
 Action = np.ndarray
+
+
+class Choices(TypedDict, total=False):
+    """Choices of `Env.of`."""
+
+    objective: AbstractObjective
+    layout: Layout
+    spread: float | Float[Array, ""]
+    penalty_weight: float | Float[Array, ""]
+    constants: tuple[PyTree, PyTree] | None
+
 
 _reset = eqx.filter_jit(Env.reset)
 _step = eqx.filter_jit(Env.step)
 
 
 def _process(
-    plant_class: type[AbstractPlant], plant: AbstractPlant | None, choices: dict[str, Any]
+    plant_class: type[AbstractPlant], plant: AbstractPlant | None, choices: Choices
 ) -> Env:
     """The process in double precision, whatever the given parts of it were made in.
 
@@ -51,10 +65,11 @@ def _process(
             "JAX does not survive a fork: spawn the processes, as with vector_kwargs="
             '{"context": "spawn"}, or step all environments as one batch, make_vec\'s default'
         )
-    if not 0 <= choices.get("spread", 0.3) < 1:
-        raise ValueError(f"spread must lie in [0, 1): got {choices['spread']}")
-    if not 0 <= choices.get("penalty_weight", 1.0) < math.inf:
-        raise ValueError(f"penalty_weight must lie in [0, inf): got {choices['penalty_weight']}")
+    spread, penalty_weight = choices.get("spread", 0.3), choices.get("penalty_weight", 1.0)
+    if not 0 <= spread < 1:
+        raise ValueError(f"spread must lie in [0, 1): got {spread}")
+    if not 0 <= penalty_weight < math.inf:
+        raise ValueError(f"penalty_weight must lie in [0, inf): got {penalty_weight}")
     with jax.enable_x64(True):
         env = Env.of(plant_class() if plant is None else plant, **choices)
         return jax.tree.map(lambda leaf: jnp.asarray(leaf, float), env)
@@ -72,7 +87,7 @@ def _spaces(env: Env) -> tuple[spaces.Box, spaces.Box]:
     return observation, spaces.Box(-1.0, 1.0, (len(layout.input_half),), np.float32)
 
 
-def _info(env: Env, transition: Transition) -> dict[str, Any]:
+def _info(env: Env, transition: Transition) -> dict[str, np.ndarray]:
     """What a step tells beside observation and reward; the error is a fraction."""
     names = names_of(env.plant.definition.parameters)
     errors = np.asarray(transition.relative_errors)
@@ -126,7 +141,7 @@ class ExperimentEnv(gymnasium.Env[Observation, Action]):
     `is_violation`, and `relative_error_NAME` of each parameter so far.
 
     ## Arguments
-    `plant`, and all choices of `excite.env.Env.of`.
+    `plant`, and all choices of `excite.environment.Env.of`.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  (Gymnasium's own form)
@@ -136,7 +151,7 @@ class ExperimentEnv(gymnasium.Env[Observation, Action]):
         plant_class: type[AbstractPlant] = Aero2,
         plant: AbstractPlant | None = None,
         render_mode: None = None,
-        **choices: Any,
+        **choices: Unpack[Choices],
     ) -> None:
         self.render_mode = render_mode
         self.process = _process(plant_class, plant, choices)
@@ -144,8 +159,8 @@ class ExperimentEnv(gymnasium.Env[Observation, Action]):
         self._state: EnvState | None = None
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
+        self, *, seed: int | None = None, options: dict[str, object] | None = None
+    ) -> tuple[Observation, dict[str, object]]:
         """A new plant; the same seed draws the same plants and the same noise."""
         super().reset(seed=seed)
         with jax.enable_x64(True):
@@ -153,7 +168,7 @@ class ExperimentEnv(gymnasium.Env[Observation, Action]):
             self._state, observation = _reset(self.process, key)
             return np.array(observation), {}
 
-    def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, object]]:
         """One sampling time."""
         if self._state is None:
             raise gymnasium.error.ResetNeeded(
@@ -183,7 +198,7 @@ class ExperimentVectorEnv(VectorEnv[Observation, Action, np.ndarray]):
         plant_class: type[AbstractPlant] = Aero2,
         plant: AbstractPlant | None = None,
         render_mode: None = None,
-        **choices: Any,
+        **choices: Unpack[Choices],
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1: got {num_envs}")
@@ -192,11 +207,11 @@ class ExperimentVectorEnv(VectorEnv[Observation, Action, np.ndarray]):
         self.single_observation_space, self.single_action_space = _spaces(self.process)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self.batch: Any = None
+        self.batch: Batch | None = None
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
+        self, *, seed: int | None = None, options: dict[str, object] | None = None
+    ) -> tuple[Observation, dict[str, object]]:
         """New plants in all environments."""
         super().reset(seed=seed)
         with jax.enable_x64(True):
@@ -215,7 +230,7 @@ class ExperimentVectorEnv(VectorEnv[Observation, Action, np.ndarray]):
                 self.process, self.batch, jnp.asarray(actions)
             )
             terminated = np.array(transition.terminated)
-            infos: dict[str, Any] = {}
+            infos: dict[str, object] = {}
             if terminated.any():
                 infos = {
                     "final_obs": np.array(transition.observation),

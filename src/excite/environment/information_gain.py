@@ -14,7 +14,7 @@ from .objective import (
     MAX_SENSITIVITY,
     AbstractObjective,
     Knowledge,
-    Sample,
+    StepData,
     next_knowledge,
     prior_knowledge,
 )
@@ -64,7 +64,7 @@ class InformationGain(AbstractObjective):
         return InformationMemory(*known, self._value(known[1]))
 
     def update(
-        self, plant: AbstractPlant, memory: InformationMemory, sample: Sample, k: Int[Array, ""]
+        self, plant: AbstractPlant, memory: InformationMemory, sample: StepData, k: Int[Array, ""]
     ) -> tuple[InformationMemory, Float[Array, ""]]:
         """Sensitivities one step on, and what the measurement at its end adds."""
         del k

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Sequence
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
 from ..description import PlantDescription, names_of
 from ..information import relative_size
@@ -30,7 +29,7 @@ estimator can find.
 """
 
 
-class Sample(eqx.Module):
+class StepData(eqx.Module):
     """What one step shows an objective; only the last two are known on a rig.
 
     Attributes:
@@ -49,33 +48,33 @@ class AbstractObjective(eqx.Module):
     """What an experiment is worth."""
 
     @abc.abstractmethod
-    def init(self, plant: AbstractPlant, measured: Float[Array, " output"]) -> Any:
+    def init(self, plant: AbstractPlant, measured: Float[Array, " output"]) -> PyTree:
         """Memory at the first measurement."""
 
     @abc.abstractmethod
     def update(
-        self, plant: AbstractPlant, memory: Any, sample: Sample, k: Int[Array, ""]
-    ) -> tuple[Any, Float[Array, ""]]:
+        self, plant: AbstractPlant, memory: PyTree, sample: StepData, k: Int[Array, ""]
+    ) -> tuple[PyTree, Float[Array, ""]]:
         """Memory after step k (0, 1, ...), and the reward if every step were rewarded."""
 
     @abc.abstractmethod
-    def final(self, plant: AbstractPlant, memory: Any, params: Params) -> Float[Array, ""]:
+    def final(self, plant: AbstractPlant, memory: PyTree, params: Params) -> Float[Array, ""]:
         """Reward added at the last step."""
 
     @abc.abstractmethod
     def relative_errors(
-        self, plant: AbstractPlant, memory: Any, params: Params
+        self, plant: AbstractPlant, memory: PyTree, params: Params
     ) -> Float[Array, " param"]:
         """Relative error of each parameter as far as the objective knows it, to watch."""
 
     def outcome(
-        self, plant: AbstractPlant, memory: Any, params: Params, worth: Float[Array, ""]
-    ) -> Any:
+        self, plant: AbstractPlant, memory: PyTree, params: Params, worth: Float[Array, ""]
+    ) -> PyTree:
         """What `of_batch` needs to know of one experiment: its rewards summed, `worth`."""
         del plant, memory, params
         return worth
 
-    def of_batch(self, outcomes: Any) -> Float[Array, ""]:
+    def of_batch(self, outcomes: PyTree) -> Float[Array, ""]:
         """What experiments on many plants are worth together, of their outcomes: the mean."""
         return jnp.mean(outcomes)
 
@@ -118,7 +117,7 @@ class AbstractError(AbstractObjective):
         if self.form not in ("relative", "log", "goals"):
             raise ValueError(f"form must be relative, log or goals: got {self.form!r}")
 
-    def final(self, plant: AbstractPlant, memory: Any, params: Params) -> Float[Array, ""]:
+    def final(self, plant: AbstractPlant, memory: PyTree, params: Params) -> Float[Array, ""]:
         """What the estimate at the end is worth."""
         return self.of_errors(self.relative_errors(plant, memory, params)[None])
 
@@ -133,7 +132,7 @@ class AbstractError(AbstractObjective):
         return -self.weight * jnp.mean(of_plants)
 
     def outcome(
-        self, plant: AbstractPlant, memory: Any, params: Params, worth: Float[Array, ""]
+        self, plant: AbstractPlant, memory: PyTree, params: Params, worth: Float[Array, ""]
     ) -> Float[Array, " param"]:
         """The errors alone, which are all that is rewarded."""
         del worth
@@ -165,7 +164,7 @@ def prior_knowledge(
 
 
 def next_knowledge(
-    plant: AbstractPlant, memory: Knowledge, sample: Sample, limit: Float[Array, ""]
+    plant: AbstractPlant, memory: Knowledge, sample: StepData, limit: Float[Array, ""]
 ) -> tuple[
     Float[Array, "state param"], Float[Array, "param param"], Float[Array, "output param"], Array
 ]:
@@ -182,7 +181,7 @@ def next_knowledge(
 def sensitivities(
     plant: AbstractPlant,
     sensitivity: Float[Array, "state param"],
-    sample: Sample,
+    sample: StepData,
     limit: Float[Array, ""],
 ) -> tuple[Float[Array, "state param"], Float[Array, "output param"], Float[Array, " output"]]:
     """Relative sensitivities of state and outputs one step on, and the true outputs."""

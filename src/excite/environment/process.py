@@ -12,13 +12,11 @@ is ever truncated. The memory of an objective does not grow with T.
 
 from __future__ import annotations
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
 
 from ..plant import AbstractARXPlant, AbstractPlant, Params, draw_params
 from ..plant.fields import floats
@@ -35,7 +33,7 @@ from ..safety import critical_levels, penalty, watched_levels
 from ..simulation import measure, step
 from .errors import EstimationError
 from .information_gain import InformationGain
-from .objective import AbstractObjective, Sample, prior_sd_of, target_mask
+from .objective import AbstractObjective, StepData, prior_sd_of, target_mask
 
 
 class EnvState(eqx.Module):
@@ -54,10 +52,10 @@ class EnvState(eqx.Module):
     """
 
     params: Params
-    constants: Any
+    constants: PyTree
     plant_state: Float[Array, " state"]
     window: Window
-    memory: Any
+    memory: PyTree
     k: Int[Array, ""]
     max_abs_output: Float[Array, " output"]
     is_finite: Bool[Array, ""]
@@ -101,16 +99,28 @@ class Env(eqx.Module):
     layout: Layout = eqx.field(static=True)
     spread: Float[Array, ""] = eqx.field(converter=floats, default=0.3)
     penalty_weight: Float[Array, ""] = eqx.field(converter=floats, default=1.0)
-    constants: tuple[Any, Any] | None = None
+    constants: tuple[PyTree, PyTree] | None = None
 
     @classmethod
-    def of(cls, plant: AbstractPlant, **choices: Any) -> Env:
+    def of(
+        cls,
+        plant: AbstractPlant,
+        *,
+        objective: AbstractObjective | None = None,
+        layout: Layout | None = None,
+        spread: float | Float[Array, ""] = 0.3,
+        penalty_weight: float | Float[Array, ""] = 1.0,
+        constants: tuple[PyTree, PyTree] | None = None,
+    ) -> Env:
         """The paper's process for a plant, but for what is chosen."""
-        if "objective" not in choices:
-            choices["objective"] = default_objective(plant, float(choices.get("spread", 0.3)))
-        if "layout" not in choices:
-            choices["layout"] = Layout.of(plant.description)
-        return cls(plant, **choices)
+        return cls(
+            plant,
+            default_objective(plant, float(spread)) if objective is None else objective,
+            Layout.of(plant.description) if layout is None else layout,
+            spread,
+            penalty_weight,
+            constants,
+        )
 
     def reset(self, key: PRNGKeyArray) -> tuple[EnvState, Float[Array, " observation"]]:
         """A plant drawn at random, at its initial state, and its first observation."""
@@ -152,7 +162,7 @@ class Env(eqx.Module):
         after = jnp.where(is_finite, after, state.plant_state)
         output = plant.output(after, state.params)
         measured = measure(plant, output, jax.random.fold_in(state.key, k))
-        sample = Sample(state.params, state.plant_state, input, measured)
+        sample = StepData(state.params, state.plant_state, input, measured)
         memory, gain = self.objective.update(plant, state.memory, sample, state.k)
         window = with_input(jnp, self.layout, state.window, input)
         new = EnvState(
@@ -168,7 +178,7 @@ class Env(eqx.Module):
         )
         return new, output, jnp.where(is_finite, gain, 0.0)
 
-    def _draw_constants(self, key: PRNGKeyArray) -> Any:
+    def _draw_constants(self, key: PRNGKeyArray) -> PyTree:
         """Constants of one episode's plant, each uniform between its ends."""
         if self.constants is None:
             return self.plant.constants

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
 from ..plant import AbstractPlant, Params
-from .objective import AbstractObjective, Sample
+from .objective import AbstractObjective, StepData
 
 
 class SumMemory(eqx.Module):
     """Memories of the terms, and what each was rewarded so far."""
 
-    terms: tuple[Any, ...]
+    terms: tuple[PyTree, ...]
     gained: Float[Array, " term"]
 
 
@@ -39,7 +37,7 @@ class WeightedSum(AbstractObjective):
         return SumMemory(memories, jnp.zeros(len(memories)))
 
     def update(
-        self, plant: AbstractPlant, memory: SumMemory, sample: Sample, k: Int[Array, ""]
+        self, plant: AbstractPlant, memory: SumMemory, sample: StepData, k: Int[Array, ""]
     ) -> tuple[SumMemory, Float[Array, ""]]:
         """Every term one step on, and the sum of their gains."""
         pairs = zip(self.terms, memory.terms, strict=True)
@@ -58,14 +56,14 @@ class WeightedSum(AbstractObjective):
 
     def outcome(
         self, plant: AbstractPlant, memory: SumMemory, params: Params, worth: Float[Array, ""]
-    ) -> tuple[Any, ...]:
+    ) -> tuple[PyTree, ...]:
         """Of every term, which got its own part of the rewards."""
         del worth
         parts = memory.gained + self._finals(plant, memory, params)
         of_terms = zip(self.terms, memory.terms, parts, strict=True)
         return tuple(term.outcome(plant, own, params, part) for term, own, part in of_terms)
 
-    def of_batch(self, outcomes: tuple[Any, ...]) -> Float[Array, ""]:
+    def of_batch(self, outcomes: tuple[PyTree, ...]) -> Float[Array, ""]:
         """The sum of what the terms make of the batch."""
         values = [term.of_batch(own) for term, own in zip(self.terms, outcomes, strict=True)]
         return sum(values, jnp.zeros(()))

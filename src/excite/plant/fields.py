@@ -65,7 +65,7 @@ def _allowed(field: object) -> str:
         field = get_args(field)[0]
     if field in (bool, int):
         return "true or false" if field is bool else "a whole number"
-    axes = getattr(field, "dim_str", "" if field is float else None)
+    axes = "" if field is float else getattr(field, "dim_str", "no array")
     return {"": "a number", "...": "a number or a list of numbers"}.get(axes, "")
 
 

@@ -14,14 +14,13 @@ import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Float, Key, PRNGKeyArray
+from jaxtyping import Array, Float, Key, PRNGKeyArray, PyTree
 
 from ..environment import Env, EnvState
 from ..policy import Layout, Weights, act
@@ -55,7 +54,7 @@ class Scores(eqx.Module):
     """
 
     worth: Float[Array, "*plant"]
-    outcome: Any
+    outcome: PyTree
     excess: Float[Array, "*plant"]
     nearness: Float[Array, "*plant"]
 
@@ -104,12 +103,12 @@ class Optimisation(eqx.Module):
         penalty_weight: of the safety penalty.
     """
 
-    player: Any
-    adam: Any
+    player: PyTree
+    adam: PyTree
     penalty_weight: Float[Array, "*training"]
 
     @classmethod
-    def start(cls, player: Any, settings: GradientSettings) -> Optimisation:
+    def start(cls, player: PyTree, settings: GradientSettings) -> Optimisation:
         """Before the first update."""
         adam = _optimiser(settings).init(eqx.filter(player, eqx.is_array))
         return cls(player, adam, jnp.asarray(settings.penalty_weight, float))
@@ -120,7 +119,7 @@ def update(
 ) -> tuple[Optimisation, Scores]:
     """One step of Adam on the plants of these keys, and their experiments before it."""
 
-    def loss(player: Any) -> tuple[Array, Scores]:
+    def loss(player: PyTree) -> tuple[Array, Scores]:
         batch = experiments(env, player, keys, settings.margin)
         worth = env.objective.of_batch(batch.outcome)
         return now.penalty_weight * jnp.mean(batch.excess) - worth, batch
@@ -207,7 +206,7 @@ class _Course:
     """
 
     now: Optimisation
-    best: Any
+    best: PyTree
     rank: Float[np.ndarray, "seed 2"]
     curves: list[list[dict[str, float]]]
     num_updates: int = 0

@@ -1,17 +1,18 @@
 """Proximal policy optimisation of Stable-Baselines3 on a batch of plants.
 
-This file is the only door to Stable-Baselines3 and torch. Its VecEnv hands the batched
-Gymnasium environment through as it is: one compiled call a step, no loop over
-environments. Training can be stopped at any rollout boundary and continued bit by bit:
-a checkpoint holds weights, Adam's moments, the running episodes and all random states,
-as tensors and JSON, never as a pickle.
+Its VecEnv hands the batched Gymnasium environment through as it is: one compiled call a
+step, no loop over environments. Training can be stopped at any rollout boundary and resumed
+bit by bit: a checkpoint holds weights, Adam's moments, the running episodes and all random
+states, as tensors and JSON, never as a pickle.
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
-from typing import Any
+from collections.abc import Iterator
+from typing import Any, NoReturn
 
 import jax
 import numpy as np
@@ -19,6 +20,7 @@ import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
 from ..environment import Env
 from ..environment.gymnasium import ExperimentVectorEnv
@@ -50,12 +52,12 @@ class BatchedVecEnv(VecEnv):
         """Remembers the actions."""
         self._actions = actions
 
-    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, object]]]:
         """One step of all; an episode that ended tells its last observation and its return."""
         observations, rewards, dones, _, final = self.env.step(self._actions)
         self.totals += rewards
         self.lengths += 1
-        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        infos: list[dict[str, object]] = [{} for _ in range(self.num_envs)]
         for i in np.flatnonzero(dones):
             infos[i] = {
                 "terminal_observation": final["final_obs"][i],
@@ -69,25 +71,37 @@ class BatchedVecEnv(VecEnv):
     def close(self) -> None:
         """Nothing is held."""
 
-    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[object]:
         """An attribute of the batch, once for every index."""
         return [getattr(self.env, attr_name)] * len(list(self._get_indices(indices)))
 
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+    def set_attr(self, attr_name: str, value: object, indices: VecEnvIndices = None) -> NoReturn:
         """Not offered: the batch is one object."""
         raise NotImplementedError("the environments of a batch share all settings")
 
     def env_method(
-        self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any
-    ) -> list[Any]:
+        self, method_name: str, *args: object, indices: VecEnvIndices = None, **kwargs: object
+    ) -> NoReturn:
         """Not offered: the batch is one object."""
-        raise NotImplementedError("the environments of a batch have no methods of their own")
+        raise NotImplementedError("the environments of a batch have no methods")
 
-    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+    def env_is_wrapped(self, wrapper_class: type, indices: VecEnvIndices = None) -> list[bool]:
         """Never: wrappers of single environments do not apply."""
         return [False] * len(list(self._get_indices(indices)))
 
 
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """Torch in one thread: its networks are small, and more threads wait for each other."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@_one_thread()
 def train(
     env: Env,
     settings: PPOSettings,
