@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import click
 
-from .benchmark import show_comparison, warned
+from .benchmark import show_comparison
 from .options import (
     NUMBERS,
     WholeNumber,
@@ -17,6 +16,7 @@ from .options import (
     progress_bar,
     show_json,
     show_table,
+    warnings_shown,
 )
 
 
@@ -71,56 +71,17 @@ def policies(as_json: bool) -> None:
 @computing
 def evaluate(policy: str, as_json: bool, **options: Any) -> None:
     """Score POLICY, a file or a shipped name, on plants drawn at random."""
-    from ..study.tasks import run_benchmark
+    from ..study.evaluate import evaluate as evaluated
+    from ..study.evaluate import policy_at
 
-    own = _policy(policy)
-    chosen = warned(_study(policy, own, options))
-    with progress_bar(f"evaluating {policy}") as progress:
-        rows = run_benchmark(chosen, progress)
+    on_rig, filtered, noise = (options.pop(n) for n in ("on_rig", "filtered", "noise"))
+    with warnings_shown(), progress_bar(f"evaluating {policy}") as progress:
+        study, rows = evaluated(
+            policy, rig=on_rig, filter=filtered, noise=merged(noise), progress=progress, **options
+        )
     if as_json:
-        said = chosen.model_dump(mode="json", exclude_unset=True)
-        show_json({"policy_hash": own.hash, "study": said, "rows": rows})
+        settings = study.model_dump(mode="json", exclude_unset=True)
+        show_json({"policy_hash": policy_at(policy).hash, "study": settings, "rows": rows})
     else:
-        show_comparison(rows, chosen.model_dump(), None)
+        show_comparison(rows, study.model_dump(), None)
         click.echo(f"log det of the Fisher information: {rows[0]['log_det_information']:.2f}")
-
-
-def _policy(policy: str) -> Any:
-    """The policy of a file or a shipped name."""
-    from ..description import unknown
-    from ..policy import POLICY_ENDING, policy_path, read_policy, shipped_policies
-
-    path = policy_path(policy)
-    if path is None and Path(policy).exists():
-        raise ValueError(f"{policy}: policy files end in {POLICY_ENDING}")
-    if path is None:
-        raise unknown("policy", policy, [*shipped_policies(), "path/to/policy.safetensors"])
-    return read_policy(path)
-
-
-def _study(policy: str, own: Any, options: dict[str, Any]) -> Any:
-    """The study of one method that these options mean."""
-    from ..plant import AbstractARXPlant
-    from ..plant.catalogue import plant_named
-    from ..study.spec import study_from
-
-    if options["filtered"] and not options["on_rig"]:
-        raise ValueError("--filter is a part of a rig; it needs --rig")
-    plant = options["plant"] or own.plant.name
-    kinds = ["arx-rls"] * isinstance(plant_named(plant), AbstractARXPlant) + ["nls"]
-    study = study_from(
-        {
-            "name": Path(policy).stem,
-            "plant": plant,
-            "episodes": options["episodes"],
-            "num_steps": own.layout.num_steps,
-            "seed": options["seed"],
-            "spread": options["spread"],
-            "sensor": {n: {"noise_sd": sd} for n, sd in merged(options["noise"]).items()},
-            "methods": {Path(policy).stem: {"excitation": policy}},
-            "estimators": {kind: {"kind": kind} for kind in kinds},
-            "rig": {"filter": options["filtered"]} if options["on_rig"] else None,
-        },
-        "evaluate",
-    )
-    return study.changed(estimators=options["estimators"]).checked("evaluate")

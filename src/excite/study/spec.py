@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import inspect
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -22,7 +23,7 @@ from ..excitation.catalogue import excitation_and_origin, excitation_named
 from ..files import folder_word
 from ..information import require_noise
 from ..plant import AbstractARXPlant, AbstractPlant
-from ..plant.catalogue import plant_named, with_sensor
+from ..plant.catalogue import PLANTS, plant_named, with_sensor
 from ..policy import POLICY_ENDING
 from ..record.read import SIGNAL_ENDINGS
 from ..training.gradient import GradientSettings
@@ -252,15 +253,16 @@ class Study(Settings):
                 if name not in parameters:
                     raise unknown(f"parameter in reference.{method}", name, parameters)
 
-    def changed(self, estimators: str | None = None, **values: Any) -> Study:
+    def changed(self, estimators: str | Sequence[str] | None = None, **values: object) -> Study:
         """The same study with other settings; None leaves a setting as it is.
 
         Args:
-            estimators: names of the study's own or of any estimator, with commas between.
+            estimators: names of the study's or of any estimator, or these with commas between.
         """
         settings = {k: v for k, v in values.items() if v is not None}
         if estimators is not None:
-            chosen = [name.strip() for name in estimators.split(",")]
+            names = estimators.split(",") if isinstance(estimators, str) else estimators
+            chosen = [name.strip() for name in names]
             known = {n: {"kind": n} for n in ESTIMATORS} | {
                 n: e.model_dump() for n, e in self.estimators.items()
             }
@@ -322,3 +324,50 @@ def study_from(content: Mapping[str, Any], where: str) -> Study:
     if not study.estimators:
         raise ValueError(f"{where}: the study has no estimators")
     return study
+
+
+def plant_tables(
+    plant: str | AbstractPlant | type[AbstractPlant], noise: Mapping[str, float] | None = None
+) -> tuple[dict[str, object], AbstractPlant]:
+    """What a study file says of a plant and its sensor, and the plant it means.
+
+    Args:
+        noise: standard deviation by output, in its unit, where it differs from the plant's.
+
+    Raises:
+        ValueError: for a class that is in no file, or a plant with other numbers than its class.
+    """
+    word = plant if isinstance(plant, str) else _word(plant)
+    built = plant_named(word)
+    sensor: dict[str, dict[str, float]] = {}
+    if isinstance(plant, AbstractPlant):
+        own = built.definition.outputs, plant.description.outputs
+        sensor = {
+            mine.name: {"noise_sd": mine.noise_sd, "resolution": mine.resolution}
+            for usual, mine in zip(*own, strict=True)
+            if mine != usual
+        }
+        built = built.changed(sensor=plant.sensor)
+        if built.description.hash != plant.description.hash:
+            raise ValueError(
+                f"a study names its plant, and this {word} differs from its class in constants, dt "
+                "or initial state: write a class with these numbers"
+            )
+    for name, sd in (noise or {}).items():
+        sensor[name] = {**sensor.get(name, {}), "noise_sd": sd}
+    return {"plant": word, "sensor": sensor}, built
+
+
+def _word(plant: AbstractPlant | type[AbstractPlant]) -> str:
+    """The name of a plant's class in a study file."""
+    kind = plant if isinstance(plant, type) else type(plant)
+    shipped = [name for name, plant_class in PLANTS.items() if plant_class is kind]
+    if shipped:
+        return shipped[0]
+    try:
+        return f"{inspect.getfile(kind)}:{kind.__name__}"
+    except (TypeError, OSError):  # typed into a notebook or a shell
+        raise ValueError(
+            f"other processes cannot import the plant class {kind.__name__}: save it in a file (in "
+            f"a notebook by %%writefile plant.py) and name it as 'plant.py:{kind.__name__}'"
+        ) from None

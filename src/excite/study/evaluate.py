@@ -1,0 +1,82 @@
+"""`evaluate`: one policy on plants drawn at random, as a study of one method."""
+
+from __future__ import annotations
+
+import tempfile
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from ..description import unknown
+from ..plant import AbstractARXPlant, AbstractPlant
+from ..policy import POLICY_ENDING, Policy, policy_path, read_policy, shipped_policies
+from ..training.checkpoint import Progress
+from .spec import Study, plant_tables, study_from
+from .tasks import run_benchmark
+
+
+def evaluate(
+    policy: str | Path | Policy,
+    plant: str | AbstractPlant | type[AbstractPlant] | None = None,
+    *,
+    episodes: int = 1000,
+    seed: int = 0,
+    spread: float = 0.3,
+    noise: Mapping[str, float] | None = None,
+    estimators: str | Sequence[str] | None = None,
+    rig: bool = False,
+    filter: bool = False,
+    progress: Progress = lambda *_: None,
+) -> tuple[Study, list[dict[str, object]]]:
+    """Scores a policy on plants drawn at random.
+
+    Args:
+        policy: the name of a shipped one, a file, or the policy.
+        plant: its name, `path/to/file.py:ClassName`, the plant or its class; default the
+            policy's plant.
+        episodes: experiments, each with a plant of its own.
+        seed: of the plants, the noise and the excitations.
+        spread: parameters are uniform in nominal value ± spread times their scale.
+        noise: standard deviation by output, in its unit, where it differs from the plant's.
+        estimators: names, default `nls`, and `arx-rls` where the plant has a mapping from ARX.
+        rig: whether experiments are made on the plant's simulated rig.
+        filter: whether they are made once more there, behind the predictive safety filter.
+        progress: called with a text, how much is done, and how much there is.
+
+    Raises:
+        ValueError: for an argument that is not allowed, or a policy that cannot excite the plant.
+    """
+    if filter and not rig:
+        raise ValueError("the safety filter is part of a rig: filter (--filter) needs rig (--rig)")
+    with tempfile.TemporaryDirectory() as folder:
+        if isinstance(policy, Policy):
+            content, policy = policy.to_bytes(), Path(folder) / f"policy{POLICY_ENDING}"
+            policy.write_bytes(content)
+        trained = policy_at(policy)
+        tables, built = plant_tables(trained.plant.name if plant is None else plant, noise)
+        kinds = ["arx-rls"] * isinstance(built, AbstractARXPlant) + ["nls"]
+        settings = {
+            "name": Path(policy).stem,
+            **tables,
+            "episodes": episodes,
+            "num_steps": trained.layout.num_steps,
+            "seed": seed,
+            "spread": spread,
+            "methods": {Path(policy).stem: {"excitation": str(policy)}},
+            "estimators": {kind: {"kind": kind} for kind in kinds},
+            "rig": {"filter": filter} if rig else None,
+        }
+        study = study_from(settings, "evaluate").changed(estimators=estimators)
+        for warning in study.checked("evaluate").warnings():
+            warnings.warn(warning, stacklevel=2)
+        return study, run_benchmark(study, progress)
+
+
+def policy_at(policy: str | Path) -> Policy:
+    """The policy of a file or a shipped name; ValueError for another word."""
+    path = policy_path(str(policy))
+    if path is None and Path(policy).exists():
+        raise ValueError(f"{policy}: policy files end in {POLICY_ENDING}")
+    if path is None:
+        raise unknown("policy", str(policy), [*shipped_policies(), "path/to/policy.safetensors"])
+    return read_policy(path)
