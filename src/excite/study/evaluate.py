@@ -9,7 +9,7 @@ from pathlib import Path
 
 from ..description import unknown
 from ..plant import AbstractARXPlant, AbstractPlant
-from ..policy import POLICY_ENDING, Policy, policy_path, read_policy, shipped_policies
+from ..policy import POLICY_ENDING, Policy, mismatch, policy_path, read_policy, shipped_policies
 from ..training.checkpoint import Progress
 from .spec import Study, plant_tables, study_from
 from .tasks import run_benchmark
@@ -49,26 +49,28 @@ def evaluate(
     if filter and not rig:
         raise ValueError("the safety filter is part of a rig: filter (--filter) needs rig (--rig)")
     with tempfile.TemporaryDirectory() as folder:
+        word = str(policy)
         if isinstance(policy, Policy):
-            content, policy = policy.to_bytes(), Path(folder) / f"policy{POLICY_ENDING}"
-            policy.write_bytes(content)
-        trained = policy_at(policy)
+            file = Path(folder) / f"policy{POLICY_ENDING}"
+            file.write_bytes(policy.to_bytes())
+            word = str(file)
+        trained, name = policy_at(word), Path(word).stem
         tables, built = plant_tables(trained.plant.name if plant is None else plant, noise)
         kinds = ["arx-rls"] * isinstance(built, AbstractARXPlant) + ["nls"]
         settings = {
-            "name": Path(policy).stem,
+            "name": name,
             **tables,
             "episodes": episodes,
             "num_steps": trained.layout.num_steps,
             "seed": seed,
             "spread": spread,
-            "methods": {Path(policy).stem: {"excitation": str(policy)}},
+            "methods": {name: {"excitation": word}},
             "estimators": {kind: {"kind": kind} for kind in kinds},
             "rig": {"filter": filter} if rig else None,
         }
-        study = study_from(settings, "evaluate").changed(estimators=estimators)
-        for warning in study.checked("evaluate").warnings():
-            warnings.warn(warning, stacklevel=2)
+        study = study_from(settings, "evaluate").changed(estimators=estimators).checked("evaluate")
+        if (warning := mismatch(trained, built.description)) is not None:
+            warnings.warn(f"{name}: {warning}", stacklevel=2)
         return study, run_benchmark(study, progress)
 
 

@@ -355,7 +355,7 @@ def plant_tables(
             )
     for name, sd in (noise or {}).items():
         sensor[name] = {**sensor.get(name, {}), "noise_sd": sd}
-    return {"plant": word, "sensor": sensor}, built
+    return {"plant": word, "sensor": sensor}, with_sensor(built, noise or {}, {})
 
 
 def _word(plant: AbstractPlant | type[AbstractPlant]) -> str:

@@ -1,0 +1,112 @@
+"""`train`: a policy for a plant, as a study of one agent and a chirp to compare it with."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from ..plant import AbstractARXPlant, AbstractPlant
+from ..policy import Policy, read_policy
+from ..training.checkpoint import Progress
+from .folder import seed_folder
+from .objectives import decision_of, rewards_of
+from .run import run_study
+from .spec import Study, plant_tables, study_from
+from .table import best_seeds
+from .workers import local_engine
+
+
+def train(
+    plant: str | AbstractPlant | type[AbstractPlant],
+    out: str | Path | None = None,
+    *,
+    method: str = "gradient",
+    objective: str | Sequence[str] | Mapping[str, float] = "D",
+    target: str | Sequence[str] = (),
+    goal: Mapping[str, float] | None = None,
+    window: int | None = None,
+    clock: float | Sequence[float] = (),
+    training: Mapping[str, object] | None = None,
+    seeds: int = 1,
+    spread: float = 0.3,
+    steps: int = 500,
+    noise: Mapping[str, float] | None = None,
+    episodes: int = 100,
+    output_scale: Mapping[str, float] | None = None,
+    workers: int = 1,
+    progress: Progress = lambda *_: None,
+) -> Policy:
+    """Trains a policy that excites a plant, and compares it with a chirp.
+
+    Rerun with the same arguments to resume an interrupted training.
+
+    Args:
+        plant: its name, `path/to/file.py:ClassName`, the plant or its class.
+        out: run folder of the study; without one nothing is kept but the policy.
+        method: `gradient` of the simulated experiment, or `ppo`.
+        objective: criterion of the Fisher information (`D`, `A`, `E`), or errors of the ARX
+            estimator (`relative`, `log`, `goals`) or of nonlinear least squares (`nls`);
+            several are added, with weights (`["D", "log=0.1"]` or `{"D": 1, "log": 0.1}`).
+        target: parameters that count, default the plant's targets.
+        goal: relative error that counts as one, by parameter.
+        window: samples observed, default 80.
+        clock: frequencies [Hz] whose sine and cosine are observed too.
+        training: hyper-parameters of the method (`excite.training.settings`).
+        seeds: independent trainings; the best policy is returned.
+        spread: plants are drawn from nominal values ± this fraction.
+        steps: samples of an experiment.
+        noise: standard deviation by output, in its unit, where it differs from the plant's.
+        episodes: experiments on which the policies are evaluated.
+        output_scale: what an output is divided by before it is observed, in its unit.
+        workers: processes that train side by side.
+        progress: called with a text, how much is done, and how much there is.
+
+    Raises:
+        ValueError: for an argument that is not allowed, or a training that fails.
+    """
+    rewards = rewards_of(objective, goal or {})
+    decision = {
+        **decision_of(rewards.values()),
+        "output_scale": dict(output_scale or {}),
+        "window": window,
+        "clocks": list(clock) if isinstance(clock, Sequence) else [clock],
+    }
+    agent = {
+        "targets": ([target] if isinstance(target, str) else list(target)) or None,
+        "method": method,
+        "decision": {name: value for name, value in decision.items() if value},
+        "training": dict(training or {}),
+    }
+    settings = {"episodes": episodes, "num_steps": steps, "spread": spread, "seeds": seeds}
+    agents = {f"{method}({', '.join(rewards)})": agent}
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary if out is None else out)
+        study = _compared_with_a_chirp(plant, noise, folder.absolute().name, settings, agents)
+        failures = run_study(study, folder, local_engine(workers), progress)
+        if failures:
+            raise ValueError("; ".join(f"{name}: {error}" for name, error in failures.items()))
+        ((name, seed),) = best_seeds(study, folder).items()
+        return read_policy(seed_folder(folder, name, seed) / "policy.safetensors")
+
+
+def _compared_with_a_chirp(
+    plant: str | AbstractPlant | type[AbstractPlant],
+    noise: Mapping[str, float] | None,
+    name: str,
+    settings: Mapping[str, object],
+    agents: Mapping[str, object],
+) -> Study:
+    """The study of these settings; ValueError for one that is not allowed."""
+    own, built = plant_tables(plant, noise)
+    kinds = ["nls"] + ["arx-rls"] * isinstance(built, AbstractARXPlant)
+    content = {
+        "name": name,
+        "title": f"{own['plant']}: {next(iter(agents))}",
+        **own,
+        **settings,
+        "agents": agents,
+        "methods": {"chirp": {"excitation": "chirp"}},
+        "estimators": {kind: {"kind": kind} for kind in kinds},
+    }
+    return study_from(content, "train").checked("train")
