@@ -36,7 +36,7 @@ from excite.web.places import _file_name, _receive
 from excite.web.requests import MAX_UPLOAD, RefusedError
 from excite.web.runs import found
 from excite.web.security import MAX_TRIES, _source
-from excite.web.sessions import MAX_JOBS, MAX_SESSIONS, Place, Session, Sessions, Settings
+from excite.web.sessions import MAX_JOBS, MAX_SESSIONS, PageSettings, Place, Session, Sessions
 from excite.web.trainings import Training, _free
 
 HERE = "http://127.0.0.1:8000"
@@ -288,7 +288,7 @@ def processes_of(address: str) -> set[int]:
             parent = int((place / "stat").read_text().rpartition(")")[2].split()[1])
         except OSError:
             continue
-        if b"excite.web.worker" in words and listens(parent, port):
+        if b"excite.study.worker" in words and listens(parent, port):
             found.add(int(place.name))
     return found
 
@@ -431,7 +431,7 @@ def test_a_training_that_ends_slowly_ends_with_the_server(
 
 def is_running(process: int) -> bool:
     try:
-        return "excite.web.worker" in Path(f"/proc/{process}/cmdline").read_text()
+        return "excite.study.worker" in Path(f"/proc/{process}/cmdline").read_text()
     except OSError:
         return False
 
@@ -495,7 +495,7 @@ def scratch(tmp_path: Path) -> Path:
 
 
 def guarded(runs: Path, scratch: Path, **settings: Any) -> TestClient:
-    app = application(Settings(runs, num_workers=0, **settings), scratch)
+    app = application(PageSettings(runs, num_workers=0, **settings), scratch)
     return TestClient(app, base_url=HERE, headers={"origin": HERE})
 
 
@@ -726,7 +726,7 @@ def test_a_long_learning_curve_is_thinned(tmp_path: Path):
     for i in range(2000):
         write_json(tmp_path / "seeds" / "agent" / "0" / "progress.json", {"steps": i})
         training._look()
-    steps = [row["steps"] for row in training.told()["curve"]]
+    steps = [row["steps"] or 0.0 for row in training.told()["curve"]]
     assert len(steps) <= 501
     assert (steps[0], steps[-1], steps) == (0, 1999, sorted(steps))
 

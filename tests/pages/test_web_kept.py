@@ -12,7 +12,7 @@ from starlette.testclient import TestClient
 from excite.files import write_json
 from excite.web import application
 from excite.web.requests import RefusedError
-from excite.web.sessions import MAX_KEPT, Session, Settings
+from excite.web.sessions import MAX_KEPT, PageSettings, Session
 from excite.web.workers import Workers
 
 HERE = "http://127.0.0.1:8000"
@@ -46,7 +46,7 @@ def page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> TestClient:
     monkeypatch.setattr(Workers, "events", answered)
     (tmp_path / "runs").mkdir()
     (tmp_path / "scratch").mkdir()
-    app = application(Settings(tmp_path / "runs", num_workers=0), tmp_path / "scratch")
+    app = application(PageSettings(tmp_path / "runs", num_workers=0), tmp_path / "scratch")
     client = TestClient(app, base_url=HERE, headers={"origin": HERE})
     assert client.post("/api/session", json={}).is_success
     return client

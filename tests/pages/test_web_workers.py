@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from excite.study import workers as processes
 from excite.web import workers as module
 from excite.web.jobs import columns
 from excite.web.requests import RefusedError, without_folders
@@ -19,7 +20,7 @@ import json, sys
 print(json.dumps({{"kind": "ready"}}), flush=True)
 for line in sys.stdin:
     call = json.loads(line)
-    number, target = call["number"], call["target"]
+    number, target = call["number"], call["target"].partition(":")[2]
     good = json.dumps({{"kind": "end", "number": number}})
 """
 ANSWERS = {
@@ -36,7 +37,7 @@ def program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """What is started in place of Python."""
     path = tmp_path / "python"
     monkeypatch.setattr("sys.executable", str(path))
-    monkeypatch.setattr(module, "_LINE", 2**16)
+    monkeypatch.setattr(processes, "_LINE", 2**16)
     return path
 
 
@@ -45,15 +46,15 @@ def write(program: Path, text: str) -> None:
     program.chmod(0o700)
 
 
-async def told(workers: Workers, target: str) -> list[dict[str, Any]]:
+async def told(workers: Workers, target: Any) -> list[Any]:
     async with aclosing(workers.events(target, {})) as events:
         return [event async for event in events]
 
 
-def answers(*targets: str) -> list[list[dict[str, Any]]]:
+def answers(*targets: str) -> list[list[Any]]:
     """What one worker says to calls, one after the other."""
 
-    async def ask() -> list[list[dict[str, Any]]]:
+    async def ask() -> list[list[Any]]:
         workers = Workers(1, None)
         await workers.open()
         try:
@@ -70,7 +71,7 @@ def test_a_worker_that_answers_oddly_is_replaced_and_nobody_waits(kind: str, pro
     write(program, HEADER + "    " + ANSWERS[kind] + "\n")
     bad, *good = answers("bad", "good", "good")
     assert [event["kind"] for event in bad] == ["started", "failed"]
-    assert "cannot be used" in bad[-1]["sentence"]
+    assert "invalid worker response" in bad[-1]["sentence"]
     assert good == 2 * [[{"kind": "started"}, {"kind": "end"}]]
 
 
@@ -95,7 +96,8 @@ def test_what_was_given_up_takes_no_place_in_the_queue(program: Path):
     async def kinds() -> list[str]:
         workers = Workers(1, None)
         await workers.open()
-        busy = workers.events("busy", {})
+        job: Any = "busy"
+        busy = workers.events(job, {})
         try:
             assert await anext(busy) == {"kind": "started"}
             for _ in range(2 * module.MAX_WAITING):
@@ -135,7 +137,7 @@ def test_workers_that_do_not_start_are_said_to(text: str | None, program: Path):
 def test_workers_that_do_not_start_are_tried_only_so_often(program: Path, tmp_path: Path):
     write(program, f"#!/bin/sh\necho x >> {tmp_path}/starts\nexit 1\n")
     answers("catalogue", "catalogue")
-    assert len((tmp_path / "starts").read_text().split()) == module.MAX_FAILURES
+    assert len((tmp_path / "starts").read_text().split()) == processes.MAX_FAILURES
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -58,9 +57,10 @@ def serve(
     from urllib.parse import quote
 
     try:
+        from ..study.workers import num_cores
         from ..web import serve as serve_here
         from ..web.security import is_loopback
-        from ..web.sessions import Settings
+        from ..web.sessions import PageSettings
     except ImportError:
         raise ValueError("the bench page needs the extra: pip install 'excite[web]'") from None
 
@@ -78,8 +78,8 @@ def serve(
         port = listening.getsockname()[1]
         address = f"http://{_name(host)}:{port}/" + (f"#{quote(token, safe='')}" if token else "")
         told = {"address": address, "token": token, "runs": str(runs)}
-        num_workers = workers or min(4, len(os.sched_getaffinity(0)))
-        settings = Settings(runs.absolute(), host, token, num_workers, cache_folder())
+        num_workers = workers or min(4, num_cores())
+        settings = PageSettings(runs.absolute(), host, token, num_workers, cache_folder())
         code = serve_here(settings, listening, lambda: _tell(told, as_json))
     if code:  # a signal: nobody may be there to read
         click.get_current_context().exit(code)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from .options import (
     OUT_FILE,
     RunFailedError,
     WholeNumber,
+    cache_folder,
     command_line,
     computing,
     json_option,
@@ -146,7 +146,9 @@ def _require_trainer(chosen: Any, out: Path) -> None:
 
 
 def _engine(engine: str, address: str | None, workers: int | None) -> Any:
-    from ..study.workers import dask_engine, local_engine
+    from ..study.cluster import dask_engine
+    from ..study.engine import local_engine
+    from ..study.workers import num_cores
 
     if engine == "dask":
         if address is None:
@@ -157,7 +159,7 @@ def _engine(engine: str, address: str | None, workers: int | None) -> Any:
         return dask_engine(address, lambda: click.echo(waiting, err=True))
     if address is not None:
         raise ValueError("--address is for --engine dask")
-    return local_engine(workers or len(os.sched_getaffinity(0)))
+    return local_engine(workers or num_cores(), cache_folder())
 
 
 def _finish(chosen: Any, folder: Path) -> None:

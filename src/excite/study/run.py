@@ -20,11 +20,12 @@ from ..files import csv_text, json_ready, took_lock, write_bytes, write_json
 from ..plant import AbstractPlant
 from ..policy import POLICY_ENDING, read_policy
 from ..record.read import SIGNAL_ENDINGS
+from .engine import Engine, run
 from .evaluation import Progress
 from .folder import agent_settings, fingerprint, read_json, seed_folder, study_of
 from .progress import read_progress, remove_progress
 from .spec import Study
-from .workers import Engine, run
+from .tasks import clairvoyant_task, methods_task, seed_task
 
 KIND = "excite study"
 FREE = {"name", "title", "inferred", "ours", "reference", "source"}
@@ -33,11 +34,7 @@ FREE |= {"agents", "decision", "training", "gradient", "seeds"}
 
 _Target = tuple[str, str, int]
 
-_TASKS = {
-    "methods": "excite.study.tasks:methods_task",
-    "clairvoyant": "excite.study.tasks:clairvoyant_task",
-    "seed": "excite.study.tasks:seed_task",
-}
+_TASKS = {"methods": methods_task, "clairvoyant": clairvoyant_task, "seed": seed_task}
 
 
 @contextlib.contextmanager
@@ -213,9 +210,9 @@ def run_study(
             progress(text, int(1000 * done), 1000 * len(targets))
 
         failures = {}
-        for kind, target in _TASKS.items():
+        for kind, function in _TASKS.items():
             chosen = {n: t for n, t in tasks.items() if targets[n][0] == kind}
-            failures |= run(target, chosen, engine, on_done=finished, on_tick=tick)
+            failures |= run(function, chosen, engine, on_done=finished, on_tick=tick)
         return failures
 
 

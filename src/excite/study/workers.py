@@ -1,400 +1,348 @@
-"""Where the work of a study is done: in processes started here, or on a Dask cluster.
+"""Processes of this computer that compute: one pool for studies and for the bench page.
 
-Either way it goes through one `concurrent.futures.Executor`, so that nobody else asks
-which. A task is a function, named by a word, and plain data; its result is plain data too.
+A worker does one thing at a time. What is asked to stop is told so; where it does not listen
+within half a second, for it is deep in a computation, its process is killed and another
+started. Nothing half-written is left, for files appear whole or not at all. A process that
+says anything but an answer to its call is replaced, too. JAX is not loaded here.
 """
 
 from __future__ import annotations
 
 import contextlib
-import importlib
-import multiprocessing
+import itertools
+import logging
 import os
-import pickle
-import signal
+import subprocess
+import sys
 import threading
-import time
-import warnings
-from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
-from concurrent.futures import ProcessPoolExecutor as Pool
-from functools import partial
-from typing import Any
-from urllib.parse import urlsplit
+from collections.abc import Callable, Mapping
+from pathlib import Path
 
-from .. import __version__
+from .worker import READY, Ending, Failure, Message, Started, decoded, encoded, message_of
 
-try:
-    import distributed
-except ImportError:
-    distributed: Any = None
-
-TICK = 1.0
-"""Seconds between two calls of `on_tick`."""
-
-CONNECT_TIMEOUT = 10.0
-"""Seconds in which a scheduler has to answer."""
-
+_LOG = logging.getLogger(__name__)
+GRACE = 0.5
+"""Seconds in which work stops by itself."""
+MAX_FAILURES = 3
+"""Processes that end before they are ready, one after the other, until a lane gives up."""
+_LINE = 64 * 2**20  # bytes; a longer answer is a defect
 _ONE = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NPROC", "JAX_ENABLE_X64")
 _ONE_THREAD = "--xla_cpu_multi_thread_eigen=false"
 
-# ------------------------------------------------------------------------ in a worker
+
+def num_cores() -> int:
+    """Processors that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
-def call(target: str, version: str, arguments: Mapping[str, Any]) -> Any:
-    """What a worker runs: the function `target`, "package.module:function", by keyword.
+def environment(cache: Path | None = None) -> dict[str, str]:
+    """Variables of a worker: one thread (NPROC is XLA's), double precision.
 
-    Raises:
-        ValueError: where the worker has another version of excite, or lacks a library.
-        RuntimeError: in place of an error of the function that cannot travel.
+    They are set before it starts, for OpenBLAS counts its threads and JAX reads its settings
+    when they are imported. Other flags of XLA stay.
+
+    Args:
+        cache: where compiled programs are kept.
     """
-    if version != __version__:
-        raise ValueError(
-            f"the worker runs excite {__version__}, the study was started by {version}"
-        )
-    # The function comes as a word and is imported here: sent as itself, unpickling it would
-    # import JAX before this line, and JAX reads its environment once.
-    os.environ.update(_environment())
-    module, _, name = target.partition(":")
-    try:
-        return getattr(importlib.import_module(module), name)(**arguments)
-    except ModuleNotFoundError as error:
-        lack = f"the worker has no module {error.name!r}; training needs the extra 'ppo'"
-        told = ValueError(lack)
-    except Exception as error:
-        kind = ValueError if isinstance(error, ValueError) else RuntimeError
-        told = error if _can_travel(error) else kind(_sentence(error))
-    raise told  # out here, for Dask sends what an error was raised from along with it
-
-
-def _environment() -> dict[str, str]:
-    """One thread a worker (NPROC is XLA's), double precision; other flags of XLA stay."""
     told = os.environ.get("XLA_FLAGS", "").split()
     others = [flag for flag in told if not flag.startswith(_ONE_THREAD.partition("=")[0])]
     flags = " ".join([*others, _ONE_THREAD])
-    return {**dict.fromkeys(_ONE, "1"), "TF_CPP_MIN_LOG_LEVEL": "3", "XLA_FLAGS": flags}
+    variables = {**dict.fromkeys(_ONE, "1"), "TF_CPP_MIN_LOG_LEVEL": "3", "XLA_FLAGS": flags}
+    if cache is not None:
+        variables["JAX_COMPILATION_CACHE_DIR"] = str(cache)
+        variables["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
+        variables["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "0"
+    return variables
 
 
-def _can_travel(error: Exception) -> bool:
-    """Whether an error is pickled and back; one that is only pickled breaks the pool."""
-    try:
-        pickle.loads(pickle.dumps(error))
-    except Exception:
-        return False
-    return True
-
-
-def _sentence(error: BaseException) -> str:
-    return " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
-
-
-def _prepare_process() -> None:
-    """Leaves Ctrl-C to the parent, and no orphan where the parent is killed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
-
-
-# -------------------------------------------------------------------------- executors
-
-
-class _Processes(Executor):
-    """Workers of one process each: one that dies takes only its own task along."""
-
-    def __init__(self, num_workers: int) -> None:
-        self._others = set(multiprocessing.active_children())
-        self._pools = [_pool() for _ in range(num_workers)]
-        self._futures: list[Future | None] = [None] * num_workers
-
-    def num_slots(self) -> int:
-        """How many tasks it takes at a time."""
-        return len(self._pools)
-
-    def is_lost(self) -> bool:
-        """Never: a pool that is broken is replaced."""
-        return False
-
-    def submit(self, fn: Callable, /, *args: Any, **kwargs: Any) -> Future:
-        is_busy = [future is not None and not future.done() for future in self._futures]
-        slot = is_busy.index(False) if False in is_busy else 0
-        with _ready_to_spawn():
-            try:
-                future = self._pools[slot].submit(fn, *args, **kwargs)
-            except BrokenExecutor:  # its process died with the task before
-                self._pools[slot] = _pool()
-                future = self._pools[slot].submit(fn, *args, **kwargs)
-        self._futures[slot] = future
-        return future
-
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        workers = set(multiprocessing.active_children()) - self._others
-        for worker in workers if not wait else ():
-            worker.kill()
-        for pool in self._pools:
-            pool.shutdown(wait=False, cancel_futures=cancel_futures or not wait)
-        for worker in workers:
-            worker.join()
-
-
-def _pool() -> Pool:
-    # A fork would copy the locks of JAX's threads, but not the threads that open them.
-    return Pool(1, multiprocessing.get_context("spawn"), _prepare_process)
-
-
-@contextlib.contextmanager
-def _ready_to_spawn() -> Iterator[None]:
-    """The environment of a worker, and no Ctrl-C, for a process that is started in here.
-
-    It inherits both, for its first imports come before anything it is told to do: OpenBLAS
-    counts its threads then, and an import that is interrupted shows a traceback.
-    """
-    changed = _environment()
-    before = {name: os.environ[name] for name in changed if name in os.environ}
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    os.environ.update(changed)
-    try:
-        yield
-    finally:
-        for name in changed.keys() - before.keys():
-            del os.environ[name]
-        os.environ.update(before)
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-
-
-class _Cluster(Executor):
-    """A Dask client and its executor, closed together.
-
-    What runs on a cluster cannot be stopped: a task that is cancelled comes to its end there.
-    """
-
-    def __init__(self, address: str, on_wait: Callable[[], Any]) -> None:
-        with contextlib.ExitStack() as stack:
-            # A lost scheduler is told by an error, not by lines all over our terminal.
-            stack.enter_context(distributed.utils.silence_logging_cmgr("CRITICAL"))
-            warnings.simplefilter("ignore", distributed.versions.VersionMismatchWarning)
-            self._client = _connected(address)
-            threads = self._client.nthreads().values()
-            if max(threads, default=1) > 1:
-                self._client.close()
-                raise ValueError(
-                    f"workers at {address} have several threads, which trainings would share; "
-                    "start them with --nthreads 1"
-                )
-            self._quiet = stack.pop_all()
-        if not threads:
-            on_wait()
-        self._executor = self._client.get_executor(pure=False, retries=0)
-
-    def num_slots(self) -> int:
-        """Threads of all workers, or one task that waits for the first; 0 where it cannot ask.
-
-        No task waits in a worker then, where it would be blamed for the death of another.
-        """
-        # What a client raises that loses its scheduler depends on how far it has come in closing.
-        with contextlib.suppress(OSError, RuntimeError, AttributeError):
-            return max(1, sum(self._client.nthreads().values()))
-        return 0
-
-    def is_lost(self) -> bool:
-        """Whether the scheduler was away, which forgets every task; some futures never learn."""
-        return self._client.status != "running"
-
-    def submit(self, fn: Callable, /, *args: Any, **kwargs: Any) -> Future:
-        try:
-            return self._executor.submit(fn, *args, **kwargs)
-        except Exception:
-            if not self.is_lost():
-                raise
-            future = Future()
-            future.cancel()
-            future.set_running_or_notify_cancel()
-            return future
-
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        with self._quiet, contextlib.suppress(TimeoutError):  # of a scheduler that is gone
-            if self._client.status == "running":
-                self._executor.shutdown(wait=wait and not cancel_futures)
-            self._client.close()
-
-
-def _connected(address: str) -> Any:
-    """A client of the scheduler.
-
-    It is made in a thread, for where something listens that never answers it waits without
-    end, whatever timeout it is given.
-    """
-    made: Future = Future()
-
-    def connect() -> None:
-        try:
-            timeout = CONNECT_TIMEOUT
-            made.set_result(distributed.Client(address, timeout=timeout, set_as_default=False))
-        except BaseException as error:
-            made.set_exception(error)
-
-    threading.Thread(target=connect, daemon=True).start()
-    try:
-        return made.result(CONNECT_TIMEOUT + 1)
-    except OSError:  # TimeoutError is one
-        raise ValueError(f"no Dask scheduler answers at {address}") from None
-    except Exception as error:
-        raise ValueError(f"the scheduler at {address} is of no use: {_sentence(error)}") from None
-
-
-# ------------------------------------------------------------------------- the driver
-
-Engine = Callable[[], _Processes | _Cluster]
-"""Opens an executor, and another where that one is lost; `shutdown(False)` ends its work."""
-
-
-def local_engine(num_workers: int) -> Engine:
-    """As many processes on this computer.
-
-    Raises:
-        ValueError: for less than one.
-    """
-    if num_workers < 1:
-        raise ValueError(f"{num_workers} workers can do no work; ask for at least one")
-    return partial(_Processes, num_workers)
-
-
-def dask_engine(address: str, on_wait: Callable[[], Any] = lambda: None) -> Engine:
-    """The workers of a Dask cluster, by the address of its scheduler.
-
-    Opening it raises ValueError where no scheduler answers, and calls `on_wait` where the
-    scheduler has no workers yet.
-
-    Raises:
-        ValueError: for a malformed address, or where Dask is not installed.
-    """
-    if distributed is None:
-        raise ValueError("the engine 'dask' needs the extra: pip install 'excite[dask]'")
-    is_good, url = False, address if "://" in address else f"tcp://{address}"
-    with contextlib.suppress(ValueError):  # of a port that is no number, a host that is no name
-        parts = urlsplit(url)
-        host = (parts.hostname or "").encode("idna")
-        is_good = bool(host and parts.port and url == f"tcp://{parts.netloc}")
-    if not is_good:
-        raise ValueError(f"{address!r} is no address of a scheduler, like tcp://10.0.0.5:8786")
-    return partial(_Cluster, address, on_wait)
-
-
-def run(
-    target: str,
-    tasks: Mapping[str, Mapping[str, Any]],
-    engine: Engine,
-    *,
-    on_done: Callable[[str, Any], Any],
-    on_tick: Callable[[], Any] = lambda: None,
-    num_tries: int = 3,
-) -> dict[str, Exception]:
-    """Calls `target` once a task, with its arguments, and gives every result to `on_done`.
-
-    A task whose worker dies, or that raises, is tried again later; but for a ValueError,
-    which is a user's mistake and stays one. Where this function is left by an exception, by
-    one of `on_done` or `on_tick` for example, nothing of it runs on in this computer.
-
-    Args:
-        target: "package.module:function".
-        tasks: keyword arguments by the name of the task: JSON-ready data or bytes.
-        on_done: takes the name of a task and its result, in the order in which they come.
-        on_tick: called about once a second.
-        num_tries: how often a task is tried in all.
-
-    Returns:
-        Why, by the name of each task that failed: ValueError is a mistake of the user's.
-
-    Raises:
-        ValueError: where the engine cannot be opened.
-    """
-    work = _Work(target, tasks, engine, num_tries)
-    next_tick = time.monotonic() + TICK
-    try:
-        while work.queue or work.running:
-            work.submit()
-            for name, result in work.finished(max(0.0, next_tick - time.monotonic())):
-                on_done(name, result)
-            if time.monotonic() >= next_tick:
-                on_tick()
-                next_tick = time.monotonic() + TICK
-        work.close(wait=True)
-    except BaseException:
-        work.close(wait=False)
-        raise
-    return work.failures
-
-
-class _Work:
-    """What is left of the tasks, and why some failed."""
+class Call:
+    """A call in the queue or under way."""
 
     def __init__(
-        self, target: str, tasks: Mapping[str, Mapping[str, Any]], engine: Engine, num_tries: int
+        self, number: int, line: str, tell: Callable[[Message], None], is_urgent: bool
     ) -> None:
-        self.queue, self.running = deque(tasks), {}
-        self.failures: dict[str, Exception] = {}
-        self._target, self._tasks, self._engine = target, tasks, engine
-        self._num_tries, self._tries, self._deaths = num_tries, Counter(), Counter()
-        self._executor: _Processes | _Cluster | None = None
+        self.number, self.line, self.is_urgent = number, line, is_urgent
+        self.process: _Process | None = None
+        self._tell, self._is_over, self._lock = tell, False, threading.Lock()
 
-    def submit(self) -> None:
-        """Hands over what there is room for."""
-        if self._executor is not None and self._executor.is_lost():
-            self._lose()
-        if not self.queue:
-            return
-        if self._executor is None:
-            self._executor = self._engine()
-        num_free = self._executor.num_slots() - len(self.running)
-        for _ in range(min(num_free, len(self.queue))):
-            name = self.queue.popleft()
-            arguments = dict(self._tasks[name])
-            future = self._executor.submit(call, self._target, __version__, arguments)
-            self.running[future] = name
+    @property
+    def is_over(self) -> bool:
+        """Whether the last was said of it."""
+        return self._is_over
 
-    def finished(self, seconds: float) -> Iterator[tuple[str, Any]]:
-        """Names and results of what is finished, after the first or after so many seconds."""
-        done, _ = wait(self.running, seconds, FIRST_COMPLETED)
-        lost = {future for future in done if future.cancelled()}
-        for future in done - lost:
-            name = self.running.pop(future)
-            error = future.exception()
-            if error is None:
-                yield name, future.result()
-            else:
-                self._note(name, error)
-        if lost:  # we cancel nothing while we wait: it is the scheduler that has gone
-            self._lose()
+    def say(self, message: Message) -> None:
+        """Passes a message on, but none after the last."""
+        with self._lock:
+            if self._is_over:
+                return
+            self._is_over = isinstance(message, Ending)
+        self._tell(message)
 
-    def close(self, wait: bool) -> None:
-        """Ends the executor; `submit` opens another."""
-        if self._executor is not None:
-            self._executor.shutdown(wait=wait, cancel_futures=not wait)
-        self._executor = None
+    def forget(self) -> None:
+        """Nobody is told anything any more."""
+        with self._lock:
+            self._is_over = True
 
-    def _lose(self) -> None:
-        self.close(wait=False)
-        for name in self.running.values():
-            self._note(name, BrokenExecutor())
-        self.running.clear()
 
-    def _note(self, name: str, error: BaseException) -> None:
-        num_deaths = int(isinstance(error, BrokenExecutor))
-        if distributed is not None and isinstance(error, distributed.KilledWorker):
-            num_deaths = error.args[2] + 1  # the scheduler has tried that many others itself
-        self._tries[name] += 1
-        self._deaths[name] += num_deaths
-        if self._tries[name] < self._num_tries and not isinstance(error, ValueError):
-            self.queue.append(name)
-        elif num_deaths:
-            times = "once" if self._deaths[name] == 1 else f"{self._deaths[name]} times"
-            self.failures[name] = RuntimeError(f"its worker died {times}")
-        else:  # subclasses of ValueError come from libraries
-            is_users = type(error) is ValueError
-            self.failures[name] = error if is_users else RuntimeError(_sentence(error))
+# ------------------------------------------------------------------------------------ the pool
+
+
+class Workers:
+    """Processes that answer calls, and the queue before them.
+
+    Args:
+        memory: bytes of data that a process may take; 0 for no limit.
+        niceness: by how much others go before them.
+        time_limit: seconds that a call may take.
+        warm_up: a function that every process runs first, where nobody waits.
+        cache: where they keep compiled programs.
+    """
+
+    def __init__(
+        self,
+        num_workers: int,
+        *,
+        memory: int = 0,
+        niceness: int = 0,
+        time_limit: float | None = None,
+        warm_up: str = "",
+        cache: Path | None = None,
+    ) -> None:
+        self.num_workers = num_workers
+        self._limits, self._cache = (str(memory), str(niceness)), cache
+        self._time_limit, self._warm_up = time_limit, warm_up
+        self._numbers, self._num_broken = itertools.count(), 0
+        self._waiting, self._running = list[Call](), set[Call]()
+        self._processes, self._lanes = set[_Process](), list[threading.Thread]()
+        self._changed, self._is_closed = threading.Condition(), False
+
+    @property
+    def num_waiting(self) -> int:
+        """Calls in the queue."""
+        return len(self._waiting)
+
+    def open(self) -> None:
+        """Starts the processes."""
+        self._lanes = [
+            threading.Thread(target=self._lane, daemon=True) for _ in range(self.num_workers)
+        ]
+        for lane in self._lanes:
+            lane.start()
+
+    def close(self, sentence: str = "the workers were ended") -> None:
+        """Ends the processes at once, and tells everybody who waits for them."""
+        with self._changed:
+            self._is_closed = True
+            calls = [*self._waiting, *self._running]
+            for process in self._processes:
+                process.kill()
+            self._changed.notify_all()
+        for call in calls:
+            call.say(Failure(sentence))
+        for lane in self._lanes:
+            lane.join()
+
+    def submit(
+        self,
+        target: str,
+        arguments: Mapping[str, object],
+        tell: Callable[[Message], None],
+        is_urgent: bool = False,
+    ) -> Call:
+        """Asks for a call; what is said of it goes to `tell`, in a thread of this pool.
+
+        Args:
+            target: "package.module:function".
+            is_urgent: before all that is not: somebody waits for the first sign of life.
+        """
+        with self._changed:
+            number = next(self._numbers)
+            line = encoded({"number": number, "target": target, "arguments": dict(arguments)})
+            call = Call(number, line, tell, is_urgent)
+            if not self._is_closed:
+                self._waiting.append(call)
+                self._changed.notify()
+                return call
+        call.say(Failure("the workers were ended"))
+        return call
+
+    def withdraw(self, call: Call) -> None:
+        """Ends a call that nobody waits for any longer; it takes nobody's place then."""
+        with self._changed:
+            call.forget()
+            if call in self._waiting:
+                self._waiting.remove(call)
+            elif call.process is not None:
+                call.process.send({"stop": call.number})
+                _later(GRACE, self._kill, call)
+
+    def _expire(self, call: Call) -> None:
+        call.say(Failure("this took too long and was stopped"))
+        self.withdraw(call)
+
+    def _kill(self, call: Call) -> None:
+        with self._changed:
+            if call.process is not None:
+                call.process.kill()
+
+    def _next(self) -> Call | None:
+        """The call that is first in the queue, once there is one; None where this is closed."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._waiting or self._is_closed)
+            if self._is_closed:
+                return None
+            call = min(self._waiting, key=lambda call: (not call.is_urgent, call.number))
+            self._waiting.remove(call)
+            self._running.add(call)
+            return call
+
+    def _lane(self) -> None:
+        """One worker and its successors; where none starts, the last lane tells everybody."""
+        num_failures = 0
+        while num_failures < MAX_FAILURES and not self._is_closed:
+            num_failures = 0 if self._worked() else num_failures + 1
+        with self._changed:
+            self._num_broken += 1
+        while self._num_broken == self.num_workers and (call := self._next()) is not None:
+            call.say(Failure("the workers do not start; the terminal says why"))
+            self._running.discard(call)
+
+    def _worked(self) -> bool:
+        """What one process does until it ends; whether it came to work at all."""
+        process = self._started()
+        if process is None:
+            return False
+        is_warm = not self._warm_up
+        try:
+            while True:
+                if is_warm or self._waiting:  # somebody waits already
+                    if (call := self._next()) is None:
+                        return True
+                    if not self._answered(process, call):
+                        return True
+                elif not self._answered(process, self._warming()):
+                    return False
+                else:
+                    is_warm = True
+        finally:
+            with self._changed:
+                self._processes.discard(process)
+            process.end()
+
+    def _warming(self) -> Call:
+        line = encoded({"number": -1, "target": self._warm_up, "arguments": {}})
+        return Call(-1, line, lambda message: None, False)
+
+    def _started(self) -> _Process | None:
+        """A process that is ready; None where there can be none."""
+        try:
+            process = _Process(self._limits, {**os.environ, **environment(self._cache)})
+        except OSError as error:
+            _LOG.error("no worker can be started: %s", error)
+            return None
+        with self._changed:
+            self._processes.add(process)
+            if self._is_closed:
+                process.kill()
+        is_ready = False
+        try:
+            is_ready = decoded(process.line()) == READY
+        except (ValueError, RecursionError) as error:
+            _LOG.error("a worker does not start: %s", error)
+        if is_ready:
+            return process
+        with self._changed:
+            self._processes.discard(process)
+        process.end()
+        return None
+
+    def _answered(self, process: _Process, call: Call) -> bool:
+        """Passes a call and its answers on; whether the process can be given another call."""
+        with self._changed:
+            if call.is_over:  # withdrawn meanwhile
+                self._running.discard(call)
+                return True
+            call.process = process
+        call.say(Started())
+        limit = None if self._time_limit is None else _later(self._time_limit, self._expire, call)
+        try:
+            process.send(call.line)
+            while True:
+                line = process.line()
+                if not line:
+                    sentence = "the worker ended unexpectedly; run it again"
+                    call.say(Failure(sentence, num_deaths=1))
+                    return False
+                number, message = message_of(line)
+                if number != call.number:
+                    raise ValueError("it answered another call")
+                call.say(message)
+                if isinstance(message, Ending):
+                    return True
+        except Exception as error:  # what follows would be taken for the next answer
+            _LOG.error("a worker was replaced: %s", error)
+            call.say(Failure("invalid worker response; worker restarted"))
+            return False
+        finally:
+            if limit is not None:
+                limit.cancel()
+            with self._changed:
+                call.process = None
+                self._running.discard(call)
+
+
+def _later(seconds: float, function: Callable[[Call], None], call: Call) -> threading.Timer:
+    timer = threading.Timer(seconds, function, [call])
+    timer.daemon = True
+    timer.start()
+    return timer
+
+
+class _Process:
+    """A worker, and what goes in and out of it."""
+
+    def __init__(self, limits: tuple[str, str], variables: Mapping[str, str]) -> None:
+        path = os.pathsep.join(folder for folder in sys.path if folder)
+        self._process = subprocess.Popen(
+            [sys.executable, "-P", "-m", f"{__package__}.worker", *limits],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env={**variables, "PYTHONPATH": path},
+            start_new_session=True,  # Ctrl-C is for who started this; on Windows by the next line
+            creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
+        )
+        self._lock = threading.Lock()
+
+    def send(self, message: object) -> None:
+        """A line in; where nobody reads it, the next answer says so."""
+        line = message if isinstance(message, str) else encoded(message)
+        with self._lock, contextlib.suppress(OSError, ValueError):
+            if self._process.stdin is not None:
+                self._process.stdin.write(f"{line}\n".encode())
+                self._process.stdin.flush()
+
+    def line(self) -> bytes:
+        """The next line out; empty where the process has ended.
+
+        Raises:
+            ValueError: for one that is too long.
+        """
+        line = b"" if self._process.stdout is None else self._process.stdout.readline(_LINE)
+        if len(line) >= _LINE:
+            raise ValueError("its answer is too long")
+        return line if line.endswith(b"\n") else b""
+
+    def kill(self) -> None:
+        """Ends it at once."""
+        self._process.kill()
+
+    def end(self) -> None:
+        """Ends it, and waits for that."""
+        self.kill()
+        self._process.wait()
+        for pipe in (self._process.stdin, self._process.stdout):
+            with contextlib.suppress(OSError):  # what nobody reads any longer
+                if pipe is not None:
+                    pipe.close()

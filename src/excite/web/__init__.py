@@ -1,9 +1,9 @@
 """The bench page: choose an excitation, watch the identification happen, keep the result.
 
 This process serves and computes nothing: it loads neither JAX nor a plant, so that the page
-opens at once. `worker` processes call `excite.web.jobs` and tell what they find, event by event.
-`base` holds the nouns, `security` guards every request, `streams`, `places`, `runs` and
-`trainings` answer them.
+opens at once. Worker processes run `jobs` and tell what they find, event by event (`events`).
+`requests` checks what a browser asks, `security` guards every request, `sessions` keeps what
+belongs to a browser, `streams`, `places`, `runs` and `trainings` answer.
 """
 
 from __future__ import annotations
@@ -27,24 +27,25 @@ from starlette.responses import FileResponse, JSONResponse
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
+from .events import Catalogue
 from .places import routes as place_routes
 from .requests import MAX_BODY, RefusedError
 from .runs import routes as run_routes
 from .runs import run_of
 from .security import Guard, is_loopback
-from .sessions import Sessions, Settings
+from .sessions import PageSettings, Sessions
 from .streams import routes as stream_routes
 from .trainings import Training
 from .trainings import routes as training_routes
 from .workers import Workers
 
-__all__ = ["Settings", "application", "is_loopback", "serve"]
+__all__ = ["PageSettings", "application", "is_loopback", "serve"]
 
 _STATIC = Path(__file__).with_name("static")
 
 
 def application(
-    settings: Settings, scratch: Path, ready: Callable[[], None] = lambda: None
+    settings: PageSettings, scratch: Path, ready: Callable[[], None] = lambda: None
 ) -> Starlette:
     """The page and everything it may ask for.
 
@@ -53,7 +54,7 @@ def application(
         ready: called when it answers.
     """
     workers, trainings = Workers(settings.num_workers, settings.cache), list[Training]()
-    known: list[dict[str, Any]] = []
+    known = list[Catalogue]()
 
     async def end_work() -> None:
         await asyncio.gather(workers.close(), *(training.stop() for training in trainings))
@@ -104,7 +105,7 @@ async def _session(request: Request) -> JSONResponse:
     return JSONResponse({"is_known": cookie is not None}, headers=headers)
 
 
-async def _body(request: Request) -> dict[str, Any]:
+async def _body(request: Request) -> dict[str, object]:
     """A request's JSON, an object of limited size."""
     content = bytearray()
     async for part in request.stream():
@@ -153,7 +154,8 @@ class _Server(uvicorn.Server):
 def _signals() -> Generator[list[int]]:
     """Ctrl-C, a closed terminal and a polite kill, as they come; none of them ends anything."""
     came = list[int]()
-    kinds = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    names = ("SIGINT", "SIGTERM", "SIGHUP")  # the last is unknown to Windows
+    kinds = [getattr(signal, name) for name in names if hasattr(signal, name)]
     before = {kind: signal.signal(kind, lambda number, _: came.append(number)) for kind in kinds}
     try:
         yield came
@@ -162,7 +164,7 @@ def _signals() -> Generator[list[int]]:
             signal.signal(kind, handler)
 
 
-def serve(settings: Settings, listening: socket.socket, ready: Callable[[], None]) -> int:
+def serve(settings: PageSettings, listening: socket.socket, ready: Callable[[], None]) -> int:
     """Serves until a signal comes, on a socket that is bound already; calls `ready` at its start.
 
     Returns:

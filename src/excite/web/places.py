@@ -5,16 +5,17 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
 
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
 
+from .events import JobEvent
 from .requests import MAX_UPLOAD, RefusedError
-from .sessions import MAX_STORED, Pool, Session
+from .sessions import MAX_STORED, Session
+from .workers import Job, Workers
 
 _MAX_NAME = 200  # bytes of a file's name
 _SILENCE = 30.0  # seconds without a part of a file
@@ -25,7 +26,7 @@ _DOWNLOADS = {
 }
 
 
-def routes(pool: Pool, run_of: Callable[[Request], Path]) -> list[Route]:
+def routes(workers: Workers, run_of: Callable[[Request], Path]) -> list[Route]:
     """What takes files, and gives results back.
 
     Args:
@@ -40,11 +41,12 @@ def routes(pool: Pool, run_of: Callable[[Request], Path]) -> list[Route]:
             with session.making("upload") as (name, place):
                 await _receive(request, place.folder / file, session.folder.parent)
                 wanted = {"folder": str(place.folder), "name": file}
-                told = await _last(pool, "columns", wanted, True)
+                told = await _last(workers, "columns", wanted, True)
                 place.is_done = True
         finally:
             session.end(job)
-        return JSONResponse({"upload": name, "file": file, "columns": told["columns"]})
+        columns = told["columns"] if told["kind"] == "columns" else {}
+        return JSONResponse({"upload": name, "file": file, "columns": columns})
 
     def file(request: Request) -> FileResponse:
         asked = request.path_params
@@ -59,13 +61,13 @@ def routes(pool: Pool, run_of: Callable[[Request], Path]) -> list[Route]:
         with session.using(request.path_params["name"]) as folder:
             if not (folder / "run").is_dir():
                 raise RefusedError(404, "there is nothing to report of yet")
-            return await _reported(pool, session, folder / "run")
+            return await _reported(workers, session, folder / "run")
 
     async def run_report(request: Request) -> Response:
         run = run_of(request)
         if any(path.is_symlink() for path in run.rglob("*")):
             raise RefusedError(422, "this run holds links, which the page does not follow")
-        return await _reported(pool, request.state.session, run)
+        return await _reported(workers, request.state.session, run)
 
     return [
         Route("/api/uploads", upload, methods=["POST"]),
@@ -75,14 +77,14 @@ def routes(pool: Pool, run_of: Callable[[Request], Path]) -> list[Route]:
     ]
 
 
-async def _reported(pool: Pool, session: Session, run: Path) -> Response:
+async def _reported(workers: Workers, session: Session, run: Path) -> Response:
     """The report of a run, made in a folder that goes at once."""
     job = session.begin()
     try:
         with tempfile.TemporaryDirectory(dir=session.folder) as folder:
             out = Path(folder) / "report.html"
             wanted = {"folders": [str(run)], "out": str(out)}
-            await _last(pool, "reported", wanted, False)
+            await _last(workers, "reported", wanted, False)
             content = out.read_bytes()
     finally:
         session.end(job)
@@ -136,10 +138,12 @@ async def _receive(request: Request, path: Path, scratch: Path) -> None:
         raise RefusedError(400, "the file is empty")
 
 
-async def _last(pool: Pool, target: str, arguments: dict[str, Any], urgent: bool) -> dict[str, Any]:
+async def _last(
+    workers: Workers, job: Job, arguments: Mapping[str, object], urgent: bool
+) -> JobEvent:
     """The last event of a call before its end."""
-    told: dict[str, Any] = {}
-    async with contextlib.aclosing(pool.events(target, arguments, urgent)) as events:
+    told: JobEvent = {"kind": "end"}
+    async with contextlib.aclosing(workers.events(job, arguments, urgent)) as events:
         async for event in events:
             if event["kind"] == "failed":
                 raise RefusedError(422, event["sentence"])

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Awaitable, Callable, Mapping
+
+from starlette.requests import Request
 
 MAX_UPLOAD = 32 * 2**20
 """Bytes of an uploaded file."""
@@ -13,6 +14,11 @@ MAX_STEPS = 5000
 """Samples of a simulated experiment."""
 MAX_BODY = 64 * 2**10
 """Bytes of a request that is no upload."""
+
+Asked = Mapping[str, object]
+"""What a browser sends, as JSON."""
+Body = Callable[[Request], Awaitable[dict[str, object]]]
+"""Reads it."""
 
 _FOLDERS = re.compile(r"(?<![\w.:/])/(?:[^\s/:'\"]+/)+")
 _WORD = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
@@ -34,7 +40,7 @@ class RefusedError(Exception):
 # ------------------------------------------------------------- what a browser may ask for
 
 
-def word(asked: Mapping[str, Any], key: str) -> str:
+def word(asked: Asked, key: str) -> str:
     """A name without dots, slashes and colons: never a path, never a file."""
     value = asked.get(key)
     if not (isinstance(value, str) and _WORD.fullmatch(value)):
@@ -42,7 +48,7 @@ def word(asked: Mapping[str, Any], key: str) -> str:
     return value
 
 
-def number(asked: Mapping[str, Any], key: str, lower: float, upper: float) -> float:
+def number(asked: Asked, key: str, lower: float, upper: float) -> float:
     """A finite number of a range."""
     value = asked.get(key)
     if isinstance(value, bool) or not isinstance(value, int | float) or not _is_finite(value):
@@ -59,7 +65,7 @@ def _is_finite(value: float) -> bool:
         return False
 
 
-def whole(asked: Mapping[str, Any], key: str, lower: int, upper: int) -> int:
+def whole(asked: Asked, key: str, lower: int, upper: int) -> int:
     """A whole number of a range."""
     value = number(asked, key, lower, upper)
     if value != int(value):
@@ -67,7 +73,7 @@ def whole(asked: Mapping[str, Any], key: str, lower: int, upper: int) -> int:
     return int(value)
 
 
-def numbers(asked: Mapping[str, Any], key: str) -> dict[str, float]:
+def numbers(asked: Asked, key: str) -> dict[str, float]:
     """Numbers by name; at most 32."""
     value = asked.get(key, {})
     if not isinstance(value, dict) or len(value) > 32:
@@ -75,11 +81,12 @@ def numbers(asked: Mapping[str, Any], key: str) -> dict[str, float]:
     return {str(name): number(value, name, -1e12, 1e12) for name in value}
 
 
-def texts(asked: Mapping[str, Any], key: str) -> dict[str, str]:
+def texts(asked: Asked, key: str) -> dict[str, str]:
     """Short texts by name; at most 32."""
     value = asked.get(key, {})
     if not isinstance(value, dict) or len(value) > 32:
         raise RefusedError(400, f"{key}: texts by name are needed")
-    if not all(isinstance(text, str) and len(text) <= 200 for text in value.values()):
+    found = {str(name): text for name, text in value.items() if isinstance(text, str)}
+    if len(found) < len(value) or any(len(text) > 200 for text in found.values()):
         raise RefusedError(400, f"{key}: texts by name are needed")
-    return value
+    return found

@@ -12,7 +12,6 @@ import math
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse
@@ -110,7 +109,7 @@ def _text(run: Path, name: str) -> str:
         return ""
 
 
-def _json(run: Path, name: str) -> dict[str, Any]:
+def _json(run: Path, name: str) -> dict[str, object]:
     """Content of a JSON file of a run; empty where there is none."""
     try:
         content = json.loads(_text(run, name))
@@ -119,7 +118,7 @@ def _json(run: Path, name: str) -> dict[str, Any]:
     return content if isinstance(content, dict) else {}
 
 
-def _summary(name: str, run: Path) -> dict[str, Any]:
+def _summary(name: str, run: Path) -> dict[str, object]:
     marker, study = _json(run, "run.json"), _json(run, "study.json")
     plant = marker.get("plant")
     return {
@@ -132,7 +131,7 @@ def _summary(name: str, run: Path) -> dict[str, Any]:
     }
 
 
-def _content(run: Path) -> dict[str, Any]:
+def _content(run: Path) -> dict[str, object]:
     """What a run shows: its table as it was written, or its estimate, and its files."""
     files = _files(run)
     return {
@@ -145,7 +144,7 @@ def _content(run: Path) -> dict[str, Any]:
     }
 
 
-def _table(text: str) -> dict[str, Any]:
+def _table(text: str) -> dict[str, object]:
     """Header, rows and notes of the first table of a Markdown text."""
     lines = text.splitlines()
     first = next((i for i, line in enumerate(lines) if line.startswith("|")), len(lines))
@@ -155,7 +154,7 @@ def _table(text: str) -> dict[str, Any]:
     return {"header": cells[0] if cells else [], "rows": cells[2:], "notes": notes}
 
 
-def _curves(run: Path) -> list[dict[str, Any]]:
+def _curves(run: Path) -> list[dict[str, object]]:
     """Learning curves of the finished seeds; those of bounds are told from those of errors."""
     bounds = _json(run, "table.json").get("bound_curves")
     bounds = bounds if isinstance(bounds, list) else []

@@ -15,9 +15,7 @@ import logging
 import socket
 import time
 from collections import deque
-from collections.abc import Mapping
 from http.cookies import CookieError, SimpleCookie
-from typing import Any
 from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
@@ -25,8 +23,8 @@ from starlette.requests import ClientDisconnect
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from .requests import RefusedError
-from .sessions import Session, Sessions, Settings
+from .requests import Asked, RefusedError
+from .sessions import PageSettings, Session, Sessions
 
 MAX_TRIES = 10
 """Wrong tokens in a minute, from one address."""
@@ -59,7 +57,7 @@ def is_loopback(host: str) -> bool:
 class Guard:
     """Refuses what does not come from the page, and hands sessions out."""
 
-    def __init__(self, app: ASGIApp, settings: Settings, sessions: Sessions) -> None:
+    def __init__(self, app: ASGIApp, settings: PageSettings, sessions: Sessions) -> None:
         self._app, self._settings, self._sessions = app, settings, sessions
         self._wrong: dict[str, deque[float]] = {}
         self._names = {settings.host, *_LOCAL}
@@ -120,7 +118,7 @@ class Guard:
             return RefusedError(403, "this browser is not known here; open the page again")
         return RefusedError(401, "the token is needed; it was printed where the page was started")
 
-    def _enter(self, asked: Mapping[str, Any], scope: Scope) -> str | None:
+    def _enter(self, asked: Asked, scope: Scope) -> str | None:
         """The cookie of a new session; None where the token is needed and was not shown.
 
         Raises:

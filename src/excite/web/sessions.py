@@ -1,21 +1,22 @@
-"""The nouns of the bench page: settings, sessions, refusals, and what a browser may ask for."""
+"""How the page is served, and what it keeps for every browser."""
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import secrets
 import shutil
 import tempfile
 import time
-from collections.abc import AsyncGenerator, Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
 
 from .requests import RefusedError
+from .trainings import Training
 
 MAX_JOBS = 4
-"""Things a browser may have under way at once."""
+"""Jobs that a browser may run at once."""
 MAX_SESSIONS = 256
 MAX_STORED = 2 * 2**30
 """Bytes of what is kept for all browsers, beyond which no more is uploaded."""
@@ -24,7 +25,7 @@ MAX_KEPT = 8
 
 
 @dataclass(frozen=True)
-class Settings:
+class PageSettings:
     """How the page is served.
 
     Attributes:
@@ -42,24 +43,13 @@ class Settings:
     cache: Path | None = None
 
 
-@runtime_checkable
-class Pool(Protocol):
-    """Workers; see `workers`."""
-
-    def events(
-        self, target: str, arguments: Mapping[str, Any], urgent: bool = False
-    ) -> AsyncGenerator[dict[str, Any]]:
-        """Events of a function of `excite.web.jobs`; closing it ends the work."""
-        ...
-
-
 @dataclass
 class Place:
     """A folder for an upload or a result.
 
     Attributes:
         kind: "upload" or "result"; each gives way to its own kind alone.
-        num_users: how many things under way need it now.
+        num_users: how many jobs need it now.
         is_done: whether it holds what it was made for.
     """
 
@@ -75,15 +65,15 @@ class Session:
 
     Attributes:
         folder: its uploads and results.
-        stops: how to stop what is under way, by its name; None for what is short.
+        stops: how to stop each running job, by its name; None for a short one.
         kept: results and uploads by name, the one used last at the end.
         trainings: trainings it has started, by name.
     """
 
     folder: Path
-    stops: dict[str, Any] = field(default_factory=dict)
+    stops: dict[str, asyncio.Event | None] = field(default_factory=dict)
     kept: dict[str, Place] = field(default_factory=dict)
-    trainings: dict[str, Any] = field(default_factory=dict)
+    trainings: dict[str, Training] = field(default_factory=dict)
     seen: float = field(default_factory=time.monotonic)
 
     @contextlib.contextmanager
@@ -129,23 +119,23 @@ class Session:
 
     @property
     def is_idle(self) -> bool:
-        """Whether nothing of it is under way."""
+        """Whether none of its jobs runs."""
         return not (self.stops or any(t.is_running for t in self.trainings.values()))
 
-    def begin(self, stop: Any = None) -> str:
-        """The name of one more thing that is under way, until `end`.
+    def begin(self, stop: asyncio.Event | None = None) -> str:
+        """The name of one more job that runs, until `end`.
 
         Raises:
-            RefusedError: where too much is under way already.
+            RefusedError: where too many run already.
         """
         if len(self.stops) >= MAX_JOBS:
-            raise RefusedError(429, f"{MAX_JOBS} things are under way in this browser; stop one")
+            raise RefusedError(429, f"{MAX_JOBS} jobs already running in this browser; stop one")
         name = secrets.token_urlsafe(12)
         self.stops[name] = stop
         return name
 
     def end(self, name: str) -> None:
-        """That thing is over."""
+        """That job is over."""
         self.stops.pop(name, None)
 
 

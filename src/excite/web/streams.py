@@ -11,24 +11,24 @@ import json
 import math
 from collections.abc import AsyncGenerator, AsyncIterator, Callable, Mapping
 from contextlib import aclosing
-from typing import Any
 
 from starlette.requests import Request
 from starlette.responses import JSONResponse, StreamingResponse
 from starlette.routing import Route
 
-from .requests import MAX_STEPS, RefusedError, number, numbers, texts, whole, word
-from .sessions import Pool, Session
+from .events import Episode, JobEvent, Plan, Samples, StreamEvent
+from .requests import MAX_STEPS, Body, RefusedError, number, numbers, texts, whole, word
+from .sessions import Session
+from .workers import Workers
 
 FRAME = 0.04
 """Seconds between two parts of a stream."""
 _PULSE = 1.0  # seconds after which a silent stream says that it lives
 
-Event = dict[str, Any]
-Events = AsyncGenerator[Event]
+Events = AsyncGenerator[StreamEvent]
 
 
-def routes(pool: Pool, body: Callable[[Request], Any]) -> list[Route]:
+def routes(workers: Workers, body: Body) -> list[Route]:
     """What starts and stops an experiment or an identification.
 
     Args:
@@ -38,20 +38,21 @@ def routes(pool: Pool, body: Callable[[Request], Any]) -> list[Route]:
     async def experiment(request: Request) -> StreamingResponse:
         session, asked = request.state.session, await body(request)
         seconds, asked = number(asked, "seconds", 0, 60), _experiment(asked)
-        return _streamed(session, lambda stop: _played(pool, session, asked, seconds, stop))
+        return _streamed(session, lambda stop: _played(workers, session, asked, seconds, stop))
 
     async def identification(request: Request) -> StreamingResponse:
         session, asked = request.state.session, await body(request)
         upload = str(asked.get("upload"))
         with session.using(upload):  # or there is none
             asked = _identification(asked)
-        return _streamed(session, lambda stop: _identified(pool, session, asked, upload, stop))
+        return _streamed(session, lambda stop: _identified(workers, session, asked, upload, stop))
 
     async def stop(request: Request) -> JSONResponse:
-        stops = request.state.session.stops
-        if stops.get(request.path_params["job"]) is None:
-            raise RefusedError(404, "nothing of this name is under way in this browser")
-        stops[request.path_params["job"]].set()
+        stops: dict[str, asyncio.Event | None] = request.state.session.stops
+        asked = stops.get(request.path_params["job"])
+        if asked is None:
+            raise RefusedError(404, "this browser runs no such job")
+        asked.set()
         return JSONResponse({"stopped": True})
 
     return [
@@ -61,7 +62,7 @@ def routes(pool: Pool, body: Callable[[Request], Any]) -> list[Route]:
     ]
 
 
-def _experiment(asked: Mapping[str, Any]) -> Event:
+def _experiment(asked: Mapping[str, object]) -> dict[str, object]:
     """An experiment as `excite.web.jobs` takes it: checked names and numbers, nothing else."""
     others = asked.get("others")
     if not isinstance(others, list) or len(others) > 2:
@@ -78,7 +79,7 @@ def _experiment(asked: Mapping[str, Any]) -> Event:
     }
 
 
-def _identification(asked: Mapping[str, Any]) -> Event:
+def _identification(asked: Mapping[str, object]) -> dict[str, object]:
     """An identification, likewise."""
     return {
         "plant": word(asked, "plant"),
@@ -108,11 +109,11 @@ def _streamed(session: Session, events: Callable[[asyncio.Event], Events]) -> St
     return StreamingResponse(lines(), media_type="application/x-ndjson")
 
 
-def _line(event: Event) -> str:
+def _line(event: StreamEvent) -> str:
     return json.dumps(event, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-async def _lively(events: Events, stop: asyncio.Event) -> Events:
+async def _lively(events: AsyncGenerator[JobEvent], stop: asyncio.Event) -> Events:
     """The same events; a pulse where there is none for long; the end where asked to stop."""
     stopped = asyncio.ensure_future(stop.wait())
     following = None
@@ -139,7 +140,11 @@ async def _lively(events: Events, stop: asyncio.Event) -> Events:
 
 
 async def _identified(
-    pool: Pool, session: Session, asked: Event, upload: str, stop: asyncio.Event
+    workers: Workers,
+    session: Session,
+    asked: Mapping[str, object],
+    upload: str,
+    stop: asyncio.Event,
 ) -> Events:
     with session.using(upload) as source, session.making("result") as (name, place):
         arguments = {
@@ -148,7 +153,7 @@ async def _identified(
             "name": next(iter(source.iterdir())).name,
             "folder": str(place.folder / "run"),
         }
-        async with aclosing(_lively(pool.events("identified", arguments), stop)) as events:
+        async with aclosing(_lively(workers.events("identified", arguments), stop)) as events:
             async for event in events:
                 if event["kind"] == "identified":
                     place.is_done, event["result"] = True, name
@@ -156,11 +161,15 @@ async def _identified(
 
 
 async def _played(
-    pool: Pool, session: Session, asked: Event, seconds: float, stop: asyncio.Event
+    workers: Workers,
+    session: Session,
+    asked: Mapping[str, object],
+    seconds: float,
+    stop: asyncio.Event,
 ) -> Events:
     """The samples at their pace, estimates among them, then what the rest comes to."""
     shown = None
-    async with aclosing(_lively(pool.events("episode", {"asked": asked}, True), stop)) as events:
+    async with aclosing(_lively(workers.events("episode", {"asked": asked}, True), stop)) as events:
         async for event in events:
             if event["kind"] == "episode":
                 shown = event
@@ -172,19 +181,21 @@ async def _played(
     yield player.plan()
     with session.making("result") as (name, place):
         arguments = {"asked": asked, "folder": str(place.folder / "run")}
-        async with aclosing(_followed(pool, arguments, player, stop)) as events:
+        async with aclosing(_followed(workers, arguments, player, stop)) as events:
             async for event in events:
                 if event["kind"] == "result":
                     place.is_done, event["result"] = event["identification"] is not None, name
                 yield event
 
 
-async def _followed(pool: Pool, arguments: Event, player: _Player, stop: asyncio.Event) -> Events:
+async def _followed(
+    workers: Workers, arguments: Mapping[str, object], player: _Player, stop: asyncio.Event
+) -> Events:
     """Frames of samples, and what is found from them."""
-    waiting = asyncio.Queue[Event]()
+    waiting = asyncio.Queue[JobEvent]()
 
     async def follow() -> None:
-        async with aclosing(pool.events("followed", arguments)) as events:
+        async with aclosing(workers.events("followed", arguments)) as events:
             async for event in events:
                 if event["kind"] != "started":
                     waiting.put_nowait(event)
@@ -198,9 +209,9 @@ async def _followed(pool: Pool, arguments: Event, player: _Player, stop: asyncio
         await asyncio.gather(following, return_exceptions=True)
 
 
-async def _mixed(player: _Player, waiting: asyncio.Queue[Event], stop: asyncio.Event) -> Events:
+async def _mixed(player: _Player, waiting: asyncio.Queue[JobEvent], stop: asyncio.Event) -> Events:
     """Frames of samples with the estimates made until then; afterwards whatever comes."""
-    early, silent = list[Event](), 0.0
+    early, silent = list[JobEvent](), 0.0
     while not stop.is_set():
         while not waiting.empty():
             early.append(waiting.get_nowait())
@@ -225,29 +236,36 @@ async def _mixed(player: _Player, waiting: asyncio.Queue[Event], stop: asyncio.E
 class _Player:
     """How much of an experiment was shown so far."""
 
-    def __init__(self, shown: Event, seconds: float) -> None:
+    def __init__(self, shown: Episode, seconds: float) -> None:
         self._shown, self._seconds, self._sent = shown, seconds, 0
         self._start = asyncio.get_running_loop().time()
 
-    def plan(self) -> Event:
+    def plan(self) -> Plan:
         """What is known before the first sample."""
-        known = {k: v for k, v in self._shown.items() if k not in ("inputs", "outputs", "time")}
-        return {**known, "kind": "plan", "num_samples": len(self._shown["time"])}
+        shown = self._shown
+        return {
+            "kind": "plan",
+            "plant": shown["plant"],
+            "excitation": shown["excitation"],
+            "warning": shown["warning"],
+            "params": shown["params"],
+            "num_samples": len(shown["time"]),
+        }
 
     @property
     def is_over(self) -> bool:
         """Whether all samples were shown."""
         return self._sent == len(self._shown["time"])
 
-    def allows(self, event: Event) -> bool:
+    def allows(self, event: JobEvent) -> bool:
         """Whether an event may be shown: not before the sample it was made at, or the last."""
-        return self.is_over or event.get("k", math.inf) <= self._sent - 1
+        return self.is_over or (event["kind"] == "estimate" and event["k"] < self._sent)
 
     def hurry(self) -> None:
         """Shows the rest at once."""
         self._seconds = 0.0
 
-    def frame(self) -> Event | None:
+    def frame(self) -> Samples | None:
         """The samples that are due."""
         total, elapsed = len(self._shown["time"]), asyncio.get_running_loop().time() - self._start
         part = 1.0 if self._seconds == 0 else min(1.0, elapsed / self._seconds)
@@ -255,5 +273,9 @@ class _Player:
         self._sent = max(self._sent, due.stop)
         if due.start >= due.stop:
             return None
-        parts = ("time", "inputs", "outputs")
-        return {"kind": "samples", **{part: self._shown[part][due] for part in parts}}
+        return {
+            "kind": "samples",
+            "time": self._shown["time"][due],
+            "inputs": self._shown["inputs"][due],
+            "outputs": self._shown["outputs"][due],
+        }

@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import os
 import secrets
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Literal, TypedDict
 
 from starlette.requests import Request
 from starlette.responses import JSONResponse
@@ -22,19 +21,41 @@ from starlette.routing import Route
 
 from ..study.objectives import OBJECTIVES, is_information
 from ..study.progress import read_progress
-from .requests import RefusedError, number, whole, without_folders, word
+from .requests import Asked, Body, RefusedError, number, whole, without_folders, word
 
 MAX_TRAININGS = 2
 _PATIENCE = 10.0  # seconds for a training to end when it is interrupted
 _MAX_ROWS = 500  # of a learning curve; of a longer one every second row is let go
 _STEP_BACK = """
 import ctypes, os, signal, sys
-os.nice(10)  # what is being watched comes first
+if hasattr(os, "nice"):
+    os.nice(10)  # what is being watched comes first
 if sys.platform == "linux":  # a server that is killed interrupts its trainings
     PR_SET_PDEATHSIG = 1
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGINT)
 os.execv(sys.executable, [sys.executable, "-m", "excite", *sys.argv[1:]])
 """
+
+
+class TrainingStatus(TypedDict):
+    """A training as the page shows it.
+
+    Keys:
+        sentence: why it failed.
+        curve: rows of its learning curve; None for a number that is not finite.
+        is_bound: whether the curve's errors are bounds, for an objective of the information.
+    """
+
+    name: str
+    folder: str
+    state: State
+    sentence: str
+    curve: list[dict[str, float | None]]
+    is_bound: bool
+    command: str
+
+
+State = Literal["starting", "training", "stopping", "stopped", "finished", "failed"]
 
 
 class Training:
@@ -43,7 +64,8 @@ class Training:
     def __init__(self, name: str, folder: Path, words: list[str]) -> None:
         self.name, self.folder, self.words = name, folder, words
         self.curve: list[dict[str, float | None]] = []
-        self.state, self.sentence = "starting", ""
+        self.state: State = "starting"
+        self.sentence = ""
         self._process: asyncio.subprocess.Process | None = None
         self._followed: asyncio.Task | None = None
 
@@ -68,12 +90,12 @@ class Training:
             return
         self.state = "stopping"
         with contextlib.suppress(ProcessLookupError):
-            os.kill(process.pid, signal.SIGINT)
+            process.send_signal(signal.SIGINT)
         try:
             await asyncio.wait_for(process.wait(), _PATIENCE)
         except TimeoutError:
             with contextlib.suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)
+                process.kill()  # its workers end with it
         if self._followed is not None:
             await self._followed
 
@@ -91,7 +113,7 @@ class Training:
             self.state = "stopped"
         else:
             self.state = "failed"
-            self.sentence = without_folders((last or ["it ended without a word"])[0])
+            self.sentence = without_folders((last or ["it exited without an error message"])[0])
 
     def _look(self) -> None:
         for place in self.folder.glob("seeds/*/0"):
@@ -103,7 +125,7 @@ class Training:
                 del self.curve[1:-1:2]
             self.state = "training" if self.state == "starting" else self.state
 
-    def told(self) -> dict[str, Any]:
+    def told(self) -> TrainingStatus:
         """What the page shows."""
         return {
             "name": self.name,
@@ -116,7 +138,7 @@ class Training:
         }
 
 
-def routes(folder: Path, body: Callable[[Request], Any], every: list[Training]) -> list[Route]:
+def routes(folder: Path, body: Body, every: list[Training]) -> list[Route]:
     """What starts, shows and stops trainings.
 
     Args:
@@ -156,7 +178,7 @@ def routes(folder: Path, body: Callable[[Request], Any], every: list[Training]) 
     ]
 
 
-def _words(asked: dict[str, Any]) -> list[str]:
+def _words(asked: Asked) -> list[str]:
     """The command, of checked words and numbers alone."""
     objective, updates = word(asked, "objective"), whole(asked, "updates", 1, 100_000)
     if objective not in OBJECTIVES:

@@ -1,41 +1,53 @@
 """Work arrives whole, whatever happens to workers, and leaves nobody behind."""
 
-import multiprocessing
+import contextlib
 import os
 import signal
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+import tasks as functions
 from cluster import Cluster, wait_for
 
 from excite import __version__
-from excite.study import workers as engine
+from excite.study import cluster as dask
+from excite.study import engine
+from excite.study.worker import Failure
 
 TESTS = Path(__file__).parent
-MIXED = "tasks:any_of_them"
 
 
 @pytest.fixture(autouse=True)
 def _tasks_are_importable(monkeypatch):
-    monkeypatch.setenv("PYTHONPATH", str(TESTS))
+    told = os.environ.get("PYTHONPATH", "")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, [str(TESTS), told])))
 
 
 @pytest.fixture(autouse=True)
 def _nobody_is_left():
     yield
-    # Two threads wait for a killed process; the one that lost may be here before the other has
-    # noted its end.
-    assert wait_for(lambda: not multiprocessing.active_children(), 1.0)
+    assert not workers_of(os.getpid())
+
+
+def workers_of(parent: int) -> list[int]:
+    """Worker processes that a process has started and not buried."""
+    found = []
+    for place in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):
+            of = int((place / "stat").read_text().rpartition(")")[2].split()[1])
+            if of == parent and b"excite.study.worker" in (place / "cmdline").read_bytes():
+                found.append(int(place.name))
+    return found
 
 
 def work(
-    target: str, tasks: dict[str, Any], where: engine.Engine, **options: Any
+    function: Callable[..., Any], tasks: dict[str, Any], where: engine.Engine, **options: Any
 ) -> tuple[dict[str, Any], dict[str, str]]:
     results = {}
 
@@ -43,7 +55,7 @@ def work(
         assert name not in results
         results[name] = result
 
-    failures = engine.run(target, tasks, where, on_done=on_done, **options)
+    failures = engine.run(function, tasks, where, on_done=on_done, **options)
     return results, sentences(failures)
 
 
@@ -66,22 +78,24 @@ def is_alive(pid: int) -> bool:
 
 def test_importing_the_engine_loads_no_jax():
     code = (
-        "import sys, excite.study.workers; print(*{'jax', 'torch', 'equinox'} & set(sys.modules))"
+        "import sys, excite.study.engine; "
+        "print(*{'jax', 'torch', 'equinox', 'distributed'} & set(sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == ""
 
 
 def test_another_version_is_refused():
-    with pytest.raises(ValueError, match=rf"runs excite {__version__}.*started by 0\.0\.0"):
-        engine.call("tasks:add", "0.0.0", {"a": 1, "b": 2})
+    answer = dask.call("tasks:add", "0.0.0", {"a": 1, "b": 2})
+    sentence = f"the worker runs excite {__version__}, the study was started by 0.0.0"
+    assert answer == Failure(sentence, is_mistake=True)
 
 
 def test_no_tasks_open_no_engine():
-    def never() -> Any:
+    def never(num_tasks: int) -> Any:
         raise RuntimeError
 
-    assert work("tasks:add", {}, never) == ({}, {})
+    assert work(functions.add, {}, never) == ({}, {})
 
 
 def test_less_than_one_worker_is_refused():
@@ -90,9 +104,9 @@ def test_less_than_one_worker_is_refused():
 
 
 def test_without_dask_the_extra_is_named(monkeypatch):
-    monkeypatch.setattr(engine, "distributed", None)
+    monkeypatch.setattr(dask, "distributed", None)
     with pytest.raises(ValueError, match=r"pip install 'excite\[dask\]'"):
-        engine.dask_engine("tcp://127.0.0.1:8786")
+        dask.dask_engine("tcp://127.0.0.1:8786")
 
 
 @pytest.mark.parametrize(
@@ -105,7 +119,7 @@ def test_without_dask_the_extra_is_named(monkeypatch):
 def test_a_malformed_address_is_refused(address):
     pytest.importorskip("distributed")
     with pytest.raises(ValueError, match="no address of a scheduler"):
-        engine.dask_engine(address)
+        dask.dask_engine(address)
 
 
 # ------------------------------------------------------------------- processes here
@@ -119,11 +133,11 @@ def test_results_arrive_and_what_fails_is_tried_again(tmp_path):
     tasks = {f"sum {i}": {"function": "add", "a": i, "b": 1} for i in range(5)}
     tasks |= {"once": failing("os", 1), "always": failing("os", 99), "two": failing("two", 99)}
     tasks |= {"value": failing("value", 99), "exit": failing("exit", 1)}
-    results, failures = work(MIXED, tasks, engine.local_engine(2))
+    results, failures = work(functions.any_of_them, tasks, engine.local_engine(2))
     assert results == {f"sum {i}": i + 1 for i in range(5)} | {"once": "mended", "exit": "mended"}
     assert failures == {
         "always": "OSError: a disk is full",
-        "two": "RuntimeError: NeedsTwoError: does not travel",
+        "two": "NeedsTwoError: does not travel",
         "value": "mistake: a user's mistake",
     }
     assert {p.name: len(p.read_text().splitlines()) for p in tmp_path.iterdir()} == {
@@ -141,7 +155,7 @@ def test_workers_that_die_take_nobody_along(tmp_path):
     for i in range(4):
         marker = str(tmp_path / f"sum{i}")
         tasks[f"sum {i}"] = {"function": "add", "a": i, "b": 1, "marker": marker, "seconds": 0.5}
-    results, failures = work(MIXED, tasks, engine.local_engine(2))
+    results, failures = work(functions.any_of_them, tasks, engine.local_engine(2))
     assert results == {"once": 3} | {f"sum {i}": i + 1 for i in range(4)}
     assert failures == {"always": "its worker died 3 times"}
     for i in range(4):  # not even a task that ran beside one that died is done again
@@ -153,7 +167,7 @@ def test_the_environment_is_set_before_anything_is_imported(monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", told)
     monkeypatch.delenv("NPROC", raising=False)
     before = os.environ.copy()
-    results, failures = work("tasks:environment", {"e": {}}, engine.local_engine(1))
+    results, failures = work(functions.environment, {"e": {}}, engine.local_engine(1))
     assert not failures
     expected = {
         "OMP_NUM_THREADS": "1",
@@ -172,7 +186,7 @@ def test_the_environment_is_set_before_anything_is_imported(monkeypatch):
 
 def test_openblas_of_a_worker_has_one_thread():
     """Dask imports NumPy before a worker is told anything: what it inherits has to do."""
-    there, _ = work("tasks:num_blas_threads", {"t": {}}, engine.local_engine(1))
+    there, _ = work(functions.num_blas_threads, {"t": {}}, engine.local_engine(1))
     assert there == {"t": 1}
 
 
@@ -186,7 +200,7 @@ def test_ctrl_c_ends_the_workers_at_once(tmp_path):
 
     tasks = {m.name: {"marker": str(m)} for m in markers}
     with pytest.raises(KeyboardInterrupt):
-        work("tasks:hang", tasks, engine.local_engine(2), on_tick=interrupt)
+        work(functions.hang, tasks, engine.local_engine(2), on_tick=interrupt)
     pids = [int(m.read_text()) for m in markers]
     assert wait_for(lambda: not any(map(is_alive, pids)), 1.0)
 
@@ -200,7 +214,7 @@ def test_an_error_of_on_done_ends_the_workers_and_is_told(tmp_path):
     tasks: dict[str, Any] = {"hang": {"function": "hang", "marker": str(marker)}}
     tasks["sum"] = {"function": "add", "a": 1, "b": 1}
     with pytest.raises(OSError, match="disk full"):
-        engine.run(MIXED, tasks, engine.local_engine(2), on_done=on_done)
+        engine.run(functions.any_of_them, tasks, engine.local_engine(2), on_done=on_done)
     assert wait_for(lambda: not is_alive(int(marker.read_text())), 1.0)
 
 
@@ -208,8 +222,8 @@ def test_a_killed_driver_leaves_no_worker(tmp_path):
     markers = [tmp_path / str(i) for i in range(2)]
     tasks = {m.name: {"marker": str(m)} for m in markers}
     code = (
-        "from excite import engine\n"
-        f"engine.run('tasks:hang', {tasks}, engine.local_engine(2), on_done=print)"
+        "import tasks\nfrom excite.study import engine\n"
+        f"engine.run(tasks.hang, {tasks}, engine.local_engine(2), on_done=print)"
     )
     driver = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL)
     try:
@@ -247,11 +261,11 @@ def test_a_cluster_that_loses_a_worker_gives_what_the_local_engine_gives(cluster
         if len(results) == 8:
             cluster.kill(1)
 
-    where = engine.dask_engine(cluster.address)
-    failures = sentences(engine.run(MIXED, tasks, where, on_done=on_done))
+    where = dask.dask_engine(cluster.address)
+    failures = sentences(engine.run(functions.any_of_them, tasks, where, on_done=on_done))
     for kind in ("os", "two", "value"):
         (tmp_path / kind).unlink()
-    assert (results, failures) == work(MIXED, tasks, engine.local_engine(2))
+    assert (results, failures) == work(functions.any_of_them, tasks, engine.local_engine(2))
     assert results == {f"{i}": i + 1 for i in range(24)} | {"os": "mended", "two": "mended"}
     assert failures == {"value": "mistake: a user's mistake"}
 
@@ -259,8 +273,8 @@ def test_a_cluster_that_loses_a_worker_gives_what_the_local_engine_gives(cluster
 def test_a_task_that_kills_the_workers_of_a_cluster_is_given_up(cluster):
     tasks: dict[str, Any] = {"always": {"function": "die"}}
     tasks |= {f"{i}": {"function": "add", "a": i, "b": 1, "seconds": 0.1} for i in range(9)}
-    where = engine.dask_engine(cluster.address)
-    results, failures = work(MIXED, tasks, where, num_tries=2)
+    where = dask.dask_engine(cluster.address)
+    results, failures = work(functions.any_of_them, tasks, where, num_tries=2)
     assert results == {f"{i}": i + 1 for i in range(9)}
     assert failures == {"always": "its worker died 2 times"}
 
@@ -277,17 +291,17 @@ def test_ctrl_c_calls_back_what_waits_on_a_cluster_and_a_lost_one_is_told(
 
     marker = tmp_path / "called"
     task = {"a": 1, "b": 1, "marker": str(marker), "seconds": 0.4}
-    where = engine.dask_engine(cluster.address)
+    where = dask.dask_engine(cluster.address)
     with pytest.raises(KeyboardInterrupt):
-        work("tasks:add", {f"{i}": task for i in range(40)}, where, on_tick=stop)
+        work(functions.add, {f"{i}": task for i in range(40)}, where, on_tick=stop)
     time.sleep(0.5)
     num_calls = len(marker.read_text().splitlines())
     time.sleep(1)
     assert len(marker.read_text().splitlines()) == num_calls < 20
 
-    monkeypatch.setattr(engine, "CONNECT_TIMEOUT", 1.0)
+    monkeypatch.setattr(dask, "CONNECT_TIMEOUT", 1.0)
     with pytest.raises(ValueError, match="no Dask scheduler answers"):
-        engine.run("tasks:add", {f"{i}": task for i in range(40)}, where, on_done=lose)
+        engine.run(functions.add, {f"{i}": task for i in range(40)}, where, on_done=lose)
 
 
 def test_a_cluster_without_workers_is_waited_for_and_that_is_told(tmp_path):
@@ -299,8 +313,8 @@ def test_a_cluster_without_workers_is_waited_for_and_that_is_told(tmp_path):
         cluster.start_worker()
 
     try:
-        where = engine.dask_engine(cluster.address, on_wait)
-        assert work("tasks:add", {"sum": {"a": 1, "b": 2}}, where) == ({"sum": 3}, {})
+        where = dask.dask_engine(cluster.address, on_wait)
+        assert work(functions.add, {"sum": {"a": 1, "b": 2}}, where) == ({"sum": 3}, {})
     finally:
         cluster.close()
     assert told == ["waiting"]
@@ -310,8 +324,9 @@ def test_a_cluster_without_workers_is_waited_for_and_that_is_told(tmp_path):
 def test_a_scheduler_that_does_not_answer_is_one_sentence(is_silent):
     pytest.importorskip("distributed")
     code = (
-        "import sys\nfrom excite import engine\nengine.CONNECT_TIMEOUT = 1.0\n"
-        "try:\n    engine.run('a:b', {'t': {}}, engine.dask_engine(sys.argv[1]), on_done=print)\n"
+        "import sys\nfrom excite.study import cluster, engine\ncluster.CONNECT_TIMEOUT = 1.0\n"
+        "try:\n    where = cluster.dask_engine(sys.argv[1])\n"
+        "    engine.run(print, {'t': {}}, where, on_done=print)\n"
         "except ValueError as error:\n    print(error)"
     )
     with socket.create_server(("127.0.0.1", 0)) as server:

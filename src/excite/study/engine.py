@@ -1,0 +1,199 @@
+"""How the tasks of a study are done: by processes of this computer, or by a Dask cluster.
+
+A task is a function of a module and plain data; its result is plain data, too. What fails is
+tried again, unless it is the user's mistake.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from functools import partial
+from pathlib import Path
+from typing import Protocol
+
+from .worker import Ending, Failure, Message
+from .workers import Workers
+
+TICK = 1.0
+"""Seconds between two calls of `on_tick`."""
+
+
+class Executor(Protocol):
+    """What runs tasks."""
+
+    def num_slots(self) -> int:
+        """How many tasks it takes at a time."""
+        ...
+
+    def is_lost(self) -> bool:
+        """Whether it has forgotten its tasks, and another has to be opened."""
+        ...
+
+    def submit(self, target: str, arguments: Mapping[str, object]) -> Future[Ending]:
+        """Hands a call over; cancelled where the executor is lost."""
+        ...
+
+    def close(self, is_done: bool) -> None:
+        """Ends it, and the tasks that it still has where not `is_done`."""
+        ...
+
+
+Engine = Callable[[int], Executor]
+"""Opens an executor for so many tasks."""
+
+
+def local_engine(num_workers: int, cache: Path | None = None) -> Engine:
+    """As many processes on this computer.
+
+    Args:
+        cache: where they keep compiled programs.
+
+    Raises:
+        ValueError: for less than one.
+    """
+    if num_workers < 1:
+        raise ValueError(f"{num_workers} workers can do no work; ask for at least one")
+    return partial(_Local, num_workers, cache)
+
+
+class _Local:
+    """The pool of this computer: a worker that dies takes only its own task along."""
+
+    def __init__(self, num_workers: int, cache: Path | None, num_tasks: int) -> None:
+        self._workers = Workers(min(num_workers, num_tasks), cache=cache)
+        self._workers.open()
+
+    def num_slots(self) -> int:
+        return self._workers.num_workers
+
+    def is_lost(self) -> bool:
+        return False
+
+    def submit(self, target: str, arguments: Mapping[str, object]) -> Future[Ending]:
+        future: Future[Ending] = Future()
+
+        def tell(message: Message) -> None:
+            if isinstance(message, Ending):
+                future.set_result(message)
+
+        self._workers.submit(target, arguments, tell)
+        return future
+
+    def close(self, is_done: bool) -> None:
+        del is_done  # its processes hold nothing that could be lost
+        self._workers.close()
+
+
+def run(
+    function: Callable[..., object],
+    tasks: Mapping[str, Mapping[str, object]],
+    engine: Engine,
+    *,
+    on_done: Callable[[str, object], object],
+    on_tick: Callable[[], object] = lambda: None,
+    num_tries: int = 3,
+) -> dict[str, Exception]:
+    """Calls a function once a task, with its arguments, and gives every result to `on_done`.
+
+    A task whose worker dies, or that raises, is tried again later; but for a ValueError,
+    which is a user's mistake and stays one. Where this function is left by an exception, by
+    one of `on_done` or `on_tick` for example, nothing of it runs on in this computer.
+
+    Args:
+        function: of a module, which the workers import.
+        tasks: keyword arguments by the name of the task: JSON-ready data or bytes.
+        on_done: takes the name of a task and its result, in the order in which they come.
+        on_tick: called about once a second.
+        num_tries: how often a task is tried in all.
+
+    Returns:
+        Why, by the name of each task that failed: ValueError is a mistake of the user's.
+
+    Raises:
+        ValueError: where the engine cannot be opened.
+    """
+    work = _Work(f"{function.__module__}:{function.__qualname__}", tasks, engine, num_tries)
+    next_tick = time.monotonic() + TICK
+    try:
+        while work.queue or work.running:
+            work.submit()
+            for name, result in work.finished(max(0.0, next_tick - time.monotonic())):
+                on_done(name, result)
+            if time.monotonic() >= next_tick:
+                on_tick()
+                next_tick = time.monotonic() + TICK
+        work.close(is_done=True)
+    except BaseException:
+        work.close(is_done=False)
+        raise
+    return work.failures
+
+
+class _Work:
+    """What is left of the tasks, and why some failed."""
+
+    def __init__(
+        self,
+        target: str,
+        tasks: Mapping[str, Mapping[str, object]],
+        engine: Engine,
+        num_tries: int,
+    ) -> None:
+        self.queue, self.running = deque(tasks), dict[Future[Ending], str]()
+        self.failures: dict[str, Exception] = {}
+        self._target, self._tasks, self._engine = target, tasks, engine
+        self._num_tries, self._tries, self._deaths = num_tries, Counter[str](), Counter[str]()
+        self._executor: Executor | None = None
+
+    def submit(self) -> None:
+        """Hands over what there is room for."""
+        if self._executor is not None and self._executor.is_lost():
+            self._lose()
+        if not self.queue:
+            return
+        if self._executor is None:
+            self._executor = self._engine(len(self.queue))
+        num_free = self._executor.num_slots() - len(self.running)
+        for _ in range(min(num_free, len(self.queue))):
+            name = self.queue.popleft()
+            self.running[self._executor.submit(self._target, self._tasks[name])] = name
+
+    def finished(self, seconds: float) -> Iterator[tuple[str, object]]:
+        """Names and results of what is finished, after the first or after so many seconds."""
+        done, _ = wait(self.running, seconds, FIRST_COMPLETED)
+        lost = {future for future in done if future.cancelled()}
+        for future in done - lost:
+            name, outcome = self.running.pop(future), future.result()
+            if isinstance(outcome, Failure):
+                self._note(name, outcome)
+            else:
+                yield name, outcome.value
+        if lost:  # we cancel nothing while we wait: it is the scheduler that has gone
+            self._lose()
+
+    def close(self, is_done: bool) -> None:
+        """Ends the executor; `submit` opens another."""
+        if self._executor is not None:
+            self._executor.close(is_done)
+        self._executor = None
+
+    def _lose(self) -> None:
+        self.close(is_done=False)
+        for name in self.running.values():
+            self._note(name, Failure("", num_deaths=1))
+        self.running.clear()
+
+    def _note(self, name: str, failure: Failure) -> None:
+        self._tries[name] += 1
+        self._deaths[name] += failure.num_deaths
+        if self._tries[name] < self._num_tries and not failure.is_mistake:
+            self.queue.append(name)
+        elif failure.num_deaths:
+            times = "once" if self._deaths[name] == 1 else f"{self._deaths[name]} times"
+            self.failures[name] = RuntimeError(f"its worker died {times}")
+        else:
+            kind = ValueError if failure.is_mistake else RuntimeError
+            self.failures[name] = kind(failure.sentence)
