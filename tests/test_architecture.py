@@ -4,6 +4,7 @@ Packages stand in one order, and a module imports only what stands above its own
 """
 
 import ast
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -53,8 +54,8 @@ DOORS = {
     "scipy.io": ["record/record"],
     "pydantic": ["study"],
     "tomlkit": ["study"],
-    "dask": ["study/workers"],
-    "distributed": ["study/workers"],
+    "dask": ["study/cluster"],
+    "distributed": ["study/cluster"],
     "onnx": ["policy/onnx"],
     "fmpy": ["rig/fmu"],
     "quanser": ["rig/quanser"],
@@ -82,6 +83,12 @@ WITHOUT_JAX = (
 )
 WORKERS = ("web/jobs",)
 """What runs in a worker of the page, and may load JAX there."""
+
+BY_NAME = {
+    "study/tasks": ["training/gradient", "training/ppo"],
+    "web/workers": ["web/jobs"],
+}
+"""Modules that are named in a string, for a worker to import them: edges all the same."""
 
 INHERITED = {"derivative", "output", "from_transfer_function"}  # documented by the contract
 
@@ -120,6 +127,11 @@ def inner_imports(module: str) -> frozenset[str]:
                 assert target is not None, f"{module}: nothing behind {base}"
                 found.add(target)
     return frozenset(found)
+
+
+def edges(module: str) -> set[str]:
+    """Modules that a module imports, or names for a worker to import."""
+    return {*inner_imports(module), *BY_NAME.get(module, [])}
 
 
 def outer_imports(module: str) -> Iterator[str]:
@@ -173,7 +185,7 @@ def test_every_room_has_its_place_in_the_order():
 @modules
 def test_a_module_imports_only_rooms_left_of_its_own(module):
     own = room_of(module)
-    for target in inner_imports(module):
+    for target in edges(module):
         if room_of(target) == own:
             assert "/" in module, f"{module} imports {target} of its own cell"
         else:
@@ -182,13 +194,23 @@ def test_a_module_imports_only_rooms_left_of_its_own(module):
 
 @modules
 def test_no_module_imports_itself_in_a_circle(module):
-    seen, waiting = set(), list(inner_imports(module))
+    seen, waiting = set(), list(edges(module))
     while waiting:
         current = waiting.pop()
         if current not in seen:
             seen.add(current)
-            waiting.extend(inner_imports(current))
+            waiting.extend(edges(current))
     assert module not in seen
+
+
+@modules
+def test_modules_in_strings_are_known(module):
+    """A name that is imported while the program runs hides an edge from the other tests."""
+    strings = [n.value for n in ast.walk(tree_of(module)) if isinstance(n, ast.Constant)]
+    words = [w for w in strings if isinstance(w, str) and re.fullmatch(r"excite(\.\w+)+[.:]?", w)]
+    named = {word.rstrip(".:").removeprefix("excite.").replace(".", "/") for word in words}
+    places = BY_NAME.get(module, [])
+    assert [n for n in named if resolved(n) and not any(belongs(p, (n,)) for p in places)] == []
 
 
 @modules

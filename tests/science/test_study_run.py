@@ -19,6 +19,7 @@ from cluster import Cluster, wait_for
 from excite.cli.study import _require_trainer
 from excite.policy import read_policy
 from excite.study import table
+from excite.study.engine import local_engine
 from excite.study.folder import seed_folder, study_of
 from excite.study.run import _live, opened, run_study
 from excite.study.spec import read_study, study_from
@@ -29,7 +30,6 @@ from excite.study.table import (
     learning_curves,
     study_table,
 )
-from excite.study.workers import local_engine
 
 TINY = """
 name = "tiny"
