@@ -662,7 +662,7 @@ BAD: dict[str, tuple[str, tuple[str, ...]]] = {
     "text": (IDENTIFY.format("text.csv"), ("text.csv", "sample 5", "'on'", "number")),
     "uneven sampling": (IDENTIFY.format("uneven.csv"), ("uneven.csv", "0.13 s", "0.1 s")),
     "samples left out": (IDENTIFY.format("gap.csv"), ("gap.csv", "missing", "0.4 s")),
-    "wrong unit": (IDENTIFY.format("unit.csv"), ("unit.csv", "-24 to 24", "--scale voltage")),
+    "wrong unit": (IDENTIFY.format("unit.csv"), ("unit.csv", "-24 to 24", "voltage=FACTOR")),
     "too short": (IDENTIFY.format("short.csv"), ("short.csv", "8 samples", "15 or more")),
     "nothing to see": (IDENTIFY.format("rest.csv"), ("no parameter can be seen",)),
     "no response": (IDENTIFY.format("silent.csv"), ("no parameter can be seen",)),

@@ -156,10 +156,12 @@ def test_a_run_is_stopped(address: str, page: Page):
 
 def test_a_value_that_is_not_allowed_is_one_sentence(address: str, page: Page):
     ready(page, address)
+    page.evaluate("document.getElementById('signals').append(document.createElement('canvas'))")
     page.locator("#params input").first.fill("-1")
     page.get_by_role("button", name="Run", exact=True).click()
     expect(status(page)).to_contain_text("is not allowed", timeout=WAIT)
     expect(status(page)).to_have_class(re.compile("bad"))
+    assert page.locator("#signals canvas").count() == 0  # nothing of the run before
 
 
 def test_it_is_used_by_the_keyboard_alone(address: str, page: Page):
@@ -198,7 +200,8 @@ def test_the_header_is_skipped_to_the_part_that_is_shown(address: str, page: Pag
 def test_columns_are_chosen_before_anything_is_identified(address: str, page: Page):
     page.goto(f"{address}/#record")
     expect(page.locator("#record-plant option").first).to_be_attached(timeout=WAIT)
-    content = b"t,u,y\n" + b"".join(b"%g,1,%g\n" % (0.1 * k, 0.01 * k) for k in range(60))
+    rows = (b"20,%g,1,%g\n" % (0.1 * k, 0.01 * k) for k in range(60))
+    content = b"Temperature,t,u,y\n" + b"".join(rows)
     log: Any = {"name": "log.csv", "mimeType": "", "buffer": content}
     carried = page.evaluate_handle(
         """(text) => {
@@ -209,7 +212,7 @@ def test_columns_are_chosen_before_anything_is_identified(address: str, page: Pa
         content.decode(),
     )
     page.locator("#record .drop").dispatch_event("drop", {"dataTransfer": carried})
-    expect(status(page, "record")).to_contain_text("3 columns, 60 samples", timeout=WAIT)
+    expect(status(page, "record")).to_contain_text("4 columns, 60 samples", timeout=WAIT)
     identify = page.get_by_role("button", name="Identify")
     for name, column in (("time", "t"), ("voltage", ""), ("pitch", "")):
         expect(page.locator(f"#column-{name}")).to_have_value(column)
@@ -225,7 +228,7 @@ def test_columns_are_chosen_before_anything_is_identified(address: str, page: Pa
     identify.click()
     other: Any = {**log, "name": "other.csv"}
     page.locator("#file").set_input_files(other)
-    expect(status(page, "record")).to_contain_text("other.csv: 3 columns", timeout=WAIT)
+    expect(status(page, "record")).to_contain_text("other.csv: 4 columns", timeout=WAIT)
     page.locator("#column-voltage").select_option("u")
     page.locator("#column-pitch").select_option("y")
     expect(identify).to_be_disabled()

@@ -68,6 +68,6 @@ def check_size(values: np.ndarray, part: Input | Output, path: Path) -> None:
     if excess > allowed:
         raise ValueError(
             f"{path}: {part.name!r} reaches {worst:g} {part.unit}, {expected}; "
-            f"is it in another unit? Give a factor (--scale {part.name}=FACTOR; 1 says that the "
-            "unit is right)"
+            f"is it in another unit? Give a scale, {part.name}=FACTOR (1 says that the unit is "
+            "right)"
         )

@@ -74,8 +74,8 @@ def read_record(
     if dt > TIMES_DT * description.dt and scales.get("time") != 1:
         raise ValueError(
             f"{path}: sampled every {dt:g} s, where {description.name!r} is every "
-            f"{description.dt:g} s; is 'time' in another unit? Give a factor (--scale "
-            "time=FACTOR; 1 says that the unit is right)"
+            f"{description.dt:g} s; is 'time' in another unit? Give a scale, "
+            "time=FACTOR (1 says that the unit is right)"
         )
     parts = {part.name: read(part.name) for part in quantities}
     for part in quantities:

@@ -58,7 +58,7 @@ function chooseExcitation() {
   const name = at("excitation").value, input = plant.inputs[0], isSignal = !name.startsWith("loop-") && !(name in plant.policies);
   const half = (input.upper - input.lower) / 2;
   Object.assign(at("amplitude"), { disabled: !isSignal, max: half, value: input.amplitude });
-  section.querySelector("label[for=amplitude] .unit").textContent = isSignal ? `${input.unit}, at most ${half}` : "its own";
+  section.querySelector("label[for=amplitude] .unit").textContent = isSignal ? `${input.unit}, at most ${half}` : "set by the excitation";
   const longest = plant.policies[name];
   at("steps").max = longest ?? 5000;
   if (longest && +at("steps").value > longest) at("steps").value = longest;
@@ -93,15 +93,16 @@ function asked() {
 }
 
 const waiting = (live) => (live.found.length ? "Estimating and comparing…"
-  : "Compiling the estimator for this plant and length, which takes a while, once…");
+  : "Compiling the estimator for this plant and length; only the first run waits for this…");
 
 function run() {
   const wanted = asked();
   let live = null, rows = [];
   at("outcome").hidden = true;
+  for (const plots of ["signals", "estimates"]) at(plots).replaceChildren(); // of the run before
   say(form, "Waiting for a worker…");
   task.run("api/experiments", wanted, (event) => {
-    if (event.kind === "started") say(form, "Preparing; a plant, length or excitation met for the first time takes up to half a minute…");
+    if (event.kind === "started") say(form, "Preparing. The first run with a plant, a length or an excitation compiles programs, which can take a minute or two…");
     else if (event.kind === "plan") live = new Live(event);
     else if (event.kind === "samples") {
       live.samples(event);
@@ -126,8 +127,6 @@ class Live {
     this.end = (plan.num_samples - 1) * plan.plant.dt;
     if (matchMedia("(max-width: 60rem)").matches) section.querySelector(".view").scrollIntoView();
     if (plan.warning) say(form, plan.warning, true);
-    at("signals").replaceChildren();
-    at("estimates").replaceChildren();
     const title = (part) => el("span", {}, part.name, " ", el("span", { class: "unit" }, part.shown_unit));
     const from = (name) => el("span", {}, symbol(name), " ", el("span", { class: "unit" }, "% from the true value"));
     this.plots = [...plan.plant.inputs, ...plan.plant.outputs].map((part) =>

@@ -53,13 +53,13 @@ function showMapping() {
   at("mapping").hidden = false;
   at("mapping").querySelector("div").replaceChildren(...needed().map((name) => {
     const select = el("select", { id: `column-${name}` });
-    const likely = found(name) ?? (name === "time" ? there.find((c) => /^t/i.test(c)) : undefined);
+    const likely = found(name) ?? (name === "time" ? there.find((c) => /^(t|time|timestamps?)(?![a-z])/i.test(c)) : undefined);
     options(select, there, likely);
     if (likely === undefined) select.prepend(el("option", { value: "", selected: true }, "choose…"));
     select.addEventListener("change", () => task.refresh());
     return el("div", { class: "map" },
       el("div", { class: "field" }, el("label", { for: select.id }, `${name} `, el("span", { class: "unit" }, unitOf(name))), select),
-      el("div", { class: "field" }, el("label", { for: `scale-${name}` }, "factor"),
+      el("div", { class: "field" }, el("label", { for: `scale-${name}` }, "scale"),
         el("input", { id: `scale-${name}`, type: "number", step: "any", placeholder: "none" })));
   }));
   task.refresh();

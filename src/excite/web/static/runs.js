@@ -38,7 +38,7 @@ async function show(run, button) {
     const link = (file) => download(address(file), file), isPolicy = (file) => file.endsWith(".safetensors");
     const policies = content.files.filter(isPolicy), others = content.files.filter((file) => !isPolicy(file));
     const report = content.is_finished ? [download(`api/run/report.html?name=${name}`, "Report")] : [];
-    if (!content.is_finished) card.append(el("p", {}, "Not finished. Typed where it was begun, this goes on with it: ", el("code", {}, content.command || "the same command")));
+    if (!content.is_finished) card.append(el("p", {}, "Not finished. To resume, rerun the command in the folder where it was started: ", el("code", {}, content.command || "the same command")));
     card.append(el("p", { class: "row downloads" }, ...report, ...others.map(link)));
     if (policies.length) card.append(el("details", { open: policies.length < 4 }, el("summary", {}, `Policies (${policies.length})`), el("p", { class: "row downloads" }, ...policies.map(link))));
     view.replaceChildren(card);
