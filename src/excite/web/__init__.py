@@ -17,7 +17,7 @@ import tempfile
 from collections.abc import AsyncIterator, Callable, Generator
 from functools import partial
 from pathlib import Path
-from typing import Any
+from urllib.parse import quote
 
 import uvicorn
 from starlette.applications import Starlette
@@ -32,14 +32,14 @@ from .places import routes as place_routes
 from .requests import MAX_BODY, RefusedError
 from .runs import routes as run_routes
 from .runs import run_of
-from .security import Guard, is_loopback
+from .security import Guard
 from .sessions import PageSettings, Sessions
 from .streams import routes as stream_routes
 from .trainings import Training
 from .trainings import routes as training_routes
 from .workers import Workers
 
-__all__ = ["PageSettings", "application", "is_loopback", "serve"]
+__all__ = ["PageSettings", "address_of", "application", "listening_at", "serve"]
 
 _STATIC = Path(__file__).with_name("static")
 
@@ -89,9 +89,11 @@ def application(
         Mount("/static", StaticFiles(directory=_STATIC)),
     ]
     guard = Middleware(Guard, settings=settings, sessions=Sessions(scratch))
-    handlers: Any = {RefusedError: _refused}
     return Starlette(
-        routes=routes, middleware=[guard], exception_handlers=handlers, lifespan=lifespan
+        routes=routes,
+        middleware=[guard],
+        exception_handlers={RefusedError: _refused},
+        lifespan=lifespan,
     )
 
 
@@ -122,17 +124,27 @@ async def _body(request: Request) -> dict[str, object]:
     return asked
 
 
-def _refused(request: Request, error: RefusedError) -> JSONResponse:
+def _refused(request: Request, error: Exception) -> JSONResponse:
     del request
+    if not isinstance(error, RefusedError):
+        raise error
     return JSONResponse({"sentence": error.sentence}, error.status)
 
 
 class _Server(uvicorn.Server):
     """A server that a signal ends; what computes ends first, so that no request waits for it."""
 
-    def __init__(self, config: uvicorn.Config, came: list[int]) -> None:
-        super().__init__(config)
-        self._came = came
+    def __init__(self, app: Starlette, came: list[int]) -> None:
+        super().__init__(
+            uvicorn.Config(
+                app,
+                log_level="error",
+                server_header=False,
+                proxy_headers=False,
+                timeout_graceful_shutdown=1,
+            )
+        )
+        self._app, self._came = app, came
 
     @contextlib.contextmanager
     def capture_signals(self) -> Generator[None]:
@@ -145,8 +157,7 @@ class _Server(uvicorn.Server):
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Ends what computes, then what serves."""
-        app: Any = self.config.app
-        await app.state.end_work()
+        await self._app.state.end_work()
         await super().shutdown(sockets)
 
 
@@ -164,6 +175,40 @@ def _signals() -> Generator[list[int]]:
             signal.signal(kind, handler)
 
 
+def listening_at(host: str, port: int) -> socket.socket:
+    """A socket that listens; port 0 takes a free one.
+
+    Raises:
+        ValueError: where there can be none.
+    """
+    try:
+        [family, kind, _, _, address] = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+    except (socket.gaierror, UnicodeError):
+        raise ValueError(f"{host!r} is no address of this computer") from None
+    listening = socket.socket(family, kind)
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listening.bind(address)
+        listening.listen(128)
+    except OSError as error:
+        listening.close()
+        raise ValueError(
+            f"cannot listen at {host}, port {port} ({error.strerror}); is another page open, or "
+            "the address another computer's? (--port 0 takes a free port)"
+        ) from None
+    return listening
+
+
+def address_of(settings: PageSettings, listening: socket.socket) -> str:
+    """What a browser opens: the name of this computer where all its addresses are bound."""
+    host = settings.host
+    if host in ("0.0.0.0", "::"):
+        host = socket.gethostname().lower()
+    name = f"[{host}]" if ":" in host else host
+    token = f"#{quote(settings.token, safe='')}" if settings.token else ""
+    return f"http://{name}:{listening.getsockname()[1]}/{token}"
+
+
 def serve(settings: PageSettings, listening: socket.socket, ready: Callable[[], None]) -> int:
     """Serves until a signal comes, on a socket that is bound already; calls `ready` at its start.
 
@@ -172,13 +217,7 @@ def serve(settings: PageSettings, listening: socket.socket, ready: Callable[[], 
     """
     folder = partial(tempfile.TemporaryDirectory, ignore_cleanup_errors=True)
     with _signals() as came, folder(prefix="excite-bench-") as scratch:
-        config = uvicorn.Config(
-            application(settings, Path(scratch), ready),
-            log_level="error",
-            server_header=False,
-            proxy_headers=False,
-            timeout_graceful_shutdown=1,
-        )
-        _Server(config, came).run(sockets=[listening])
+        app = application(settings, Path(scratch), ready)
+        _Server(app, came).run(sockets=[listening])
     first = (came or [signal.SIGINT])[0]
     return 0 if first == signal.SIGINT else 128 + first

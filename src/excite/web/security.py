@@ -24,7 +24,7 @@ from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from .requests import Asked, RefusedError
-from .sessions import PageSettings, Session, Sessions
+from .sessions import PageSettings, Session, Sessions, is_loopback
 
 MAX_TRIES = 10
 """Wrong tokens in a minute, from one address."""
@@ -42,16 +42,6 @@ _HEADERS = {
     "cross-origin-resource-policy": "same-origin",
     "cache-control": "no-store",
 }
-
-
-def is_loopback(host: str) -> bool:
-    """Whether an address is of this computer alone."""
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 class Guard:

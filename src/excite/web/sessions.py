@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import ipaddress
 import secrets
 import shutil
 import tempfile
@@ -12,6 +13,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from ..study.workers import num_cores
 from .requests import RefusedError
 from .trainings import Training
 
@@ -41,6 +43,33 @@ class PageSettings:
     token: str | None = None
     num_workers: int = 2
     cache: Path | None = None
+
+    @classmethod
+    def of(
+        cls, runs: Path, host: str, token: str | None, workers: int | None, cache: Path
+    ) -> PageSettings:
+        """Checked; a token is drawn where other computers may come, and a worker a core, at most 4.
+
+        Raises:
+            ValueError: for a short token, or a run folder that does not exist.
+        """
+        if token is not None and len(token) < 8:
+            raise ValueError("a token needs eight characters or more")
+        if not runs.is_dir():
+            raise ValueError(f"{runs}: no such folder; --runs names the run folder to be shown")
+        if token is None and not is_loopback(host):
+            token = secrets.token_urlsafe(16)
+        return cls(runs.absolute(), host, token, workers or min(4, num_cores()), cache)
+
+
+def is_loopback(host: str) -> bool:
+    """Whether an address is of this computer alone."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 @dataclass
