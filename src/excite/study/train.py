@@ -9,12 +9,12 @@ from pathlib import Path
 from ..plant import AbstractARXPlant, AbstractPlant
 from ..policy import Policy, read_policy
 from ..training.checkpoint import Progress
+from .engine import local_engine
 from .folder import seed_folder
 from .objectives import decision_of, rewards_of
 from .run import run_study
 from .spec import Study, plant_tables, study_from
 from .table import best_seeds
-from .workers import local_engine
 
 
 def train(
