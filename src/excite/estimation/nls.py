@@ -11,17 +11,14 @@ the first samples pin the frequency down well enough for the next, longer part.
 
 from __future__ import annotations
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from ..description import names_of
-from ..information import marginal_information, relative_size, require_double_precision
-from ..plant import AbstractPlant, Params
+from ..information import marginal_information, relative_size
+from ..plant import AbstractPlant, Params, require_double_precision
 from .contract import (
     AbstractEstimator,
     Estimate,
@@ -32,6 +29,7 @@ from .contract import (
     simulate_experiments,
     to_search,
 )
+from .levenberg_marquardt import least_squares
 
 
 class NLS(AbstractEstimator):
@@ -113,17 +111,17 @@ class NLS(AbstractEstimator):
 
             # Relative to its size at the start, so that damping means the same for any data.
             size = jnp.maximum(jnp.linalg.norm(weighted(unknowns)), 1e-6) / boldness
-            solution = optx.least_squares(
-                lambda z, _: weighted(z) / size,
-                _solver(tolerance),
+            unknowns, converged = least_squares(
+                lambda z: (weighted(z) / size).ravel(),
                 unknowns,
-                max_steps=self.max_steps,
-                throw=False,
+                problem.experiments.measured.size,
+                tolerance,
+                self.max_steps,
             )
             if problem.num_outputs > 1:
                 complete = horizon >= samples
-                sd = jnp.where(complete, problem.noise_sd(problem.residual(solution.value)), sd)
-            return (solution.value, sd), solution.result == optx.RESULTS.successful
+                sd = jnp.where(complete, problem.noise_sd(problem.residual(unknowns)), sd)
+            return (unknowns, sd), converged
 
         start = problem.with_initial_state(problem.experiments.initial_state), problem.assumed_sd
         (unknowns, _), converged = jax.lax.scan(search, start, stages)
@@ -145,13 +143,6 @@ def _stages(nls: NLS, samples: int, reweighted: bool) -> tuple[Array, Array, Arr
         horizons, tolerances = [*horizons, horizons[-1]], [*tolerances, nls.tolerance]
         boldness = [*boldness, boldness[-1]]
     return jnp.asarray(horizons), jnp.asarray(tolerances), jnp.asarray(boldness)
-
-
-def _solver(tolerance: Any) -> optx.LevenbergMarquardt:
-    """Levenberg-Marquardt whose damping also falls after steps that were merely good."""
-    solver = optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
-    search = optx.ClassicalTrustRegion(high_cutoff=0.75)
-    return eqx.tree_at(lambda s: s.search, solver, search)
 
 
 class _Problem(eqx.Module):
