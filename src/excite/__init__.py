@@ -1,37 +1,88 @@
 """Safe, informative experiments for mechatronic systems, and the parameters they identify.
 
-The floor plan, from left to right; a module imports only what stands left of it:
+    >>> import excite as ex
+    >>> record = ex.simulate("aero2", "chirp", seed=0)
+    >>> result = ex.identify(record)
+    >>> result.status
+    'successful'
 
-    description    what a plant is, as plain data, and its hash
-    files          files and run folders, written whole or not at all
-    policy         a network and its contract, run by NumPy or JAX, in one file
-    records        experiment files
-    safety         warning and critical level of an output, penalty, a supervisor's rules
-    plant          the contract of a plant, and the plants that are shipped
-    excitation     signals laid down beforehand; a position loop, a policy
-    simulation     `simulate` (noise-free) and `run_episode` (closed loop, sensor noise)
-    information    sensitivities, Fisher information, Cramér-Rao bound
-    estimation     recursive least squares, nonlinear least squares, logarithmic decrement
-    evaluation     how anything is scored: many experiments, each on a plant of its own
-    objective      what an experiment is worth: the error of the estimate, or the information
-    env            the decision process: reset and step, one plant or a batch
-    gymnasium_env  the same with a Gymnasium face
-    training       policies by PPO, or by the gradient of the whole experiment
-    names          the words of the command line and what they stand for
-    design         robust and clairvoyant signals by gradient, classical ones tuned
-    study          every choice of a comparison and of its agents, read from a TOML file
-    engine         processes of this computer, or a Dask cluster
-    rig            experiments in real time: contract, loop, record; simulated and real rigs
-    identification from recorded experiments to parameters with confidence
-    benchmark      methods and agents x estimators on common plants and noise
-    report         records to tables, figures and pages
-    export         a policy as ONNX, for other tools
-    live           what the bench page asks for, told event by event
-    cli            the command line
-    web            the bench page: server, workers, and what a browser may ask for
-    policies       policies that are shipped, as data
-
-This file imports nothing, so that `import excite` costs nothing.
+Every verb takes names or objects, and what it returns shows itself. Verbs and nouns are loaded
+when they are first used: `import excite` alone costs nothing, and loads neither JAX nor NumPy.
+The package computes in double precision, which it switches on when a plant is first used.
 """
 
+from importlib import import_module
+from typing import TYPE_CHECKING
+
 __version__ = "0.1.0"
+
+_PLACES = {
+    # verbs
+    "simulate": "simulation",
+    "information": "information",
+    "identify": "estimation.identify",
+    "design": "training.design",
+    "evaluate": "study.evaluate",
+    # nouns
+    "Record": "record.record",
+    "read_record": "record.read",
+    "PlantDescription": "description",
+    "State": "description",
+    "Input": "description",
+    "Output": "description",
+    "Parameter": "description",
+    "Constant": "description",
+    "AbstractPlant": "plant.contract",
+    "Policy": "policy.contract",
+    "read_policy": "policy.file",
+    "Study": "study.spec",
+    "read_study": "study.spec",
+    "Identification": "estimation.result",
+    # what there is
+    "plants": "plant.catalogue",
+    "excitations": "excitation.catalogue",
+    "policies": "policy.file",
+    "estimators": "estimation.catalogue",
+    "studies": "study.catalogue",
+}
+"""The module behind each name."""
+
+__all__ = ["__version__", *_PLACES]  # pyright: ignore[reportUnsupportedDunderAll]
+
+
+def __getattr__(name: str) -> object:
+    if name not in _PLACES:
+        raise AttributeError(f"module 'excite' has no attribute {name!r}")
+    found = globals()[name] = getattr(import_module(f".{_PLACES[name]}", __name__), name)
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)
+
+
+if TYPE_CHECKING:
+    from .description import Constant as Constant
+    from .description import Input as Input
+    from .description import Output as Output
+    from .description import Parameter as Parameter
+    from .description import PlantDescription as PlantDescription
+    from .description import State as State
+    from .estimation.catalogue import estimators as estimators
+    from .estimation.identify import identify as identify
+    from .estimation.result import Identification as Identification
+    from .excitation.catalogue import excitations as excitations
+    from .information import information as information
+    from .plant.catalogue import plants as plants
+    from .plant.contract import AbstractPlant as AbstractPlant
+    from .policy.contract import Policy as Policy
+    from .policy.file import policies as policies
+    from .policy.file import read_policy as read_policy
+    from .record.read import read_record as read_record
+    from .record.record import Record as Record
+    from .simulation import simulate as simulate
+    from .study.catalogue import studies as studies
+    from .study.evaluate import evaluate as evaluate
+    from .study.spec import Study as Study
+    from .study.spec import read_study as read_study
+    from .training.design import design as design

@@ -4,18 +4,24 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ..description import Listing
 from .contract import Policy
 
 POLICY_ENDING = ".safetensors"
 SHIPPED = Path(__file__).parent / "shipped"
 
 
-def read_policy(path: Path) -> Policy:
-    """The policy in a file.
+def read_policy(path: str | Path) -> Policy:
+    """The policy in a file, or a shipped policy by its name.
+
+        >>> import excite as ex
+        >>> ex.read_policy("aero2").layout.num_steps
+        500
 
     Raises:
         ValueError: one sentence for a file that cannot be read or is no sound policy.
     """
+    path = policy_path(str(path)) or Path(path)
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -26,6 +32,17 @@ def read_policy(path: Path) -> Policy:
 def shipped_policies() -> dict[str, Path]:
     """Policies that come with the package, by name; a plant's default has the plant's name."""
     return {path.stem: path for path in sorted(SHIPPED.glob(f"*{POLICY_ENDING}"))}
+
+
+def policies() -> Listing:
+    """The policies that come with the package, by name.
+
+    >>> import excite as ex
+    >>> ex.policies()["aero2"]
+    'for aero2, 500 steps'
+    """
+    read = {name: read_policy(path) for name, path in shipped_policies().items()}
+    return Listing({n: f"for {p.plant.name}, {p.layout.num_steps} steps" for n, p in read.items()})
 
 
 def policy_path(name: str) -> Path | None:

@@ -10,7 +10,12 @@ SHIPPED = Path(__file__).parent / "shipped"
 
 
 def studies() -> dict[str, Path]:
-    """The study files that come with the package, by name."""
+    """The study files that come with the package, by name.
+
+    >>> import excite as ex
+    >>> "table1" in ex.studies()
+    True
+    """
     return {path.stem: path for path in sorted(SHIPPED.glob("*.toml"))}
 
 

@@ -30,6 +30,9 @@ def evaluate(
 ) -> tuple[Study, list[dict[str, object]]]:
     """Scores a policy on plants drawn at random.
 
+        >>> import excite as ex
+        >>> result = ex.evaluate("aero2", episodes=4)
+
     Args:
         policy: the name of a shipped one, a file, or the policy.
         plant: its name, `path/to/file.py:ClassName`, the plant or its class; default the

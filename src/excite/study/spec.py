@@ -29,6 +29,7 @@ from ..record.read import SIGNAL_ENDINGS
 from ..training.gradient import GradientSettings
 from ..training.settings import PPOSettings
 from .agent import REWARD_TABLES, Agent, AgentSettings, DecisionSettings
+from .catalogue import study_path
 from .settings import Choice, Count, EstimatorSettings, Magnitude, Settings, checked, sentence
 
 
@@ -87,6 +88,10 @@ class ReferenceRow(Settings):
 
 class Study(Settings):
     """Methods x estimators over common plants and noise.
+
+        >>> import excite as ex
+        >>> ex.read_study("table1").episodes
+        100
 
     Attributes:
         name, title: a word, and a line for tables.
@@ -283,13 +288,18 @@ _TABLES = {
 }
 
 
-def read_study(path: Path) -> Study:
-    """The study in a TOML file, checked down to every option of every method.
+def read_study(path: str | Path) -> Study:
+    """The study in a TOML file or of a shipped name, checked down to every option.
+
+        >>> import excite as ex
+        >>> ex.read_study("baselines").plant
+        'aero2'
 
     Raises:
         ValueError: one sentence for a file that cannot be read, a key that does not
             exist (with the nearest that does), or a value that is not allowed.
     """
+    path = study_path(path)
     try:
         content = tomlkit.parse(path.read_text(encoding="utf-8")).unwrap()
     except (OSError, UnicodeDecodeError) as error:

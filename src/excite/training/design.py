@@ -24,7 +24,7 @@ from ..excitation import Replay
 from ..excitation.catalogue import EXCITATIONS, LOOP, excitation_named
 from ..information import d_optimality, require_noise
 from ..plant import AbstractPlant
-from ..plant.catalogue import plant_named, with_sensor
+from ..plant.catalogue import PlantLike, plant_from, with_sensor
 from ..record import Record, require_record_path, write_record
 from ..simulation import response, run_episode
 from .checkpoint import Progress
@@ -115,7 +115,7 @@ class Design:
 
 
 def design(
-    plant: str | AbstractPlant,
+    plant: PlantLike,
     kind: str = "robust",
     *,
     criterion: str = "D",
@@ -131,6 +131,11 @@ def design(
     progress: Progress = lambda *_: None,
 ) -> Design:
     """Designs an open-loop input within a plant's limits, safe for uncertain parameters.
+
+        >>> import excite as ex
+        >>> signal = ex.design("aero2", "clairvoyant", steps=60, starts=1, updates=3)
+        >>> ex.simulate("aero2", signal, steps=60).inputs.shape
+        (61, 1)
 
     Args:
         plant: its name, `path/to/file.py:ClassName`, or the plant.
@@ -155,8 +160,7 @@ def design(
     _check(steps, spread, seed, starts, updates, trials)
     if out is not None:
         require_record_path(Path(out), overwrite)
-    chosen = plant_named(plant) if isinstance(plant, str) else plant
-    chosen = with_sensor(chosen, noise or {}, {})
+    chosen = with_sensor(plant_from(plant), noise)
     require_noise(chosen)
     env = signal_env(chosen, steps, spread, criterion)
     worth_by_start: tuple[float, ...] = ()

@@ -1,0 +1,172 @@
+"""`import excite as ex`: instant, complete, every example runs, and every object fits a screen."""
+
+import doctest
+import json
+import subprocess
+import sys
+import textwrap
+
+import numpy as np
+import pytest
+
+import excite as ex
+
+NAMES = [name for name in ex.__all__ if name != "__version__"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_name_has_an_example_that_runs(name):
+    found = getattr(ex, name)
+    tests = doctest.DocTestFinder(recurse=False).find(found, name, globs={})
+    examples = [test for test in tests if test.examples]
+    assert examples, f"{name} has no example"
+    for test in examples:
+        assert doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(test).failed == 0
+
+
+def test_the_package_lists_what_it_has():
+    assert dir(ex) == sorted(ex.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'simulat'"):
+        ex.simulat  # noqa: B018
+
+
+def test_importing_the_package_loads_nothing():
+    code = "import sys, excite; print(*{'jax', 'numpy', 'equinox'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
+
+
+@pytest.fixture(scope="module")
+def record():
+    return ex.simulate("aero2", "chirp", steps=200)
+
+
+@pytest.fixture(scope="module")
+def result(record):
+    return ex.identify(record)
+
+
+def test_every_object_fits_a_screen(record, result):
+    listings = [ex.plants(), ex.excitations(), ex.policies(), ex.estimators()]
+    objects = [record, result, ex.information("aero2", steps=200), ex.read_policy("aero2")]
+    plant = record.description
+    for shown in map(repr, [*listings, *objects, plant]):
+        lines = shown.splitlines()
+        assert len(lines) <= 24
+        assert max(map(len, lines)) <= 80
+
+
+def test_a_result_shows_itself(result):
+    assert result.params.D_p == result.params["D_p"]
+    assert "K_pu" in result._repr_html_()
+    assert "<table>" in ex.information("aero2", steps=200)._repr_html_()
+    assert result.plot().axes
+    with pytest.raises(AttributeError, match="did you mean 'D_p'"):
+        result.params.Dp  # noqa: B018
+
+
+def test_a_record_is_replayed_and_its_inputs_are_a_signal(record):
+    again = ex.simulate("aero2", record)
+    np.testing.assert_array_equal(again.inputs, record.inputs)
+    np.testing.assert_array_equal(ex.simulate("aero2", record.inputs).inputs[:-1], record.inputs)
+
+
+MISTAKES = {
+    "ex.simulate('aero')": "unknown plant 'aero'; did you mean 'aero2'",
+    "ex.simulate(3)": "plant must be a name, path/to/file.py:ClassName, a plant or its class: "
+    "got int 3",
+    "ex.simulate(dict)": "got the class dict",
+    "ex.simulate('aero2', 'chrip')": "did you mean 'chirp'",
+    "ex.simulate('aero2', 7)": "excitation must be a name, an excitation or its class",
+    "ex.simulate('aero2', [1.0, 2.0])": "an array of inputs by sample and input: got list",
+    "ex.simulate('aero2', seed='0')": "seed must be a whole number or a key of jax.random.key: "
+    "got str '0'",
+    "ex.simulate('aero2', seed=True)": "seed must be a whole number",
+    "ex.simulate('aero2', seed=-1)": "seed must be 0 or more",
+    "ex.simulate('aero2', steps=2.5)": "steps must be a whole number: got float 2.5",
+    "ex.simulate('aero2', steps=1)": "steps must be at least 2: got 1",
+    "ex.simulate('aero2', params=[1, 2, 3])": "params must be a dict by name or the plant's named",
+    "ex.simulate('aero2', params={'J_p': 'x'})": "J_p must be a number: got str 'x'",
+    "ex.simulate('aero2', params={'J': 1})": "no parameter 'J'",
+    "ex.simulate('aero2', noise=0.1)": "noise must be a dict by output: got float 0.1",
+    "ex.simulate('aero2', noise={'pitch': [1]})": "noise of 'pitch' must be a number",
+    "ex.simulate('aero2', options=3)": "options must be a dict by name: got int 3",
+    "ex.information('aero2', initial_state='no')": "initial state 'no' is not one of",
+    "ex.identify(3)": "records must be a record or the path of an experiment file, or several",
+    "ex.identify([3])": "records must be a record",
+    "ex.identify([])": "no record is given",
+    "ex.identify('missing.csv', 'aero2')": "missing.csv: no such file",
+    "ex.identify('missing.csv')": "missing.csv has no sidecar that names its plant",
+    "ex.identify(record, 'cart_pole')": "has 1 inputs and 1 outputs; plant 'cart_pole'",
+    "ex.identify(record, estimator='nsl')": "did you mean 'nls'",
+    "ex.identify(record, estimator=3)": "estimator must be a name, an estimator or its class",
+    "ex.identify(record, start=[1])": "params must be a dict by name",
+    "ex.identify(record, estimator='arx-rls', hold={'J_p': 1})": "takes no hold",
+    "ex.Record([0, 1], [[0], [1]], [[0]])": "outputs of a record needs one row for each of 2",
+    "ex.Record([0, 1], 'no', [[0]])": "inputs must be an array of numbers: got str 'no'",
+    "ex.simulate(Deciding)": "derivative of Deciding decides by the value of a state, an input or "
+    "a parameter (if, while, and, or, float, int): use jnp.where(condition, value, otherwise)",
+    "ex.simulate(Numpy())": "derivative of Numpy uses NumPy: use jax.numpy",
+    "ex.simulate(ex.AbstractPlant)": "AbstractPlant is not a complete plant",
+}
+
+WORKS = [
+    "ex.simulate(Aero2, ex.simulate('aero2', steps=20))",
+    "ex.simulate(Aero2(), Chirp, steps=20)",
+    "ex.simulate(Aero2(), Chirp(amplitude=2.0), steps=20, seed=jax.random.key(0))",
+    "ex.simulate('aero2', params=Aero2().nominal, steps=20, seed=np.int64(3))",
+    "ex.simulate(single, steps=20)",
+    "ex.simulate('aero2', ex.read_policy('aero2'), steps=20)",
+    "ex.Record([0, 0.1, 0.2], [0, 1, 0], [0, 0, 0])",
+]
+
+SCRIPT = """
+import json, sys, warnings
+import excite as ex
+import jax, jax.numpy as jnp, numpy as np
+from excite.excitation import Chirp
+from excite.plant import Aero2
+
+class Deciding(Aero2):
+    def derivative(self, state, input, params):
+        if state[0] > 0:
+            return -state
+        return state
+
+class Numpy(Aero2):
+    def derivative(self, state, input, params):
+        return np.sin(state)
+
+jax.config.update("jax_enable_x64", False)
+single = Aero2()
+jax.config.update("jax_enable_x64", True)
+record = ex.simulate("aero2", steps=60)
+said = {}
+for line in json.load(sys.stdin):
+    try:
+        eval(line)
+        said[line] = "works"
+    except Exception as error:
+        said[line] = f"{type(error).__name__}: {error}"
+said["single"] = float(single.dt), float(ex.simulate(single, steps=20).time[1])
+print(json.dumps(said))
+"""
+
+
+def test_a_mistake_is_one_sentence_and_what_can_be_meant_works():
+    """In a process without the tests' run-time check of types, which would speak first."""
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(SCRIPT)],
+        input=json.dumps([*MISTAKES, *WORKS]),
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    said = json.loads(done.stdout)
+    assert said.pop("single")[1] == 0.1  # not single precision's 0.10000000149
+    for line, sentence in MISTAKES.items():
+        kind, _, text = said[line].partition(": ")
+        assert kind in ("ValueError", "TypeError"), f"{line}: {said[line]}"
+        assert sentence in text, f"{line}: {text}"
+        assert "\n" not in text, line
+    assert {line: said[line] for line in WORKS} == dict.fromkeys(WORKS, "works")
