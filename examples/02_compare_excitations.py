@@ -17,11 +17,11 @@ def main() -> None:
         run = run_episode(plant, true, excitation, 500, jax.random.key(1))
         bound = best_possible(plant, true, run.inputs, initial_state_known=True)
         record = Record.of_episode(run.time, run.inputs, run.measured, source="simulated")
-        result = identify(plant, [record], initial_state="known")
-        print(f"\n{type(excitation).__name__}: log det {bound['log_det_information']:.1f}")
+        result = identify([record], plant, initial_state="known")
+        print(f"\n{type(excitation).__name__}: log det {bound.log_det_information:.1f}")
         for name, value in result.params.items():
             low, high = result.ci95(name)
-            least = bound["params"][name]["cramer_rao_percent"]
+            least = bound.params[name].cramer_rao_percent
             print(f"  {name}: {value:.4g} in [{low:.4g}, {high:.4g}], bound {least:.2g} %")
 
 

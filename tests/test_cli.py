@@ -297,7 +297,7 @@ def test_a_policy_is_an_excitation_like_any_other(run, policy, tmp_path):
     ("words", "sentence"),
     [
         (("emps",), "trained for the input 'voltage'"),
-        (("aero2", "--steps", 41), "policy.safetensors was made for 40 steps; --steps asks for 41"),
+        (("aero2", "--steps", 41), "policy.safetensors was made for 40 steps; 41 are asked for"),
         (("aero2", "--steps", 40, "--set", "amplitude=3"), "a policy has no options"),
     ],
 )
@@ -427,7 +427,7 @@ def test_a_simulation_that_diverges_is_a_failed_run(run, here):
         "simulate", "aero2", "--steps", NUM_STEPS, "--params", "J_p=1e-9", "--out", "r.csv"
     )
     assert answer.code == 1
-    assert "finite" in answer.err
+    assert "diverged" in answer.err
     assert answer.err.count("\n") == 1
     assert contents(here) == before
 
@@ -487,7 +487,6 @@ def test_the_table_shows_the_numbers_of_the_json(run, here):
         line = next(line for line in shown.splitlines() if line.strip().startswith(f"{name} "))
         assert p["unit"] in line
         assert number(p["std_error"]) in line
-        assert f"{p['relative_to_nominal']:.4f}" in line
         estimate = float(line.split(p["unit"])[1].split()[0])
         assert abs(estimate - p["estimate"]) < p["std_error"] / 10
     assert f"fit {number(found['fit_percent']['pitch'], 4)} %" in shown
@@ -557,7 +556,7 @@ def test_what_a_free_decay_cannot_tell_is_held_and_named(run, decay):
     assert answer.code == 0
     assert "partly identifiable" in answer.out
     assert "(held)" in answer.out
-    assert "the data cannot see K_pu; K_pu was held at 0.0125" in answer.out
+    assert "K_pu is not identifiable from the data; K_pu was held at 0.0125" in answer.out
     found = run(*words, "--json").json
     assert found["params"]["K_pu"]["std_error"] is None
     assert found["fit_percent"]["pitch"] > 99
@@ -664,8 +663,8 @@ BAD: dict[str, tuple[str, tuple[str, ...]]] = {
     "samples left out": (IDENTIFY.format("gap.csv"), ("gap.csv", "missing", "0.4 s")),
     "wrong unit": (IDENTIFY.format("unit.csv"), ("unit.csv", "-24 to 24", "voltage=FACTOR")),
     "too short": (IDENTIFY.format("short.csv"), ("short.csv", "8 samples", "15 or more")),
-    "nothing to see": (IDENTIFY.format("rest.csv"), ("no parameter can be seen",)),
-    "no response": (IDENTIFY.format("silent.csv"), ("no parameter can be seen",)),
+    "nothing to see": (IDENTIFY.format("rest.csv"), ("no parameter is identifiable",)),
+    "no response": (IDENTIFY.format("silent.csv"), ("no parameter is identifiable",)),
     "truncated CSV": (IDENTIFY.format("truncated.csv"), ("truncated.csv", "truncated?")),
     "empty file": (IDENTIFY.format("empty.csv"), ("empty.csv", "empty")),
     "header only": (IDENTIFY.format("header.csv"), ("header.csv", "0 samples")),
@@ -734,7 +733,7 @@ BAD: dict[str, tuple[str, tuple[str, ...]]] = {
         "simulate aero2 --out notes.csv --overwrite", ("notes.json", "lost"),
     ),
     "more steps than inputs": (
-        "simulate aero2 good.csv --steps 5000", ("good.csv", "201 inputs", "5000"),
+        "simulate aero2 good.csv --steps 5000", ("good.csv", "201 steps", "5000"),
     ),
     "zero steps": ("simulate aero2 --steps 0", ("--steps", "0")),
     "negative seed": ("simulate aero2 --seed -1", ("--seed", "-1")),
@@ -761,7 +760,6 @@ BAD: dict[str, tuple[str, tuple[str, ...]]] = {
     "zero episodes": ("benchmark study.toml --episodes 0", ("--episodes", "0")),
     "unknown command": ("identfy good.csv", ("identfy", "identify")),
     "unknown option": ("simulate aero2 --exitation chirp", ("--exitation", "--excitation")),
-    "no plant": ("identify good.csv", ("--plant",)),
     "no file": ("identify --plant aero2", ("FILE",)),
     "other initial state": (
         "identify good.csv --plant aero2 --initial-state maybe", ("maybe", "free", "known"),

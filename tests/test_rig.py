@@ -582,7 +582,7 @@ def test_a_record_with_latency_identifies_without_bias(tmp_path):
     assert outcome.is_complete
     true = rig.facts()["true_params"]
     record = read_record(tmp_path / "a.csv", IDEAL.description)
-    result = identify(IDEAL, [record], initial_state="known")
+    result = identify([record], IDEAL, initial_state="known")
     for name, value in true.items():
         off = abs(result.params[name] - value)
         assert off < 4 * result.std_error[name], (name, result.params, true)
@@ -834,7 +834,7 @@ def test_a_killed_process_leaves_a_record_that_identifies(tmp_path):
     record = read_record(path, plant.description)
     assert len(record.time) >= num_needed
     assert record.starts_at_initial_state
-    result = identify(plant, [record])
+    result = identify([record], plant)
     assert result.status == "successful"
     for name, nominal in plant.nominal._asdict().items():
         assert abs(result.params[name] / float(nominal) - 1) < 0.5

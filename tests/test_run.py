@@ -116,11 +116,11 @@ def test_what_ran_on_the_rig_identifies_its_hidden_parameters(seed, call):
     assert (code, told["trip"]) == (0, "none")
     assert told["rig"]["true_max_abs_output"][0] < AERO.outputs[0].critical_level
     record = read_record("r.csv", AERO)
-    found = identify(Aero2Detailed(), [record])
+    found = identify([record], Aero2Detailed())
     for name, true in told["rig"]["true_params"].items():
         assert abs(found.params[name] / true - 1) < 0.002
         assert abs(found.params[name] - true) < 2.6 * found.std_error[name]  # 99 %
-    wrong = identify(Aero2(), [read_record("r.csv", Aero2.definition)])
+    wrong = identify([read_record("r.csv", Aero2.definition)], Aero2())
     assert wrong.structure["pitch"] < 0.01
     assert "structure" in wrong.verdict[0]
 

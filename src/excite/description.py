@@ -15,9 +15,11 @@ import difflib
 import hashlib
 import json
 import math
+import reprlib
+import textwrap
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
-from typing import Any
+from typing import Any, TypeVar
 
 FORMAT = 1
 """Version of the canonical JSON below; it enters every hash."""
@@ -28,6 +30,9 @@ HALF_95 = 1.959964
 RARE = 0.01
 """p-value below which a residual is said not to be white, or to follow the input: in sentences,
 in tables, and where intervals are widened for it."""
+
+
+_T = TypeVar("_T")
 
 
 def _require(condition: bool, sentence: str) -> None:
@@ -60,7 +65,12 @@ class _Named:
 
 @dataclass(frozen=True)
 class State(_Named):
-    """One component of the state: its value at rest and a typical size, in `unit`."""
+    """One component of the state: its value at rest and a typical size, in `unit`.
+
+    >>> import excite as ex
+    >>> ex.State("pitch", "rad", scale=0.5).initial
+    0.0
+    """
 
     name: str
     unit: str
@@ -77,6 +87,10 @@ class Input(_Named):
     """One input with its limits, and the amplitude at which classical signals are safe.
 
     `amplitude` counts from the middle of the limits; left out (0) it is half their width.
+
+        >>> import excite as ex
+        >>> ex.Input("voltage", "V", -24.0, 24.0).amplitude
+        24.0
     """
 
     name: str
@@ -106,6 +120,10 @@ class Output(_Named):
 
     `noise_sd` is the standard deviation of Gaussian sensor noise, `resolution` the step
     of an encoder (0: none), both in `unit`. A level left out is a level not watched.
+
+        >>> import excite as ex
+        >>> ex.Output("pitch", "rad", scale=0.8, resolution=0.002).critical_level is None
+        True
     """
 
     name: str
@@ -142,6 +160,10 @@ class Parameter(_Named):
     `target` says whether an experiment is designed for it. `symbol` is how a report
     writes it (TeX), `scale` the size of a relevant change
     (left out: that of the nominal value).
+
+        >>> import excite as ex
+        >>> ex.Parameter("J_p", "kg m²", 0.0232).scale
+        0.0232
     """
 
     name: str
@@ -180,16 +202,38 @@ class Parameter(_Named):
 
 @dataclass(frozen=True)
 class Constant(_Named):
-    """One known physical constant."""
+    """One known physical constant.
+
+    >>> import excite as ex
+    >>> ex.Constant("g", "m/s²", 9.81).value
+    9.81
+    """
 
     name: str
     unit: str
     value: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class PlantDescription:
     """A plant as plain data.
+
+        >>> import excite as ex
+        >>> tank = ex.PlantDescription(
+        ...     name="tank",
+        ...     states=(ex.State("level", "m"),),
+        ...     inputs=(ex.Input("inflow", "m³/s", 0.0, 0.02),),
+        ...     outputs=(ex.Output("level", "m", scale=1.0, noise_sd=0.01, critical_level=3.0),),
+        ...     parameters=(ex.Parameter("area", "m²", 1.5),),
+        ...     constants=(ex.Constant("g", "m/s²", 9.81),),
+        ...     dt=1.0,
+        ...     band=(0.001, 0.1),
+        ... )
+        >>> tank
+        plant tank, sampled every 1 s
+          input inflow: 0 to 0.02 m³/s
+          output level [m], critical level 3 m
+          parameters area = 1.5 m²
 
     Attributes:
         name: the word by which command line, studies and records know it.
@@ -230,6 +274,11 @@ class PlantDescription:
             f"inputs and outputs of {self.name!r} are file columns beside 'time': "
             "all their names must differ",
         )
+
+    def __repr__(self) -> str:
+        from .report.results import plant_text
+
+        return plant_text(self)
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -277,6 +326,33 @@ def names_of(parts: Iterable[_Named]) -> tuple[str, ...]:
     return tuple(part.name for part in parts)
 
 
+def first_line(kind: type) -> str:
+    """The first sentence of a class's docstring."""
+    return (kind.__doc__ or "").strip().partition("\n")[0]
+
+
+class Listing(dict[str, str]):
+    """What there is, by name, with one line each; it shows itself as two columns."""
+
+    def __repr__(self) -> str:
+        widest = max(map(len, self), default=0)
+        gap = " " * (widest + 2)
+        lines = (f"{name:{widest}}  {line}" for name, line in self.items())
+        return "\n".join(textwrap.fill(line, 80, subsequent_indent=gap) for line in lines)
+
+
+class Named(dict[str, _T]):
+    """Values by name, which are attributes too: `values["D_p"]` is `values.D_p`."""
+
+    def __getattr__(self, name: str) -> _T:
+        if name in self:
+            return self[name]
+        raise AttributeError(str(unknown("name", name, self)))
+
+    def __dir__(self) -> list[str]:
+        return [*super().__dir__(), *self]
+
+
 def display_unit(unit: str) -> tuple[str, float]:
     """Unit in which people read a quantity, and its factor: degrees for radians."""
     if unit in ("rad", "rad/s"):
@@ -290,3 +366,11 @@ def unknown(kind: str, word: str, allowed: Iterable[str]) -> ValueError:
     nearest = difflib.get_close_matches(word, allowed, n=1, cutoff=0.5)
     hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
     return ValueError(f"unknown {kind} {word!r}{hint} (there is {', '.join(allowed)})")
+
+
+def wrong_type(what: str, value: object, allowed: str) -> TypeError:
+    """The error for an object of another type than those allowed: what came, what is allowed."""
+    text = reprlib.repr(value)
+    shown = "" if text.startswith("<") or "\n" in text else f" {text}"
+    kind = f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
+    return TypeError(f"{what} must be {allowed}: got {kind}{shown * (not isinstance(value, type))}")

@@ -9,33 +9,33 @@ of the parameters all of it is relative, and comparable between parameters.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING, Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PRNGKeyArray
 
-from .description import names_of
-from .plant import AbstractPlant, Params
-from .simulation import response
+from .description import Named, PlantDescription, names_of
+from .excitation.catalogue import ExcitationLike
+from .plant import AbstractPlant, Params, require_double_precision
+from .plant.catalogue import PlantLike
+from .record import Record
+from .report.results import data_frame, information_html, information_text, wrapped
+from .simulation import Experiment, response, run_episode
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from pandas import DataFrame
 
 Information = Float[Array, "param param"]
 
 UNSEEN_SD = 0.5
-"""A direction of relative changes known no better than this is not seen by the data: its
+"""A direction of relative changes known no better than this is not identifiable: its
 95 % interval reaches from nothing to the double."""
-
-
-def require_double_precision() -> None:
-    """Raises ValueError where JAX computes in single precision."""
-    if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
-        raise ValueError(
-            "estimation and information need double precision: "
-            'call jax.config.update("jax_enable_x64", True) first'
-        )
 
 
 def require_noise(plant: AbstractPlant) -> None:
@@ -169,14 +169,150 @@ def cramer_rao_bound(information: Information) -> Float[Array, " param"]:
     return jnp.where(lost | (size == 0), jnp.inf, jnp.sqrt(variance))
 
 
+@dataclass(frozen=True)
+class Bound:
+    """The least standard deviation of one parameter.
+
+    Attributes:
+        value: at which the bound holds.
+        cramer_rao_bound: least standard deviation [unit]; None where there is none.
+        cramer_rao_percent: the same in percent of the value.
+    """
+
+    value: float
+    cramer_rao_bound: float | None
+    cramer_rao_percent: float | None
+    unit: str
+
+
+@dataclass(frozen=True, repr=False)
+class InformationResult:
+    """How well an experiment can determine each parameter at best; the result of `information`.
+
+        >>> import excite as ex
+        >>> ex.information("aero2").params.J_p.cramer_rao_percent < 0.1
+        True
+
+    Attributes:
+        plant: with the numbers of the experiment.
+        initial_state: "known", or "free" where it must be estimated along.
+        params: by parameter, in the order of the plant, as attribute or item.
+        log_det_information, a_optimality, e_optimality: criteria of the relative information:
+            log det M, trace M^-1, smallest eigenvalue of M.
+        information: relative Fisher information, see `experiment_information`.
+        verdict: sentences on what cannot be identified, and how certain the rest is.
+        inputs: of the experiment [input units].
+        excitation: its name.
+        warnings: a sentence where a policy was trained on another plant.
+    """
+
+    plant: PlantDescription
+    initial_state: str
+    params: Named[Bound]
+    log_det_information: float
+    a_optimality: float
+    e_optimality: float
+    information: Float[np.ndarray, "param param"]
+    verdict: tuple[str, ...]
+    inputs: Float[np.ndarray, "time input"]
+    excitation: str = ""
+    warnings: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        return information_text(self.to_dict())
+
+    def __repr__(self) -> str:
+        return wrapped(str(self))
+
+    def _repr_html_(self) -> str:
+        return information_html(self.to_dict())
+
+    def plot(self) -> Figure:
+        """The input, and the least standard deviation of each parameter in percent."""
+        from .report.figures import information_figure
+
+        time = np.arange(len(self.inputs) + 1) * self.plant.dt
+        drawn = Record.of_episode(time, self.inputs, np.empty((len(time), 0)))
+        percent = {name: bound.cramer_rao_percent for name, bound in self.params.items()}
+        return information_figure(self.plant, drawn, percent)
+
+    def to_pandas(self) -> DataFrame:
+        """One row a parameter: value, least standard deviation, the same in percent, unit.
+
+        Raises:
+            ValueError: where pandas is not installed.
+        """
+        bounds = [asdict(bound) for bound in self.params.values()]
+        return data_frame({key: [b[key] for b in bounds] for key in bounds[0]}, list(self.params))
+
+    def to_dict(self) -> dict[str, object]:
+        """The result as JSON-ready data; docs/reference/machine-readable.md lists its keys."""
+        return {
+            "plant": self.plant.name,
+            "initial_state": self.initial_state,
+            "params": {name: asdict(bound) for name, bound in self.params.items()},
+            "log_det_information": self.log_det_information,
+            "a_optimality": self.a_optimality,
+            "e_optimality": self.e_optimality,
+            "information": self.information,
+            "verdict": self.verdict,
+            "excitation": self.excitation,
+            "num_steps": len(self.inputs),
+            "warnings": self.warnings,
+        }
+
+
+def information(
+    plant: PlantLike,
+    excitation: ExcitationLike = "chirp",
+    *,
+    options: Mapping[str, object] | None = None,
+    steps: int | None = None,
+    params: Mapping[str, float] | Params | None = None,
+    noise: Mapping[str, float] | None = None,
+    resolution: Mapping[str, float] | None = None,
+    seed: int | PRNGKeyArray = 0,
+    initial_state: Literal["auto", "known", "free"] = "auto",
+) -> InformationResult:
+    """Least standard deviation of each parameter for an experiment (Cramér-Rao bound).
+
+        >>> import excite as ex
+        >>> result = ex.information("aero2", "multisine", steps=200)
+        >>> result.params["D_p"].unit
+        'N m s/rad'
+
+    Args:
+        plant, excitation, options, steps, params, noise, resolution, seed: as for `simulate`.
+        initial_state: "known", or "free" where it must be estimated along; "auto" is known, for
+            a record only where its sidecar says that it starts at the plant's initial state.
+
+    Raises:
+        ValueError: as `simulate`, for a sensor without noise, which sets no bound, and for a
+            response that is not finite.
+        TypeError: for an argument of another type.
+    """
+    if initial_state not in ("auto", "known", "free"):
+        raise ValueError(f"initial state {initial_state!r} is not one of: auto, known, free")
+    experiment = Experiment.of(
+        plant, excitation, options=options, steps=steps, params=params, noise=noise,
+        resolution=resolution, seed=seed,
+    )  # fmt: skip
+    elsewhere = isinstance(excitation, Record) and not excitation.starts_at_initial_state
+    known = initial_state == "known" or (initial_state == "auto" and not elsewhere)
+    e = experiment
+    inputs = run_episode(e.plant, e.params, e.excitation, e.num_steps, e.key).inputs
+    result = best_possible(e.plant, e.params, inputs, initial_state_known=known)
+    return replace(result, excitation=e.name, warnings=e.warnings)
+
+
 def best_possible(
     plant: AbstractPlant,
     params: Params,
     inputs: Float[Array, "time input"],
     *,
     initial_state_known: bool,
-) -> dict[str, Any]:
-    """Least standard deviation of each parameter for an input, as JSON-ready data.
+) -> InformationResult:
+    """Least standard deviation of each parameter for these inputs.
 
     Raises:
         ValueError: for a sensor without noise, which sets no bound, and for a response
@@ -190,35 +326,35 @@ def best_possible(
     values = np.linalg.eigvalsh(np.nan_to_num(np.asarray(information)))
     if not np.all(np.isfinite(information)) or values[0] < -1e-6 * values[-1]:
         raise ValueError(
-            "the response to this input is not finite, or chaotic: it has no information that "
-            "could be trusted; a smaller amplitude or other parameters may help"
+            "the response to this input is not finite, or chaotic: its information cannot be "
+            "trusted; a smaller amplitude or other parameters may help"
         )
-    size = np.asarray(relative_size(plant, params))
-    sd = np.asarray(cramer_rao_bound(information)) * size
-    return {
-        "plant": plant.definition.name,
-        "initial_state": "known" if initial_state_known else "free",
-        "params": {
-            p.name: {
-                "value": float(value),
-                "cramer_rao_bound": float(s) if np.isfinite(s) else None,
-                "cramer_rao_percent": float(100 * s / abs(value))
-                if np.isfinite(s) and value
-                else None,
-                "unit": p.unit,
-            }
-            for p, value, s in zip(plant.definition.parameters, params, sd, strict=True)
-        },
-        "log_det_information": float(d_optimality(information)),
-        "a_optimality": float(a_optimality(information)),
-        "e_optimality": float(e_optimality(information)),
-        "information": np.asarray(information),
-        "verdict": _verdict(names_of(plant.definition.parameters), np.asarray(information)),
-    }
+    parameters = plant.definition.parameters
+    sd = np.asarray(cramer_rao_bound(information)) * np.asarray(relative_size(plant, params))
+
+    def bound(value: float, least: float, unit: str) -> Bound:
+        is_finite = bool(np.isfinite(least))
+        percent = 100 * least / abs(value) if is_finite and value else None
+        return Bound(value, least if is_finite else None, percent, unit)
+
+    return InformationResult(
+        plant=plant.description,
+        initial_state="known" if initial_state_known else "free",
+        params=Named(
+            (p.name, bound(float(value), float(s), p.unit))
+            for p, value, s in zip(parameters, params, sd, strict=True)
+        ),
+        log_det_information=float(d_optimality(information)),
+        a_optimality=float(a_optimality(information)),
+        e_optimality=float(e_optimality(information)),
+        information=np.asarray(information),
+        verdict=_verdict(names_of(parameters), np.asarray(information)),
+        inputs=np.asarray(inputs),
+    )
 
 
-def _verdict(names: tuple[str, ...], information: np.ndarray) -> list[str]:
-    """What cannot be seen, one sentence each, and how well the rest is."""
+def _verdict(names: tuple[str, ...], information: np.ndarray) -> tuple[str, ...]:
+    """What cannot be identified, one sentence each, and how certain the rest is."""
     free, sentences = np.ones(len(names), bool), []
     while (unseen := worst_seen(names, information, free)) is not None:
         free[unseen[0]] = False
@@ -226,13 +362,13 @@ def _verdict(names: tuple[str, ...], information: np.ndarray) -> list[str]:
     if free.any():
         block = np.where(np.outer(free, free), information, np.eye(len(names)))
         sentences.append(identifiability(names, np.linalg.inv(block), free))
-    return sentences
+    return tuple(sentences)
 
 
 def worst_seen(
     names: tuple[str, ...], information: Float[np.ndarray, "param param"], free: np.ndarray
 ) -> tuple[int, str] | None:
-    """The free parameter to hold because the data do not see it, and why, in words.
+    """The free parameter to hold because the data do not determine it, and why, in words.
 
     None when every direction of the free parameters is known better than `UNSEEN_SD`.
     The direction is the eigenvector of the information with the smallest eigenvalue.
@@ -251,21 +387,21 @@ def worst_seen(
     chosen = int(index[np.argmax(np.abs(direction))])
     involved = [names[i] for i, v in zip(index, direction, strict=True) if abs(v) > 0.3]
     if len(involved) == 1:
-        return chosen, f"the data cannot see {names[chosen]}"
+        return chosen, f"{names[chosen]} is not identifiable from the data"
     combination = " ".join(
         f"{names[i]}^{v:+.2g}"
         for i, v in zip(index, direction / direction[np.argmax(np.abs(direction))], strict=True)
         if names[i] in involved
     )
     return chosen, (
-        f"the data cannot tell {' and '.join(involved)} apart: {combination} could have any size"
+        f"{' and '.join(involved)} are not identifiable separately: {combination} is undetermined"
     )
 
 
 def identifiability(
     names: tuple[str, ...], covariance: Float[np.ndarray, "param param"], free: np.ndarray
 ) -> str:
-    """How well the worst direction of the free parameters is seen, in words.
+    """How certain the least certain direction of the free parameters is, in words.
 
     Args:
         covariance: of relative changes.
@@ -274,6 +410,6 @@ def identifiability(
     values, vectors = np.linalg.eigh(covariance[np.ix_(index, index)])
     sd, direction = np.sqrt(max(values[-1], 0.0)), vectors[:, -1]
     involved = [names[i] for i, v in zip(index, direction, strict=True) if abs(v) > 0.3]
+    seen = "all parameters" if len(index) == len(names) else ", ".join(names[i] for i in index)
     what = involved[0] if len(involved) == 1 else f"a combination of {' and '.join(involved)}"
-    seen = ", ".join(names[i] for i in index)
-    return f"the data see all of {seen}; worst is {what}, to {100 * sd:.2g} %"
+    return f"{seen} identifiable; least certain direction: {what}, {100 * sd:.2g} % (1 SD)"

@@ -1,4 +1,4 @@
-"""From inputs to outputs: `response` without noise, `run_episode` in closed loop.
+"""From inputs to outputs: `response` without noise, `run_episode` in closed loop, `simulate`.
 
 Sample k is measured at time k dt; the input chosen then is held until k + 1. An
 experiment of T steps therefore has T inputs and T + 1 measurements. Integration is the
@@ -8,13 +8,23 @@ response is one differentiable function of everything that enters it.
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Mapping
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from .excitation import AbstractExcitation
-from .plant import AbstractPlant, Params
+from . import __version__
+from .description import names_of, wrong_type
+from .excitation import AbstractExcitation, PolicyExcitation, Replay
+from .excitation.catalogue import ExcitationLike, excitation_and_origin, name_of
+from .files import json_ready
+from .plant import AbstractPlant, Params, params_from
+from .plant.catalogue import PlantLike, plant_from, with_sensor
+from .record import Record
 
 
 class Trajectory(eqx.Module):
@@ -118,3 +128,180 @@ def run_episode(
         measured=jnp.concatenate([measured, measure(plant, last, noise_keys[-1])[None]]),
         outputs=jnp.concatenate([outputs, last[None]]),
     )
+
+
+class DivergedError(ValueError):
+    """A simulation with outputs that are not finite."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Experiment:
+    """One simulated experiment, everything chosen.
+
+    Attributes:
+        plant: with the sensor of this experiment.
+        params: true ones.
+        name: of the excitation.
+        origin: what the record must say of a policy or of a signal's file.
+        num_steps: length [samples].
+        seed: what its noise depends on; a whole number or a JAX key.
+    """
+
+    plant: AbstractPlant
+    params: Params
+    excitation: AbstractExcitation
+    name: str
+    origin: Mapping[str, str]
+    num_steps: int
+    seed: int | PRNGKeyArray = 0
+
+    @classmethod
+    def of(
+        cls,
+        plant: PlantLike,
+        excitation: ExcitationLike = "chirp",
+        *,
+        options: Mapping[str, object] | None = None,
+        steps: int | None = None,
+        params: Mapping[str, float] | Params | None = None,
+        noise: Mapping[str, float] | None = None,
+        resolution: Mapping[str, float] | None = None,
+        seed: int | PRNGKeyArray = 0,
+    ) -> Experiment:
+        """The experiment that `simulate` runs; its arguments are explained there.
+
+        Raises:
+            ValueError: for anything that is not known or not allowed.
+            TypeError: for an argument of another type.
+        """
+        chosen = with_sensor(plant_from(plant), noise, resolution)
+        if isinstance(excitation, Record):
+            chosen = chosen.changed(dt=excitation.dt)
+        if not isinstance(options, Mapping | None):
+            raise wrong_type("options", options, "a dict by name")
+        name = excitation if isinstance(excitation, str) else name_of(excitation)
+        found, origin = excitation_and_origin(excitation, options or {}, chosen)
+        source = excitation.source if isinstance(excitation, Record) else ""
+        num_steps = _num_steps(found, source or name, steps, isinstance(excitation, Record))
+        return cls(
+            chosen, params_from(chosen, params), found, name, origin, num_steps, _checked(seed)
+        )
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """A sentence where the policy was trained on another plant."""
+        return tuple(text for word, text in self.origin.items() if word == "warning")
+
+    @property
+    def key(self) -> PRNGKeyArray:
+        """The key of the excitation and of the sensor's noise."""
+        return jax.random.key(self.seed) if isinstance(self.seed, int) else self.seed
+
+    def run(self) -> Trajectory:
+        """Inputs and outputs at all samples.
+
+        Raises:
+            DivergedError: where the simulation diverged.
+        """
+        run = run_episode(self.plant, self.params, self.excitation, self.num_steps, self.key)
+        if not np.all(np.isfinite(run.outputs)):
+            raise DivergedError(
+                "the simulation diverged (NaN or infinity): these parameters make the plant too "
+                "fast for its integration step, or unstable"
+            )
+        return run
+
+    def record(self, run: Trajectory) -> Record:
+        """The measurements, and all that says how they came about."""
+        is_number = isinstance(self.seed, int)
+        seed = self.seed if is_number else jax.random.key_data(self.seed).tolist()
+        names, description = names_of(self.plant.definition.parameters), self.plant.description
+        metadata = {
+            "plant": json_ready(description.to_dict()),
+            "plant_hash": description.hash,
+            "params": {n: float(v) for n, v in zip(names, self.params, strict=True)},
+            "starts_at_initial_state": True,
+            "provenance": {
+                "excite": __version__,
+                "simulated": True,
+                "excitation": self.name,
+                "seed": seed,
+                **self.origin,
+            },
+        }
+        return Record.of_episode(run.time, run.inputs, run.measured, metadata, "simulated record")
+
+
+def _num_steps(
+    excitation: AbstractExcitation, name: str, steps: int | None, is_record: bool
+) -> int:
+    """The length asked for, or the excitation's; ValueError where that is shorter."""
+    if steps is not None and (not isinstance(steps, int) or isinstance(steps, bool)):
+        raise wrong_type("steps", steps, "a whole number")
+    if steps is not None and steps < 2:
+        raise ValueError(f"steps must be at least 2: got {steps}")
+    if isinstance(excitation, PolicyExcitation):
+        longest = usual = excitation.layout.num_steps
+    elif isinstance(excitation, Replay):
+        longest = len(excitation.inputs)
+        usual = longest - is_record  # the last row of a record acts after its end
+    else:
+        return steps or 500
+    if (steps or usual) > longest:
+        raise ValueError(f"{name} was made for {longest} steps; {steps} are asked for")
+    return steps or usual
+
+
+def _checked(seed: object) -> int | PRNGKeyArray:
+    if isinstance(seed, jax.Array) and jnp.issubdtype(seed.dtype, jax.dtypes.prng_key):
+        if seed.shape == ():
+            return seed
+    elif isinstance(seed, int | np.integer) and not isinstance(seed, bool):
+        if 0 <= seed < 2**63:
+            return int(seed)
+        raise ValueError(f"seed must be 0 or more, and below 2^63: got {seed}")
+    raise wrong_type("seed", seed, "a whole number or a key of jax.random.key")
+
+
+def simulate(
+    plant: PlantLike,
+    excitation: ExcitationLike = "chirp",
+    *,
+    options: Mapping[str, object] | None = None,
+    steps: int | None = None,
+    params: Mapping[str, float] | Params | None = None,
+    noise: Mapping[str, float] | None = None,
+    resolution: Mapping[str, float] | None = None,
+    seed: int | PRNGKeyArray = 0,
+) -> Record:
+    """The record of one simulated experiment: what the plant's sensor shows.
+
+        >>> import excite as ex
+        >>> record = ex.simulate("aero2", "prbs", params={"D_p": 0.0012}, steps=200, seed=1)
+        >>> record.inputs.shape, record.outputs.shape
+        ((201, 1), (201, 1))
+
+    Args:
+        plant: a name (`ex.plants()` lists them), `path/to/file.py:ClassName`, a plant or
+            its class.
+        excitation: a name (`ex.excitations()` lists them), an excitation or its class, a
+            policy, the file of a policy or of a signal, a record to replay, or an array of
+            inputs by sample and input [input units].
+        options: of the excitation, by name.
+        steps: length [samples]; default 500, or that of a policy, a record or a signal.
+        params: true parameters where they are not the nominal ones, by name or as the
+            plant's named tuple.
+        noise: standard deviation of an output's noise, by name [output unit].
+        resolution: step of an output's encoder, by name [output unit].
+        seed: what excitation and noise depend on; a whole number or a JAX key.
+
+    Raises:
+        ValueError: for a name, an option or a value that is not allowed; `DivergedError`
+            where the simulation diverged.
+        TypeError: for an argument of another type.
+    """
+    experiment = Experiment.of(
+        plant, excitation, options=options, steps=steps, params=params, noise=noise,
+        resolution=resolution, seed=seed,
+    )  # fmt: skip
+    return experiment.record(experiment.run())

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -22,8 +23,11 @@ from .options import (
     show_table,
 )
 
+if TYPE_CHECKING:
+    from ..description import Input, Output, PlantDescription
 
-def excitation_options(command: Any) -> Any:
+
+def excitation_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Options that choose an excitation; shared with `information`."""
     for option in reversed(
         [
@@ -55,69 +59,31 @@ def excitation_options(command: Any) -> Any:
     return command
 
 
-def prepared(options: dict[str, Any], plant_name: str, file: Path | None) -> dict[str, Any]:
-    """Plant, true parameters, excitation, length and key from the options above.
+def given_experiment(plant: str, file: Path | None, options: Mapping[str, Any]) -> dict[str, Any]:
+    """The arguments of the verbs `simulate` and `information` from the options above."""
+    from ..plant.catalogue import plant_from
+    from ..record import read_record
 
-    A policy of another plant is warned of.
-    """
-    import jax
-    import jax.numpy as jnp
-
-    from ..excitation import Replay
-    from ..plant import params_from
-    from ..plant.catalogue import plant_named, with_sensor
-    from ..record import read_record, require_playable
-
-    plant = with_sensor(
-        plant_named(plant_name), merged(options["noise"]), merged(options["resolution"])
-    )
-    record, origin, name = None, {}, options["excitation"]
-    if file is not None and (options["settings"] or name):
-        raise ValueError("an input file takes the place of --excitation and --set")
-    if file is None:
-        name = name or "chirp"
-        excitation, origin, steps = _named(name, options, plant)
-    else:
-        columns, scales = merged(options["column"]), merged(options["scale"])
-        record = read_record(file, plant.definition, columns, scales, inputs_only=True)
-        require_playable(record, plant.definition)
-        plant = plant.changed(dt=record.dt)
-        excitation, name = Replay(jnp.asarray(record.inputs)), "replay"
-        steps = options["steps"] or len(record.inputs) - 1
-        if steps > len(record.inputs):
-            raise ValueError(f"{file} has {len(record.inputs)} inputs, --steps asks for {steps}")
-    job = {
-        "plant": plant,
-        "params": params_from(plant, merged(options["params"])),
+    chosen, excitation = plant_from(plant), options["excitation"] or "chirp"
+    if file is not None:
+        if options["settings"] or options["excitation"]:
+            raise ValueError("an input file takes the place of --excitation and --set")
+        mapping = merged(options["column"]), merged(options["scale"])
+        excitation = read_record(file, chosen.description, *mapping, inputs_only=True)
+    return {
+        "plant": chosen,
         "excitation": excitation,
-        "excitation_name": name,
-        "origin": origin,
-        "warnings": [origin["warning"]] if "warning" in origin else [],
-        "steps": steps,
-        "key": jax.random.key(options["seed"]),
-        "record": record,
+        "options": merged(options["settings"]),
+        "steps": options["steps"],
+        **{name: merged(options[name]) for name in ("params", "noise", "resolution")},
+        "seed": options["seed"],
     }
-    for warning in job["warnings"]:
+
+
+def show_warnings(warnings: Iterable[str]) -> None:
+    """Warnings on stderr, one a line."""
+    for warning in warnings:
         click.echo(f"warning: {warning}", err=True)
-    return job
-
-
-def _named(name: str, options: dict[str, Any], plant: Any) -> tuple[Any, dict[str, str], int]:
-    """An excitation by name, the origin of a policy, and how many steps."""
-    from ..excitation import PolicyExcitation, Replay
-    from ..excitation.catalogue import excitation_and_origin
-
-    excitation, origin = excitation_and_origin(name, merged(options["settings"]), plant)
-    if isinstance(excitation, PolicyExcitation):
-        longest = excitation.layout.num_steps
-    elif isinstance(excitation, Replay):
-        longest = len(excitation.inputs)
-    else:
-        return excitation, origin, options["steps"] or 500
-    steps = options["steps"] or longest
-    if steps > longest:
-        raise ValueError(f"{name} was made for {longest} steps; --steps asks for {steps}")
-    return excitation, origin, steps
 
 
 @click.command()
@@ -137,40 +103,37 @@ def simulate(
 
     The input is an excitation, or replayed from INPUT_FILE (columns: time and the inputs).
     """
-    import numpy as np
-
     from ..excitation import crest_factor
     from ..record import require_record_path, write_record
-    from ..report.figure import save
-    from ..report.figures import episode_figure
     from ..safety import critical_levels, is_violation, max_abs_output
-    from ..simulation import run_episode
+    from ..simulation import DivergedError, Experiment
 
     if out is not None:
         require_record_path(out, options["overwrite"])
-    job = prepared(options, plant, input_file)
+    experiment = Experiment.of(**given_experiment(plant, input_file, options))
+    show_warnings(experiment.warnings)
     with progress_bar("simulating"):
-        run = run_episode(job["plant"], job["params"], job["excitation"], job["steps"], job["key"])
-    if not np.all(np.isfinite(run.outputs)):
-        raise RunFailedError(
-            "the simulation left the finite numbers: these parameters make the plant too fast "
-            "for its integration step, or unstable"
-        )
-    description = job["plant"].description
-    record = _record(run, job, options["seed"])
+        try:
+            run = experiment.run()
+        except DivergedError as error:
+            raise RunFailedError(str(error)) from None
+    description, record = experiment.plant.description, experiment.record(run)
     summary = {
         "plant": description.name,
-        "excitation": job["excitation_name"],
-        "num_steps": job["steps"],
+        "excitation": experiment.name,
+        "num_steps": experiment.num_steps,
         "dt": description.dt,
         "params": record.metadata["params"],
         "crest_factor": _by_name(description.inputs, crest_factor(run.inputs)),
         "max_abs_output": _by_name(description.outputs, max_abs_output(run.outputs)),
         "is_violation": bool(is_violation(run.outputs, critical_levels(description))),
         "file": None if out is None else str(out),
-        "warnings": job["warnings"],
+        "warnings": experiment.warnings,
     }
     if plot is not None:
+        from ..report.figure import save
+        from ..report.figures import episode_figure
+
         save(episode_figure(description, record), plot)
     if out is not None:
         write_record(out, record, description)
@@ -180,18 +143,11 @@ def simulate(
         _show(description, summary)
 
 
-def _by_name(parts: Any, values: Any) -> dict[str, float]:
+def _by_name(parts: Iterable[Input | Output], values: Iterable[Any]) -> dict[str, float]:
     return {part.name: float(value) for part, value in zip(parts, values, strict=True)}
 
 
-def _record(run: Any, job: dict[str, Any], seed: int) -> Any:
-    from ..web.jobs import simulated_record
-
-    provenance = {"excitation": job["excitation_name"], "seed": seed, **job["origin"]}
-    return simulated_record(run, job["plant"], job["params"], provenance)
-
-
-def _show(description: Any, summary: dict[str, Any]) -> None:
+def _show(description: PlantDescription, summary: dict[str, Any]) -> None:
     from ..description import display_unit
     from ..report.numbers import number
 

@@ -15,8 +15,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ..information import require_double_precision
-from ..plant import AbstractARXPlant, AbstractPlant, Params
+from ..plant import (
+    AbstractARXPlant,
+    AbstractPlant,
+    Params,
+    floats,
+    require_double_precision,
+)
 from .contract import (
     AbstractEstimator,
     Estimate,
@@ -58,8 +63,8 @@ class ARX(AbstractEstimator):
         forgetting_factor: weight of a sample one step older.
     """
 
-    start_covariance: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1000.0)
-    forgetting_factor: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1.0)
+    start_covariance: Float[Array, ""] = eqx.field(converter=floats, default=1000.0)
+    forgetting_factor: Float[Array, ""] = eqx.field(converter=floats, default=1.0)
     name: str = eqx.field(static=True, default="arx-rls", kw_only=True)
 
     def init(self) -> RLSState:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from ..description import unknown
+from ..description import Listing, first_line, unknown, wrong_type
 from ..plant.fields import with_options
 from .arx import ARX
 from .contract import AbstractEstimator
@@ -19,6 +19,34 @@ ESTIMATORS: Mapping[str, AbstractEstimator] = {
     "nls": NLS(),
     "decrement": Decrement(),
 }
+
+
+def estimators() -> Listing:
+    """The estimators, by name.
+
+    >>> import excite as ex
+    >>> list(ex.estimators())
+    ['arx-rls', 'arx-rls-wide', 'nls', 'decrement']
+    """
+    return Listing({name: first_line(type(chosen)) for name, chosen in ESTIMATORS.items()})
+
+
+def estimator_from(
+    given: str | AbstractEstimator | type[AbstractEstimator],
+) -> AbstractEstimator:
+    """An estimator by name, of a class, or as it is.
+
+    Raises:
+        ValueError: for an unknown name.
+        TypeError: for anything else.
+    """
+    if isinstance(given, str):
+        return estimator_named(given)
+    if isinstance(given, type) and issubclass(given, AbstractEstimator):
+        given = given()
+    if not isinstance(given, AbstractEstimator):
+        raise wrong_type("estimator", given, "a name, an estimator or its class")
+    return given
 
 
 def estimator_named(name: str, options: Mapping[str, Any] | None = None) -> AbstractEstimator:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import abc
 import enum
 from collections.abc import Sequence
+from typing import TypeAlias
 
 import equinox as eqx
 import jax
@@ -20,6 +21,8 @@ from ..description import PlantDescription
 from ..information import relative_size
 from ..plant import AbstractPlant, Params
 from ..simulation import response
+
+AnyArray: TypeAlias = Array | np.ndarray
 
 
 class Status(enum.IntEnum):
@@ -64,22 +67,25 @@ class Experiments(eqx.Module):
 
 def stack_experiments(
     plant: AbstractPlant,
-    inputs: Sequence[Float[Array, "_time input"]],
-    measured: Sequence[Float[Array, "_samples output"]],
+    inputs: Sequence[Float[Array, "_time input"] | Float[np.ndarray, "_time input"]],
+    measured: Sequence[Float[Array, "_samples output"] | Float[np.ndarray, "_samples output"]],
     initial_state_known: bool,
 ) -> Experiments:
     """Experiments of any lengths side by side; each has one more output than inputs."""
-    longest = max(len(u) for u in inputs)
+    xp = jnp if any(isinstance(rows, jax.core.Tracer) for rows in (*inputs, *measured)) else np
+    longest, counts = max(map(len, inputs)), xp.asarray([len(y) for y in measured])
 
-    def padded(rows: Array, length: int) -> Array:
-        return jnp.pad(jnp.asarray(rows, float), ((0, length - len(rows)), (0, 0)))
+    def stacked(records: Sequence[AnyArray], length: int) -> Array:
+        padded = [
+            xp.pad(xp.asarray(rows, float), ((0, length - len(rows)), (0, 0))) for rows in records
+        ]
+        return jax.device_put(xp.stack(padded))
 
-    counts = jnp.asarray([len(y) for y in measured])
     return Experiments(
-        inputs=jnp.stack([padded(u, longest) for u in inputs]),
-        measured=jnp.stack([padded(y, longest + 1) for y in measured]),
-        valid=jnp.arange(longest + 1)[None] < counts[:, None],
-        initial_state=jnp.tile(plant.initial_state, (len(inputs), 1)),
+        inputs=stacked(inputs, longest),
+        measured=stacked(measured, longest + 1),
+        valid=jax.device_put(xp.arange(longest + 1)[None] < counts[:, None]),
+        initial_state=jax.device_put(xp.tile(xp.asarray(plant.initial_state), (len(inputs), 1))),
         initial_state_known=initial_state_known,
     )
 
@@ -185,10 +191,11 @@ class _Bounds:
         self.lower, self.upper = np.nan_to_num(lower), np.nan_to_num(upper)
         self.width = np.where(self.both, self.upper - self.lower, 1.0)
 
-    def relative(self, values: Array) -> Array:
+    def relative(self, values: AnyArray) -> AnyArray:
         """Logarithms of positive parameters, free ones over their scale."""
-        logarithm = jnp.log(jnp.where(self.positive, values, 1.0))
-        return jnp.where(self.positive, logarithm, values / self.scale)
+        xp = jnp if isinstance(values, jax.Array) else np
+        logarithm = xp.log(xp.where(self.positive, values, 1.0))
+        return xp.where(self.positive, logarithm, values / self.scale)
 
 
 def to_search(description: PlantDescription, params: Params) -> Float[Array, " param"]:
@@ -216,6 +223,8 @@ def _inverse_ramp(value: Array) -> Array:
 def from_search(description: PlantDescription, z: Float[Array, " param"]) -> Array:
     """Parameters, as a vector, at search coordinates `z`; the inverse of `to_search`."""
     b = _Bounds(description)
+    if not np.any(b.has_lower | b.has_upper):
+        return jnp.where(b.positive, jnp.exp(jnp.where(b.positive, z, 0.0)), z * b.scale)
     between = b.lower + b.width * jax.nn.sigmoid(4 * z / b.width)
     one_sided = jnp.where(b.has_lower, b.lower + jax.nn.softplus(z), b.upper - jax.nn.softplus(-z))
     bounded = jnp.where(b.both, between, one_sided)
@@ -226,7 +235,7 @@ def from_search(description: PlantDescription, z: Float[Array, " param"]) -> Arr
 def bound_reached(description: PlantDescription, params: Params) -> tuple[int, float] | None:
     """Index and bound of the first parameter that ended at one; None where none did."""
     b = _Bounds(description)
-    c = np.asarray(b.relative(jnp.stack([jnp.asarray(p, float) for p in params])))
+    c = b.relative(np.array([float(p) for p in params]))
     for i, p in enumerate(description.parameters):
         margin = 1e-3 * b.width[i]
         if p.lower is not None and c[i] - b.lower[i] < margin:

@@ -13,8 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ..information import require_double_precision
-from ..plant import AbstractARXPlant, AbstractPlant, Params
+from ..plant import AbstractARXPlant, AbstractPlant, Params, require_double_precision
 from .contract import (
     AbstractEstimator,
     Estimate,

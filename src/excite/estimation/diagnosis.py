@@ -1,4 +1,4 @@
-"""What an estimate is worth: fit, whiteness of the residual, what the data cannot see.
+"""What an estimate is worth: fit, whiteness of the residual, what is not identifiable.
 
 Everything here runs once, after a fit, on NumPy arrays; nothing is differentiated.
 """

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from pathlib import Path
+from typing import Literal, TypeAlias, get_args
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Float
 
-from ..description import RARE, PlantDescription, names_of
+from ..description import RARE, Named, PlantDescription, names_of, wrong_type
 from ..files import json_ready
-from ..information import identifiability, relative_size, worst_seen
-from ..plant import AbstractPlant, Params, params_from
-from ..record import Record
+from ..information import identifiability, worst_seen
+from ..plant import AbstractPlant, Params, floats, params_from
+from ..plant.catalogue import PLANTS, PlantLike, plant_from
+from ..record import Record, read_record, read_sidecar
+from .catalogue import estimator_from
 from .contract import (
     AbstractEstimator,
     Estimate,
@@ -36,50 +40,79 @@ from .result import Fitted, Identification
 
 InitialState = Literal["auto", "free", "known"]
 _NOTHING_SEEN = (
-    "no parameter can be seen in the data; are columns, signs and units right, and does the "
-    "input move the plant beyond the noise? or has the search begun too far from the truth "
+    "no parameter is identifiable from the data; are columns, signs and units right, and does the "
+    "input move the plant beyond the noise? or did the search begin too far from the truth "
     "(--start)?"
 )
 _BY_CHANCE = 1e-3  # a fit that chance would reach more often explains nothing
 
 
+RecordLike: TypeAlias = Record | str | Path
+"""A record, or the path of an experiment file."""
+
+
 def identify(
-    plant: AbstractPlant,
-    records: Sequence[Record],
-    estimator: AbstractEstimator | None = None,
+    records: RecordLike | Sequence[RecordLike],
+    plant: PlantLike | None = None,
+    estimator: str | AbstractEstimator | type[AbstractEstimator] = "nls",
     *,
-    start: Mapping[str, float] | None = None,
+    start: Mapping[str, float] | Params | None = None,
+    hold: Mapping[str, float] | None = None,
     initial_state: InitialState = "auto",
-    validation: Sequence[Record] = (),
+    validate: RecordLike | Sequence[RecordLike] = (),
+    columns: Mapping[str, str] | None = None,
+    scales: Mapping[str, float] | None = None,
 ) -> Identification:
     """Parameters of one plant from one or several records.
 
+        >>> import excite as ex
+        >>> result = ex.identify(ex.simulate("aero2", "chirp", seed=0))
+        >>> result.status
+        'successful'
+        >>> round(result.params.K_pu, 4)
+        0.0125
+
     Args:
-        plant: its constants and sensor are taken as known; its dt gives way to the records'.
-        records: all with one sampling time.
-        estimator: default `NLS()`.
+        records: a record or the path of an experiment file, or several, with one sampling time.
+        plant: a name, `path/to/file.py:ClassName`, a plant or its class; its constants and
+            sensor are taken as known, its dt gives way to the records'. Default the plant that
+            the first record's sidecar names.
+        estimator: a name (`ex.estimators()` lists them), an estimator or its class.
         start: where the search begins, by name; default the nominal parameters.
+        hold: values of parameters that are known and not estimated, by name.
         initial_state: "known" (the plant's), "free" (estimated along), or "auto": known
             where every sidecar says so.
-        validation: records for which only the initial state is fitted.
+        validate: records for which only the initial state is fitted.
+        columns: names in the files where they are not the plant's: {"pitch": "qm"}.
+        scales: factors from the files' units to the plant's: {"pitch": 0.01745}.
 
     Raises:
         ValueError: for records too short, of different sampling times, or in which no
-            parameter can be seen, and for a start or a held value that is not allowed.
+            parameter can be identified, for a file that cannot be used, and for a name or a
+            value that is not allowed.
+        TypeError: for an argument of another type.
     """
-    estimator = NLS() if estimator is None else estimator
+    given = _listed(records, "records")
+    if not given:
+        raise ValueError("no record is given")
+    plant = plant_from(_plant_of(given[0]) if plant is None else plant)
+    estimator, begin = _chosen(estimator, plant, start, hold)
     if initial_state not in get_args(InitialState):
         raise ValueError(f"initial state {initial_state!r} is not one of: known, free, auto")
+    records, validation = (
+        [_read(r, plant.description, columns, scales) for r in group]
+        for group in (given, _listed(validate, "validate"))
+    )
     known = initial_state == "known" or (
         initial_state == "auto" and all(_starts_at(record, plant) for record in records)
     )
     _check_lengths(plant, [*records, *validation], known)
     plant = plant.changed(dt=_common_dt(plant, [*records, *validation]))
     experiments = _experiments(plant, records, known)
-    fit = _fit(plant, experiments, estimator, params_from(plant, start or {}))
+    fit = _fit(plant, experiments, estimator, begin)
     residual = _residuals(plant, records, experiments, estimator, fit)
     fitted = tuple(_fitted(plant.definition, *pair) for pair in zip(records, residual, strict=True))
-    if isinstance(estimator, NLS) and fit.estimate.status != Status.NOT_FINITE:
+    if isinstance(estimator, NLS) and not fit.has_ended_in(Status.NOT_FINITE):
         _require_explanation(records, residual, int(fit.free.sum()))
     whiteness = {
         name: _whiteness([r[:, i] for r in residual], plant.definition.outputs[i].scale)
@@ -99,8 +132,8 @@ def identify(
         plant=d,
         estimator=estimator.name,
         status=fit.status,
-        params={n: float(v) for n, v in zip(names, fit.estimate.params, strict=True)},
-        std_error={n: float(v) for n, v in zip(names, sd, strict=True)},
+        params=Named(zip(names, map(float, fit.estimate.params), strict=True)),
+        std_error=Named(zip(names, map(float, sd), strict=True)),
         held=tuple(n for n, is_free in zip(names, fit.free, strict=True) if not is_free),
         covariance=covariance,
         information=np.asarray(fit.estimate.information),
@@ -113,11 +146,79 @@ def identify(
     )
 
 
+def _listed(records: RecordLike | Sequence[RecordLike], what: str) -> list[RecordLike]:
+    """One or several records as a list."""
+    listed = [records] if isinstance(records, RecordLike) else records
+    allowed = "a record or the path of an experiment file, or several"
+    if not isinstance(listed, Sequence):
+        raise wrong_type(what, records, allowed)
+    for record in listed:
+        if not isinstance(record, RecordLike):
+            raise wrong_type(what, record, allowed)
+    return list(listed)
+
+
+def _plant_of(record: RecordLike) -> str:
+    """The plant that a record's sidecar names."""
+    is_read = isinstance(record, Record)
+    where = (record.source if is_read else str(record)) or "the record"
+    made_with = (record.metadata if is_read else read_sidecar(Path(record))).get("plant", {})
+    name = made_with.get("name")
+    if name is None:
+        raise ValueError(f"{where} has no sidecar that names its plant: name the plant")
+    if name not in PLANTS:
+        raise ValueError(
+            f"{where} is of plant {name!r}, which does not come with the package: give the plant "
+            "as path/to/file.py:ClassName, as an object or as a class"
+        )
+    return name
+
+
+def _read(
+    record: RecordLike,
+    description: PlantDescription,
+    columns: Mapping[str, str] | None,
+    scales: Mapping[str, float] | None,
+) -> Record:
+    """A record that has the plant's inputs and outputs."""
+    if not isinstance(record, Record):
+        return read_record(record, description, columns, scales)
+    found = record.inputs.shape[1], record.outputs.shape[1]
+    if found != (len(description.inputs), len(description.outputs)):
+        raise ValueError(
+            f"{record.source or 'the record'} has {found[0]} inputs and {found[1]} outputs; plant "
+            f"{description.name!r} has {len(description.inputs)} and {len(description.outputs)}"
+        )
+    return record
+
+
+def _chosen(
+    estimator: str | AbstractEstimator | type[AbstractEstimator],
+    plant: AbstractPlant,
+    start: Mapping[str, float] | Params | None,
+    hold: Mapping[str, float] | None,
+) -> tuple[AbstractEstimator, Params]:
+    """The estimator, and where its search begins."""
+    method = estimator_from(estimator)
+    for word, values in (("start", start), ("hold", hold)):
+        if values and not isinstance(method, NLS):
+            raise ValueError(
+                f"{method.name} estimates all parameters at once and takes no {word} (--{word})"
+            )
+    begin = params_from(plant, start)
+    if not hold:
+        return method, begin
+    held = params_from(plant, hold)
+    names = tuple(hold if isinstance(hold, Mapping) else begin._fields)
+    begin = begin._replace(**{name: getattr(held, name) for name in names})
+    return dataclasses.replace(method, known=names), begin
+
+
 def _starts_at(record: Record, plant: AbstractPlant) -> bool:
     """Whether the sidecar says that the record starts at this plant's initial state."""
     states = record.metadata.get("plant", {}).get("states", [])
     initial = [s.get("initial") for s in states]
-    return record.starts_at_initial_state and initial == plant.initial_state.tolist()
+    return record.starts_at_initial_state and initial == np.asarray(plant.initial_state).tolist()
 
 
 def _other_plant(record: Record, plant: AbstractPlant) -> tuple[str, ...]:
@@ -156,8 +257,8 @@ def _common_dt(plant: AbstractPlant, records: Sequence[Record]) -> float:
 
 
 def _experiments(plant: AbstractPlant, records: Sequence[Record], known: bool) -> Experiments:
-    inputs = [jnp.asarray(r.inputs[:-1]) for r in records]
-    return stack_experiments(plant, inputs, [jnp.asarray(r.outputs) for r in records], known)
+    inputs = [record.inputs[:-1] for record in records]
+    return stack_experiments(plant, inputs, [record.outputs for record in records], known)
 
 
 def _known(plant: AbstractPlant, estimator: AbstractEstimator) -> np.ndarray:
@@ -178,9 +279,12 @@ class _Fit:
     known: np.ndarray
     reasons: tuple[str, ...]
 
+    def has_ended_in(self, status: Status) -> bool:
+        return int(self.estimate.status) == status
+
     @property
     def is_successful(self) -> bool:
-        return int(self.estimate.status) == Status.SUCCESSFUL
+        return self.has_ended_in(Status.SUCCESSFUL)
 
     @property
     def status(self) -> str:
@@ -217,16 +321,16 @@ def _fit_seen(
     known = _known(plant, estimator)
     free, reasons = ~known, ()
     while True:
-        estimate = estimator(plant, experiments, start, jnp.asarray(free))
+        estimate = jax.device_get(estimator(plant, experiments, start, jax.device_put(free)))
         fit = _Fit(estimate, free, known, reasons)
         # ARX estimates all parameters or none.
-        if not isinstance(estimator, NLS) or estimate.status == Status.NOT_FINITE:
+        if not isinstance(estimator, NLS) or fit.has_ended_in(Status.NOT_FINITE):
             return fit
         held = _to_hold(plant, fit, start)
         if held is None:
             return fit
         chosen, value, why = held
-        start = start._replace(**{names[chosen]: jnp.asarray(value, float)})
+        start = start._replace(**{names[chosen]: floats(value)})
         free = free & (np.arange(len(names)) != chosen)
         reasons = (*reasons, why)
         if not free.any():
@@ -245,7 +349,7 @@ def _to_hold(plant: AbstractPlant, fit: _Fit, start: Params) -> tuple[int, float
         return None
     value = float(start[unseen[0]])
     why = f"{unseen[1]}; {names[unseen[0]]} was held at {value:g}"
-    return unseen[0], value, why + (", and the rest holds for that" if "apart" in why else "")
+    return unseen[0], value, why + (", and the rest holds for that" if "separately" in why else "")
 
 
 def _residuals(
@@ -266,7 +370,8 @@ def _residuals(
 
 def _with_initial_state(plant: AbstractPlant, experiments: Experiments, params: Params) -> Estimate:
     """The best initial states for given parameters."""
-    return NLS()(plant, experiments, params, jnp.zeros(len(params), bool))
+    held = jax.device_put(np.zeros(len(params), bool))
+    return jax.device_get(NLS()(plant, experiments, jax.device_put(params), held))
 
 
 def _confidence(
@@ -281,11 +386,13 @@ def _confidence(
     if not fit.is_successful:
         return covariance, (*fit.reasons, Status(int(fit.estimate.status)).sentence)
     names = names_of(plant.definition.parameters)
-    size = np.asarray(relative_size(plant, fit.estimate.params))
+    parameters = zip(plant.definition.parameters, fit.estimate.params, strict=True)
+    size = np.array([float(value) if p.positive else p.scale for p, value in parameters])
     remarks = ()
     coloured = [name for name, p in whiteness.items() if p < RARE]
     if coloured and isinstance(estimator, NLS):
-        S, residual = estimator.sensitivity(plant, experiments, fit.estimate, jnp.asarray(fit.free))
+        estimate, free = jax.device_put((fit.estimate, fit.free))
+        S, residual = estimator.sensitivity(plant, experiments, estimate, free)
         robust = robust_covariance(np.asarray(S), np.asarray(residual))
         robust = np.outer(size, size) * robust[: len(names), : len(names)]
         covariance = widened(covariance, robust)

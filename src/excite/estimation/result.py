@@ -5,16 +5,21 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
 
 from .. import __version__
-from ..description import HALF_95, PlantDescription, names_of
+from ..description import HALF_95, Named, PlantDescription, names_of
 from ..files import csv_text, new_run_folder, write_json
 from ..record import Record, write_record
+from ..report.results import data_frame, identification_html, identification_text, wrapped
 from .diagnosis import correlation, fit_percent
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from pandas import DataFrame
 
 
 @dataclass(frozen=True)
@@ -32,21 +37,28 @@ class Fitted:
     fit_percent: Mapping[str, float]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Identification:
-    """The result of `identify`.
+    """The result of `identify`; it shows itself as the table of `excite identify`.
+
+        >>> import excite as ex
+        >>> result = ex.identify(ex.simulate("aero2", "chirp"))
+        >>> low, high = result.ci95("J_p")
+        >>> low < result.params.J_p < high
+        True
 
     Attributes:
         plant: the plant as it was fitted, sampled as the records are.
         estimator: its name on the command line.
         status: in a few words; docs/reference/machine-readable.md lists them.
-        params, std_error: by parameter, in its unit; the error of a held one is nan.
+        params, std_error: by parameter, in its unit, as attribute or item; the error of a held
+            one is nan.
         held: parameters not estimated: unseen by the data and held where the search started,
             or held at a bound that they reached.
         covariance, information: of the estimates; see `excite.estimation.Estimate`.
         whiteness: by output, p-value of the residual being white (Ljung-Box).
         structure: by output, p-value of the residual not following past inputs.
-        verdict: sentences on what the data can see and how far to trust the intervals.
+        verdict: sentences on what is identifiable and how far to trust the intervals.
         fitted, validation: records beside their simulation.
         initial_state_known: whether initial states were taken as known.
     """
@@ -54,8 +66,8 @@ class Identification:
     plant: PlantDescription
     estimator: str
     status: str
-    params: Mapping[str, float]
-    std_error: Mapping[str, float]
+    params: Named[float]
+    std_error: Named[float]
     held: tuple[str, ...]
     covariance: Float[np.ndarray, "param param"]
     information: Float[np.ndarray, "param param"]
@@ -87,7 +99,40 @@ class Identification:
         )
         return {n: fit_percent(measured[:, i], simulated[:, i]) for i, n in enumerate(outputs)}
 
-    def to_dict(self) -> dict[str, Any]:
+    def __str__(self) -> str:
+        return identification_text(self.to_dict())
+
+    def __repr__(self) -> str:
+        return wrapped(str(self))
+
+    def _repr_html_(self) -> str:
+        return identification_html(self.to_dict())
+
+    def plot(self) -> Figure:
+        """Measured against simulated outputs of the first record, residuals, intervals."""
+        from ..report.figures import identification_figure
+
+        first = self.fitted[0]
+        return identification_figure(self.plant, self.to_dict(), first.record, first.simulated)
+
+    def to_pandas(self) -> DataFrame:
+        """One row a parameter: estimate, standard error, 95 % interval, unit.
+
+        Raises:
+            ValueError: where pandas is not installed.
+        """
+        intervals = [self.ci95(name) for name in self.params]
+        columns = {
+            "estimate": list(self.params.values()),
+            "std_error": list(self.std_error.values()),
+            "ci95_low": [low for low, _ in intervals],
+            "ci95_high": [high for _, high in intervals],
+            "unit": [p.unit for p in self.plant.parameters],
+            "held": [name in self.held for name in self.params],
+        }
+        return data_frame(columns, list(self.params))
+
+    def to_dict(self) -> dict[str, object]:
         """The result as JSON-ready data; docs/reference/machine-readable.md lists its keys."""
         return {
             "plant": self.plant.name,

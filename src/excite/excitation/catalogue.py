@@ -6,15 +6,16 @@ import hashlib
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeAlias, runtime_checkable
 
-import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
 
-from ..description import unknown
-from ..plant import AbstractPlant
+from ..description import Listing, first_line, unknown, wrong_type
+from ..plant import AbstractPlant, floats
 from ..plant.fields import with_options
-from ..policy import POLICY_ENDING, mismatch, policy_path, read_policy, shipped_policies
-from ..record import read_signal
+from ..policy import POLICY_ENDING, Policy, mismatch, policy_path, read_policy, shipped_policies
+from ..record import Record, read_signal, require_playable
 from ..record.read import SIGNAL_ENDINGS
 from .contract import AbstractExcitation, AbstractShape
 from .feedback import PolicyExcitation, PositionLoop
@@ -32,8 +33,38 @@ LOOP = "loop-"
 """Before the name of an excitation: it is the reference of a position loop."""
 
 
+def excitations() -> Listing:
+    """The excitations that need no training, by name.
+
+    >>> import excite as ex
+    >>> list(ex.excitations())
+    ['random', 'prbs', 'chirp', 'multisine', 'square', 'decay', 'loop-NAME']
+    """
+    listed = {name: first_line(kind) for name, kind in EXCITATIONS.items()}
+    return Listing({**listed, f"{LOOP}NAME": first_line(PositionLoop)})
+
+
+Inputs: TypeAlias = Float[np.ndarray, "time input"] | Float[Array, "time input"]
+
+
+@runtime_checkable
+class HasInputs(Protocol):
+    """A record or a designed signal."""
+
+    @property
+    def inputs(self) -> Inputs:
+        """By sample and input [input units]."""
+        ...
+
+
+ExcitationLike: TypeAlias = (
+    str | Path | AbstractExcitation | type[AbstractExcitation] | Policy | HasInputs | Inputs
+)
+"""An excitation, its class or name; a policy, a record or design to replay, or its file; inputs."""
+
+
 def excitation_named(
-    name: str, options: Mapping[str, Any], plant: AbstractPlant
+    name: ExcitationLike, options: Mapping[str, Any], plant: AbstractPlant
 ) -> AbstractExcitation:
     """An excitation by name, or a trained policy, checked against the plant.
 
@@ -44,7 +75,7 @@ def excitation_named(
 
 
 def excitation_and_origin(
-    name: str, options: Mapping[str, Any], plant: AbstractPlant
+    given: ExcitationLike, options: Mapping[str, Any], plant: AbstractPlant
 ) -> tuple[AbstractExcitation, dict[str, str]]:
     """An excitation, and what a record must say of the policy that it is.
 
@@ -54,31 +85,71 @@ def excitation_and_origin(
     Raises:
         ValueError: for an unknown name or option, a value that is not allowed, or a policy
             that may not excite this plant.
+        TypeError: for an object that is no excitation.
     """
-    path = policy_path(name)
-    if path is not None:
+    name = str(given) if isinstance(given, str | Path) else name_of(given)
+    path = policy_path(name) if isinstance(given, str | Path) else None
+    if path is not None or isinstance(given, Policy):
         if options:
             raise ValueError(f"a policy has no options: got {', '.join(options)}")
-        policy = read_policy(path)
+        policy = given if isinstance(given, Policy) else read_policy(path or Path(name))
         try:
             warning = mismatch(policy, plant.description)
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from None
         origin = {"policy_hash": policy.hash} | ({} if warning is None else {"warning": warning})
         return PolicyExcitation.of(policy), origin
-    if name.endswith(SIGNAL_ENDINGS):
-        signal = _recorded(name, options, plant)
-        return signal, {"signal_hash": hashlib.sha256(Path(name).read_bytes()).hexdigest()}
-    excitation = _classical(name, options, plant)
+    if isinstance(given, str | Path):
+        if name.endswith(SIGNAL_ENDINGS):
+            signal = _recorded(name, options, plant)
+            return signal, {"signal_hash": hashlib.sha256(Path(name).read_bytes()).hexdigest()}
+        excitation = _classical(name, options, plant)
+    else:
+        excitation = _object(given, name, options, plant)
     _check_excitation(excitation, plant)
     return excitation, {}
+
+
+def name_of(given: object) -> str:
+    """The word for an excitation that is an object: a record's or a command's."""
+    kind = given if isinstance(given, type) else type(given)
+    if isinstance(given, PositionLoop):
+        return LOOP + name_of(given.signal)
+    if not issubclass(kind, AbstractExcitation):
+        return "policy" if isinstance(given, Policy) else "replay"
+    shipped = {c: word for word, c in EXCITATIONS.items()}
+    return shipped.get(kind, kind.__name__)  # pyright: ignore[reportArgumentType, reportCallIssue]
+
+
+def _object(
+    given: object, name: str, options: Mapping[str, Any], plant: AbstractPlant
+) -> AbstractExcitation:
+    """An excitation from anything that is no name and no policy."""
+    if isinstance(given, type) and issubclass(given, AbstractExcitation):
+        given = given()
+    if isinstance(given, AbstractExcitation):
+        return with_options(given, name, options) if options else given
+    inputs = given.inputs if isinstance(given, HasInputs) else given
+    is_sequence = isinstance(inputs, np.ndarray | Array) and inputs.dtype.kind in "fiu"
+    if not is_sequence or inputs.ndim != 2:
+        raise wrong_type(
+            "excitation",
+            given,
+            "a name, an excitation or its class, a policy, a record, or an array of inputs by "
+            "sample and input",
+        )
+    if options:
+        raise ValueError(f"recorded inputs have no options: got {', '.join(options)}")
+    if isinstance(given, Record):
+        require_playable(given, plant.definition)
+    return Replay(floats(inputs))
 
 
 def _recorded(name: str, options: Mapping[str, Any], plant: AbstractPlant) -> Replay:
     """The designed or recorded input in a file."""
     if options:
         raise ValueError(f"a signal from a file has no options: got {', '.join(options)}")
-    return Replay(jnp.asarray(read_signal(Path(name), plant.description).inputs))
+    return Replay(floats(read_signal(Path(name), plant.description).inputs))
 
 
 def _classical(name: str, options: Mapping[str, Any], plant: AbstractPlant) -> AbstractExcitation:

@@ -1,21 +1,24 @@
-"""Plants by name: those that are shipped, and a user's own file."""
+"""Plants by name: those that are shipped, and those of a user's file."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from ..description import names_of, unknown
+from ..description import Listing, first_line, names_of, unknown, wrong_type
 from ..files import class_at
 from .aero2 import Aero2, Aero2Detailed, Aero2Lag
 from .cart_pole import CartPole
-from .contract import AbstractPlant, Sensor
+from .contract import AbstractPlant, Sensor, as_number, require_double_precision
 from .dc_motor import DCMotor
 from .emps import EMPS
+from .fields import floats
 
 PLANTS: Mapping[str, type[AbstractPlant]] = {
     "aero2": Aero2,
@@ -27,11 +30,47 @@ PLANTS: Mapping[str, type[AbstractPlant]] = {
 }
 
 
+def plants() -> Listing:
+    """The plants that come with the package, by name.
+
+    >>> import excite as ex
+    >>> "aero2" in ex.plants()
+    True
+    """
+    return Listing({name: first_line(kind) for name, kind in PLANTS.items()})
+
+
+PlantLike: TypeAlias = str | AbstractPlant | type[AbstractPlant]
+"""A plant, its class, its name, or `path/to/file.py:ClassName`."""
+
+
+def plant_from(given: PlantLike) -> AbstractPlant:
+    """A plant in double precision: by name, of a class, or as it is.
+
+    Raises:
+        ValueError: as `plant_named`, and for functions that do not fit the description.
+        TypeError: for anything else.
+    """
+    require_double_precision()
+    if isinstance(given, str):
+        return plant_named(given)
+    where = given.__name__ if isinstance(given, type) else type(given).__name__
+    if isinstance(given, type) and issubclass(given, AbstractPlant):
+        given = _complete(given, where)
+    if not isinstance(given, AbstractPlant):
+        allowed = "a name, path/to/file.py:ClassName, a plant or its class"
+        raise wrong_type("plant", given, allowed)
+    if given.dt.dtype != float:  # made in single precision: the numbers that were written down
+        return jax.tree.map(lambda x: floats(np.asarray(x).astype(str).astype(float)), given)
+    _check_plant(given, where)
+    return given
+
+
 def plant_named(name: str) -> AbstractPlant:
-    """A shipped plant by name, or a user's own as `path/to/file.py:ClassName`.
+    """A shipped plant by name, or that of a user's file as `path/to/file.py:ClassName`.
 
     The user's file is imported, that is run: a name of this kind is only ever taken from
-    the user's own command line or study file.
+    the user's command line, script or study file.
 
     Raises:
         ValueError: for an unknown name, or a file without such a class.
@@ -42,12 +81,17 @@ def plant_named(name: str) -> AbstractPlant:
     if not colon or not path.endswith(".py"):
         raise unknown("plant", name, [*PLANTS, "path/to/file.py:ClassName"])
     plant_class = class_at(Path(path), class_name, AbstractPlant, "plant")
-    try:
-        plant = plant_class()
-    except (TypeError, AttributeError) as error:  # a method or the definition is missing
-        raise ValueError(f"{class_name} in {path} is not a complete plant: {error}") from None
+    plant = _complete(plant_class, f"{class_name} in {path}")
     _check_plant(plant, f"{class_name} in {path}")
     return plant
+
+
+def _complete(plant_class: type[AbstractPlant], where: str) -> AbstractPlant:
+    """A plant of a class, with its default numbers."""
+    try:
+        return plant_class()
+    except (TypeError, AttributeError) as error:  # a method or the definition is missing
+        raise ValueError(f"{where} is not a complete plant: {error}") from None
 
 
 def _check_plant(plant: AbstractPlant, where: str) -> None:
@@ -60,6 +104,15 @@ def _check_plant(plant: AbstractPlant, where: str) -> None:
     ):
         try:
             shape = jnp.shape(jax.eval_shape(getattr(plant, name), *arguments))
+        except jax.errors.ConcretizationTypeError as error:
+            raise ValueError(
+                f"{name} of {where} decides by the value of a state, an input or a parameter "
+                "(if, while, and, or, float, int): use jnp.where(condition, value, otherwise)"
+            ) from error
+        except jax.errors.TracerArrayConversionError as error:
+            raise ValueError(
+                f"{name} of {where} uses NumPy: use jax.numpy (import jax.numpy as jnp)"
+            ) from error
         except Exception as error:
             raise ValueError(f"{name} of {where} fails: {type(error).__name__}: {error}") from error
         if shape != (count,):
@@ -67,20 +120,26 @@ def _check_plant(plant: AbstractPlant, where: str) -> None:
 
 
 def with_sensor(
-    plant: AbstractPlant, noise_sd: Mapping[str, float], resolution: Mapping[str, float]
+    plant: AbstractPlant,
+    noise_sd: Mapping[str, float] | None,
+    resolution: Mapping[str, float] | None = None,
 ) -> AbstractPlant:
     """The plant with another noise or resolution of the outputs named, in their units.
 
     Raises:
         ValueError: for an unknown output, or a value that is negative or not finite.
+        TypeError: for a value that is no number.
     """
     outputs, sensor = names_of(plant.definition.outputs), plant.sensor
     numbers = {"noise": sensor.noise_sd.tolist(), "resolution": sensor.resolution.tolist()}
-    for what, given in (("noise", noise_sd), ("resolution", resolution)):
+    for what, given in (("noise", noise_sd or {}), ("resolution", resolution or {})):
+        if not isinstance(given, Mapping):
+            raise wrong_type(what, given, "a dict by output")
         for name, value in given.items():
             if name not in outputs:
                 raise unknown(f"{plant.definition.name} output", name, outputs)
+            value = as_number(f"{what} of {name!r}", value)
             if not (math.isfinite(value) and value >= 0):
                 raise ValueError(f"{what} of {name!r} must be zero or positive: got {value:g}")
             numbers[what][outputs.index(name)] = value
-    return plant.changed(sensor=Sensor(*(jnp.asarray(v) for v in numbers.values())))
+    return plant.changed(sensor=Sensor(*map(floats, numbers.values())))

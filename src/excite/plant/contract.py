@@ -13,6 +13,7 @@ compilation.
 from __future__ import annotations
 
 import abc
+import contextlib
 import dataclasses
 import math
 from collections import namedtuple
@@ -23,13 +24,26 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeAlias
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from ..description import PlantDescription, names_of
+from ..description import PlantDescription, names_of, wrong_type
+from ..report.results import plant_text
+from .fields import floats
 
 # Estimation and information are of no value in single precision. Everything that computes
 # starts with a plant, so this is the one place where the process is switched.
 jax.config.update("jax_enable_x64", True)
+
+
+def require_double_precision() -> None:
+    """Raises ValueError where JAX was switched back to single precision."""
+    if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
+        raise ValueError(
+            "estimation and information need double precision: "
+            'call jax.config.update("jax_enable_x64", True) first'
+        )
+
 
 Params: TypeAlias = Any
 """The unknown parameters: a named tuple of scalars in the order of the description."""
@@ -62,7 +76,25 @@ else:
 
 
 class AbstractPlant(_Module):
-    """Base of all plants.
+    """Base of all plants: a class with a `definition`, a `derivative` and an `output`.
+
+        >>> import excite as ex
+        >>> class Tank(ex.AbstractPlant):
+        ...     definition = ex.PlantDescription(
+        ...         name="tank",
+        ...         states=(ex.State("level", "m", initial=1.0),),
+        ...         inputs=(ex.Input("inflow", "m³/s", 0.0, 0.02),),
+        ...         outputs=(ex.Output("level", "m", scale=1.0, noise_sd=0.01),),
+        ...         parameters=(ex.Parameter("area", "m²", 1.5),),
+        ...         dt=1.0,
+        ...         band=(0.001, 0.1),
+        ...     )
+        ...     def derivative(self, state, input, params):
+        ...         return (input - 0.005 * state) / params.area
+        ...     def output(self, state, params):
+        ...         return state
+        >>> ex.simulate(Tank, "prbs", steps=50).outputs.shape
+        (51, 1)
 
     Attributes:
         definition: the class's description with its default numbers.
@@ -104,20 +136,23 @@ class AbstractPlant(_Module):
                 f"it has {', '.join(values) or 'none'}"
             )
         values |= constants
-        self.constants = _tuple_type("Constants", tuple(values))(
-            *(jnp.asarray(v, float) for v in values.values())
-        )
+        self.constants = _tuple_type("Constants", tuple(values))(*map(floats, values.values()))
         self.sensor = sensor or Sensor(
-            jnp.asarray([o.noise_sd for o in d.outputs]),
-            jnp.asarray([o.resolution for o in d.outputs]),
+            floats([o.noise_sd for o in d.outputs]), floats([o.resolution for o in d.outputs])
         )
         at_rest = [s.initial for s in d.states]
-        self.initial_state = jnp.asarray(at_rest if initial_state is None else initial_state, float)
-        self.dt = jnp.asarray(d.dt if dt is None else dt, float)
+        self.initial_state = floats(at_rest if initial_state is None else initial_state)
+        self.dt = floats(d.dt if dt is None else dt)
         # Without a dt of its own a plant can be built of traced numbers.
         self.substeps = (
             d.substeps if dt is None else math.ceil(float(dt) * d.substeps / d.dt - 1e-3)
         )
+
+    def __repr__(self) -> str:
+        try:
+            return plant_text(self.description)
+        except TypeError:  # numbers that JAX traces cannot be shown
+            return plant_text(self.definition)
 
     @abc.abstractmethod
     def derivative(
@@ -137,7 +172,7 @@ class AbstractPlant(_Module):
     @property
     def nominal(self) -> Params:
         """Nominal parameters."""
-        return self.Params(*(jnp.asarray(p.nominal, float) for p in self.definition.parameters))
+        return self.Params(*(floats(p.nominal) for p in self.definition.parameters))
 
     @property
     def description(self) -> PlantDescription:
@@ -152,12 +187,14 @@ class AbstractPlant(_Module):
             outputs=tuple(
                 dataclasses.replace(o, noise_sd=float(sd), resolution=float(resolution))
                 for o, sd, resolution in zip(
-                    d.outputs, self.sensor.noise_sd, self.sensor.resolution, strict=True
+                    d.outputs,
+                    *map(np.asarray, (self.sensor.noise_sd, self.sensor.resolution)),
+                    strict=True,
                 )
             ),
             states=tuple(
                 dataclasses.replace(s, initial=float(x))
-                for s, x in zip(d.states, self.initial_state, strict=True)
+                for s, x in zip(d.states, np.asarray(self.initial_state), strict=True)
             ),
             dt=dt,
             band=(min(d.band[0], 0.25 / dt), min(d.band[1], 0.5 / dt)),
@@ -197,33 +234,51 @@ class AbstractARXPlant(AbstractPlant):
         """Physical parameters of y'' + c_1 y' + c_0 y = d_0 u."""
 
 
-def params_from(plant: AbstractPlant, values: Mapping[str, float]) -> Params:
-    """Nominal parameters, but for those given.
+def params_from(plant: AbstractPlant, values: Mapping[str, float] | Params | None = None) -> Params:
+    """Nominal parameters, but for those given, by name or as the plant's named tuple.
 
     Raises:
         ValueError: for an unknown name or a value outside the parameter's bounds.
+        TypeError: for anything else.
     """
-    names = names_of(plant.definition.parameters)
-    for name, value in values.items():
-        if name not in names:
-            raise ValueError(
-                f"plant {plant.definition.name!r} has no parameter {name!r}; "
-                f"it has {', '.join(names)}"
-            )
-        p = plant.definition.parameters[names.index(name)]
-        lower = 0.0 if p.positive and p.lower is None else p.lower
-        if not (
-            math.isfinite(value)
-            and (lower is None or value > lower)
-            and (p.upper is None or value < p.upper)
-        ):
-            raise ValueError(
-                f"{name} = {value:g} {p.unit} is not allowed; it must be finite, above "
-                f"{'minus infinity' if lower is None else format(lower, 'g')} and below "
-                f"{'infinity' if p.upper is None else format(p.upper, 'g')}"
-            )
-    given = {name: jnp.asarray(value, float) for name, value in values.items()}
-    return plant.nominal._replace(**given)
+    if isinstance(values, tuple) and hasattr(values, "_asdict"):
+        values = values._asdict()
+    if not isinstance(values, Mapping | None):
+        raise wrong_type("params", values, "a dict by name or the plant's named tuple")
+    return plant.nominal._replace(
+        **{name: floats(_allowed(plant, name, value)) for name, value in (values or {}).items()}
+    )
+
+
+def _allowed(plant: AbstractPlant, name: str, value: object) -> float:
+    """The value of a parameter, within its bounds."""
+    parameters = {p.name: p for p in plant.definition.parameters}
+    if name not in parameters:
+        raise ValueError(
+            f"plant {plant.definition.name!r} has no parameter {name!r}; "
+            f"it has {', '.join(parameters)}"
+        )
+    p, number = parameters[name], as_number(name, value)
+    lower = 0.0 if p.positive and p.lower is None else p.lower
+    if not (
+        math.isfinite(number)
+        and (lower is None or number > lower)
+        and (p.upper is None or number < p.upper)
+    ):
+        raise ValueError(
+            f"{name} = {number:g} {p.unit} is not allowed; it must be finite, above "
+            f"{'minus infinity' if lower is None else format(lower, 'g')} and below "
+            f"{'infinity' if p.upper is None else format(p.upper, 'g')}"
+        )
+    return number
+
+
+def as_number(name: str, value: object) -> float:
+    """One number; TypeError for a text, a list or anything else."""
+    if np.ndim(value) == 0 and not isinstance(value, str | bool):  # pyright: ignore[reportArgumentType]
+        with contextlib.suppress(TypeError, ValueError):
+            return float(value)  # pyright: ignore[reportArgumentType]
+    raise wrong_type(name, value, "a number")
 
 
 def draw_params(

@@ -14,7 +14,9 @@ from types import UnionType
 from typing import TypeVar, get_args, get_type_hints
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 from numpy.typing import ArrayLike
 
@@ -24,8 +26,10 @@ _Module = TypeVar("_Module", bound=eqx.Module)
 
 
 def floats(value: ArrayLike) -> Array:
-    """An array of floating-point numbers, also from whole ones; converts fields."""
-    return jnp.asarray(value, float)
+    """An array in double precision, also from whole numbers; what is traced stays traced."""
+    if isinstance(value, jax.core.Tracer):
+        return jnp.asarray(value, float)
+    return jax.device_put(np.asarray(value, float))  # compiles nothing, as jnp.asarray would
 
 
 def optional_floats(value: ArrayLike | None) -> Array | None:

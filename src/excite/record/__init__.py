@@ -10,5 +10,6 @@ from .read import read_record as read_record
 from .read import read_signal as read_signal
 from .record import RECORD_KIND as RECORD_KIND
 from .record import Record as Record
+from .record import read_sidecar as read_sidecar
 from .record import require_record_path as require_record_path
 from .record import write_record as write_record

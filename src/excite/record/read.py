@@ -18,7 +18,7 @@ import numpy as np
 
 from ..description import PlantDescription, names_of
 from .prepare import TIMES_DT, check_finite, check_size, check_time, require_playable
-from .record import Record, read_sidecar, require_matlab, require_record_ending
+from .record import Record, described_in, read_sidecar, require_matlab, require_record_ending
 from .table import text_columns
 
 _MAX_UNPACKED = 256 * 2**20  # bytes of all columns of a MAT file, which is compressed
@@ -27,7 +27,7 @@ _MAT_NUMBERS = re.compile(r"double|single|u?int(8|16|32|64)|logical")
 
 def read_record(
     path: str | os.PathLike[str],
-    description: PlantDescription,
+    description: PlantDescription | None = None,
     columns: Mapping[str, str] | None = None,
     scales: Mapping[str, float] | None = None,
     *,
@@ -35,8 +35,15 @@ def read_record(
 ) -> Record:
     """The experiment in a CSV or MAT file, checked against a plant.
 
+        >>> import excite as ex, tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     ex.simulate("aero2", steps=100).save(f"{folder}/r.csv")
+        ...     ex.read_record(f"{folder}/r.csv").inputs.shape
+        (101, 1)
+
     Args:
         path: the file; its ending tells its kind.
+        description: the plant; default the one that the sidecar names.
         columns: names in the file where they are not the plant's: {"pitch": "qm"}.
         scales: factors from the file's unit to the plant's: {"pitch": 0.01745}.
         inputs_only: whether the file is a designed input without outputs; the record
@@ -48,6 +55,8 @@ def read_record(
             uneven sampling, values far outside what the plant can do.
     """
     path, columns, scales = Path(path), columns or {}, scales or {}
+    if description is None:
+        description = described_in(path)
     for name in (*columns, *scales):
         if name not in description.columns:
             raise ValueError(

@@ -8,24 +8,31 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from ..description import PlantDescription
+from ..description import PlantDescription, wrong_type
 from ..files import csv_text, require_new_file, write_bytes, write_json
 
-try:  # a laboratory computer runs experiments without it, on CSV files
-    import scipy.io as matlab
-except ImportError:
-    matlab = None
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from pandas import DataFrame
 
 RECORD_KIND = "excite record"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Record:
     """One recorded experiment.
+
+        >>> import excite as ex
+        >>> ex.simulate("aero2", "chirp", steps=100)
+        record of aero2, chirp: 101 samples, every 0.1 s
+          voltage: -7.19 to 7.18 V
+          pitch: -8.36 to 9.85 deg
 
     Attributes:
         time: sampling instants [s].
@@ -44,9 +51,9 @@ class Record:
     @classmethod
     def of_episode(
         cls,
-        time: Any,
-        inputs: Any,
-        outputs: Any,
+        time: ArrayLike,
+        inputs: ArrayLike,
+        outputs: ArrayLike,
         metadata: Mapping[str, Any] | None = None,
         source: str = "",
     ) -> Record:
@@ -54,6 +61,56 @@ class Record:
         inputs = np.asarray(inputs)
         held = np.concatenate([inputs, inputs[-1:]])
         return cls(np.asarray(time), held, np.asarray(outputs), metadata or {}, source)
+
+    def __post_init__(self) -> None:
+        for name, dimensions in (("time", 1), ("inputs", 2), ("outputs", 2)):
+            try:
+                values = np.asarray(getattr(self, name), float)
+            except (TypeError, ValueError):
+                raise wrong_type(name, getattr(self, name), "an array of numbers") from None
+            if values.ndim == 1 and dimensions == 2:  # of a plant with one input or output
+                values = values[:, None]
+            if values.ndim != dimensions or len(values) != np.size(self.time):
+                raise ValueError(
+                    f"{name} of a record needs one row for each of {np.size(self.time)} samples: "
+                    f"got shape {values.shape}"
+                )
+            object.__setattr__(self, name, values)
+
+    def __repr__(self) -> str:
+        from ..report.results import record_text
+
+        return record_text(self)
+
+    @property
+    def description(self) -> PlantDescription:
+        """The plant that the sidecar names; ValueError without one."""
+        if not self.metadata.get("plant"):
+            raise ValueError(f"{self.source or 'the record'} has no sidecar that names its plant")
+        return PlantDescription.from_dict(self.metadata["plant"])
+
+    def save(self, path: str | os.PathLike[str], overwrite: bool = False) -> None:
+        """Writes the record as CSV or MAT, as the ending says, and its sidecar.
+
+        Raises:
+            ValueError: for another ending, a folder that does not exist, a file that exists
+                and not `overwrite`, and a record without a plant.
+        """
+        require_record_path(Path(path), overwrite)
+        write_record(path, self, self.description)
+
+    def plot(self) -> Figure:
+        """Inputs and outputs over time, with the safety levels; ValueError without a plant."""
+        from ..report.figures import episode_figure
+
+        return episode_figure(self.description, self)
+
+    def to_pandas(self) -> DataFrame:
+        """Columns time, inputs, outputs, by the plant's names; ValueError without pandas."""
+        from ..report.results import data_frame
+
+        values = np.column_stack([self.time, self.inputs, self.outputs]).T
+        return data_frame(dict(zip(self.description.columns, values, strict=True)))
 
     @property
     def dt(self) -> float:
@@ -81,11 +138,15 @@ def require_record_path(path: Path, overwrite: bool) -> None:
     require_new_file(path, overwrite)
 
 
-def require_matlab(path: Path) -> Any:
+def require_matlab(path: Path) -> ModuleType:
     """SciPy's reader and writer of MAT files; ValueError where SciPy is not installed."""
-    if matlab is None:
-        raise ValueError(f"{path}: MAT files need SciPy (pip install scipy); CSV does not")
-    return matlab
+    try:  # a laboratory computer runs experiments without it, on CSV files
+        import scipy.io
+    except ImportError:
+        raise ValueError(
+            f"{path}: MAT files need SciPy (pip install scipy); CSV does not"
+        ) from None
+    return scipy.io
 
 
 def read_sidecar(path: Path) -> Mapping[str, Any]:
@@ -108,6 +169,14 @@ def read_sidecar(path: Path) -> Mapping[str, Any]:
         except ValueError as error:
             raise ValueError(f"{sidecar}: {error}") from None
     return content
+
+
+def described_in(path: Path) -> PlantDescription:
+    """The plant that a record's sidecar names; ValueError without one."""
+    content = read_sidecar(path).get("plant")
+    if not content:
+        raise ValueError(f"{path} has no sidecar that names its plant: name the plant")
+    return PlantDescription.from_dict(content)
 
 
 def write_record(

@@ -75,7 +75,9 @@ def _words(cell: str) -> str:
 
 
 def _wrapped(cell: str, width: int) -> list[str]:
-    lines = textwrap.wrap(_words(cell), width, break_long_words=False, break_on_hyphens=False)
+    lines = textwrap.wrap(
+        _words(cell), max(width, 1), break_long_words=False, break_on_hyphens=False
+    )
     return [line.replace("\N{NO-BREAK SPACE}", " ") for line in lines] or [""]
 
 

@@ -143,7 +143,7 @@ def answers(target: str, arguments: Mapping[str, object]) -> Generator[Answer, N
     except MemoryError:
         yield _failure("this needs more memory than a worker may take")
     except (Exception, SystemExit) as error:  # subclasses of ValueError come from libraries
-        is_mistake = type(error) is ValueError
+        is_mistake = type(error) is ValueError or type(error).__module__.startswith("excite.")
         yield _failure(str(error) if is_mistake else sentence_of(error), is_mistake)
 
 

@@ -15,19 +15,17 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from .. import __version__
 from ..description import HALF_95, PlantDescription, display_unit, unknown
 from ..estimation import NLS, Experiments, Status, stack_experiments
-from ..estimation.catalogue import ESTIMATORS, estimator_named
+from ..estimation.catalogue import ESTIMATORS
 from ..estimation.identify import identify
 from ..estimation.result import Identification, write_run
-from ..excitation import AbstractExcitation, PolicyExcitation
-from ..excitation.catalogue import EXCITATIONS, LOOP, excitation_and_origin
-from ..files import json_ready, write_bytes
+from ..excitation.catalogue import EXCITATIONS, LOOP
+from ..files import write_bytes
 from ..information import (
     cramer_rao_bound,
     d_optimality,
@@ -35,14 +33,14 @@ from ..information import (
     require_noise,
     running_information,
 )
-from ..plant import AbstractPlant, Params, params_from
-from ..plant.catalogue import PLANTS, with_sensor
+from ..plant import AbstractPlant
+from ..plant.catalogue import PLANTS
 from ..policy import mismatch, read_policy, shipped_policies
-from ..record import Record, columns_in, read_record
+from ..record import columns_in
 from ..report.figure import kept_samples
 from ..report.html import report_html
 from ..safety import critical_levels, is_violation, max_abs_output
-from ..simulation import Trajectory, run_episode
+from ..simulation import Experiment, Trajectory
 
 Event = dict[str, Any]
 NUM_ESTIMATES = 20
@@ -104,63 +102,28 @@ def _shown(description: PlantDescription) -> dict[str, Any]:
 # --------------------------------------------------------------------------- experiments
 
 
-@dataclasses.dataclass(frozen=True)
-class Experiment:
-    """One simulated experiment as it was asked for.
+def _experiment(asked: Mapping[str, Any], name: str) -> Experiment:
+    """The experiment asked for, or the same with another excitation.
 
-    Attributes:
-        plant: with the sensor of this experiment.
-        params: true ones.
-        origin: what the record must say of a policy.
-        num_steps, seed: its length, and what its noise depends on.
+    Raises:
+        ValueError: for anything that is not known or not allowed.
     """
-
-    plant: AbstractPlant
-    params: Params
-    excitation: AbstractExcitation
-    name: str
-    origin: Mapping[str, str]
-    num_steps: int
-    seed: int
-
-    @classmethod
-    def of(cls, asked: Mapping[str, Any], name: str) -> Experiment:
-        """With another excitation than the one asked for, the rest is the same.
-
-        Raises:
-            ValueError: for anything that is not known or not allowed.
-        """
-        plant = with_sensor(_plant(asked["plant"]), asked["noise"], {})
-        require_noise(plant)
-        allowed = [*EXCITATIONS, *(LOOP + n for n in EXCITATIONS), *shipped_policies()]
-        if name not in allowed:
-            raise unknown("excitation", name, allowed)
-        # An amplitude is in units of the input, that of a loop in units of the output.
-        amplitude = asked["amplitude"] if name in EXCITATIONS else None
-        settings = {} if amplitude is None else {"amplitude": amplitude}
-        excitation, origin = excitation_and_origin(name, settings, plant)
-        steps = asked["steps"]
-        if isinstance(excitation, PolicyExcitation) and steps > excitation.layout.num_steps:
-            raise ValueError(
-                f"{name} was made for {excitation.layout.num_steps} steps; {steps} are asked for"
-            )
-        params = params_from(plant, asked["params"])
-        return cls(plant, params, excitation, name, origin, steps, asked["seed"])
-
-    def run(self) -> Trajectory:
-        """Input and output of every sample.
-
-        Raises:
-            ValueError: where the simulation leaves the finite numbers.
-        """
-        key = jax.random.key(self.seed)
-        run = run_episode(self.plant, self.params, self.excitation, self.num_steps, key)
-        if not np.all(np.isfinite(run.outputs)):
-            raise ValueError(
-                "the simulation left the finite numbers: these parameters make the plant too "
-                "fast for its integration step, or unstable"
-            )
-        return run
+    allowed = [*EXCITATIONS, *(LOOP + n for n in EXCITATIONS), *shipped_policies()]
+    if name not in allowed:
+        raise unknown("excitation", name, allowed)
+    # An amplitude is in units of the input, that of a loop in units of the output.
+    amplitude = asked["amplitude"] if name in EXCITATIONS else None
+    experiment = Experiment.of(
+        _plant(asked["plant"]),
+        name,
+        options={} if amplitude is None else {"amplitude": amplitude},
+        steps=asked["steps"],
+        params=asked["params"],
+        noise=asked["noise"],
+        seed=asked["seed"],
+    )
+    require_noise(experiment.plant)
+    return experiment
 
 
 def _plant(name: str) -> AbstractPlant:
@@ -170,25 +133,9 @@ def _plant(name: str) -> AbstractPlant:
     return PLANTS[name]()
 
 
-def simulated_record(
-    run: Trajectory, plant: AbstractPlant, params: Params, provenance: Mapping[str, Any]
-) -> Record:
-    """The record of a simulated experiment, as `excite simulate` writes it."""
-    return Record.of_episode(
-        run.time,
-        run.inputs,
-        run.measured,
-        {
-            "params": _by_name(plant.definition.parameters, params),
-            "starts_at_initial_state": True,
-            "provenance": {"excite": __version__, "simulated": True, **provenance},
-        },
-    )
-
-
 def episode(asked: Mapping[str, Any]) -> Iterator[Event]:
     """All samples of the experiment asked for: what there is to be shown first."""
-    own = Experiment.of(asked, asked["excitation"])
+    own = _experiment(asked, asked["excitation"])
     run, d = own.run(), own.plant.description
     yield {
         "kind": "episode",
@@ -208,7 +155,7 @@ def followed(asked: Mapping[str, Any], folder: str) -> Iterator[Event]:
     The run folder of the identification is left at `folder`, the same as that of
     `excite simulate` and `excite identify` one after the other.
     """
-    own = Experiment.of(asked, asked["excitation"])
+    own = _experiment(asked, asked["excitation"])
     run = own.run()
     information = running_information(own.plant, own.params, run.inputs)
     yield from _estimates(own, run, information)
@@ -219,7 +166,7 @@ def followed(asked: Mapping[str, Any], folder: str) -> Iterator[Event]:
     yield {"kind": "result", "row": row, "identification": identification}
     for name in asked["others"]:
         try:
-            other = Experiment.of(asked, name)
+            other = _experiment(asked, name)
             its_run = other.run()
         except ValueError as error:  # the experiment asked for stands without it
             yield {"kind": "left_out", "excitation": name, "sentence": str(error)}
@@ -290,14 +237,11 @@ def _outcome(
 ) -> tuple[Event, Identification | None]:
     """A row of the comparison, and what was identified, unless nothing could be."""
     plant, d = _plant(own.plant.definition.name), own.plant.description
-    provenance = {"excitation": own.name, "seed": own.seed, **own.origin}
-    record = simulated_record(run, own.plant, own.params, provenance)
-    # The estimator knows the plant as shipped: it is told nothing of this one's noise.
-    metadata = {**record.metadata, "plant": d.to_dict(), "plant_hash": d.hash}
-    record = dataclasses.replace(record, metadata=json_ready(metadata), source=_RECORD)
+    record = dataclasses.replace(own.record(run), source=_RECORD)
     result, sentence = None, ""
     try:
-        result = identify(plant, [record])
+        # The estimator knows the plant as shipped: it is told nothing of this one's noise.
+        result = identify(record, plant)
     except ValueError as error:
         sentence = str(error)
     bound = np.asarray(cramer_rao_bound(information) * relative_size(own.plant, own.params))
@@ -348,12 +292,18 @@ def columns(folder: str, name: str) -> Iterator[Event]:
 
 def identified(asked: Mapping[str, Any], source: str, name: str, folder: str) -> Iterator[Event]:
     """Parameters from an uploaded file; leaves a run folder as `excite identify` does."""
-    plant, estimator = _plant(asked["plant"]), estimator_named(asked["estimator"])
     with contextlib.chdir(source):
-        record = read_record(Path(name), plant.description, asked["columns"], asked["scales"])
-    result = identify(plant, [record], estimator, initial_state=asked["initial_state"])
+        result = identify(
+            Path(name),
+            _plant(asked["plant"]),
+            asked["estimator"],
+            initial_state=asked["initial_state"],
+            columns=asked["columns"],
+            scales=asked["scales"],
+        )
     write_run(result, Path(folder), command=_identification_again(asked, name))
     fitted = result.fitted[0]
+    record = fitted.record
     signals = [*record.inputs.T, *record.outputs.T, *fitted.simulated.T]
     kept = kept_samples(signals, _MAX_POINTS)
     yield {
