@@ -52,7 +52,7 @@ DOORS = {
     "safetensors": ["files"],
     "scipy.io": ["record/record"],
     "pandas": ["report/results"],
-    "pydantic": ["study"],
+    "pydantic": ["study", "record/rows", "report/study_table"],
     "tomlkit": ["study"],
     "dask": ["study/cluster"],
     "distributed": ["study/cluster"],

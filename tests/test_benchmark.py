@@ -17,9 +17,10 @@ from excite.files import json_ready
 from excite.information import best_possible
 from excite.plant import EMPS, Aero2, draw_params
 from excite.study import evaluation as benchmark
+from excite.study.run import run_study
 from excite.study.spec import Study, study_from
 from excite.study.statistics import wilson
-from excite.study.tasks import run_benchmark, write_benchmark
+from excite.study.table import finished_table
 
 ROOT = Path(__file__).parent.parent
 PARAMETERS = ("J_p", "K_pu", "D_p")
@@ -38,6 +39,11 @@ def tiny(**settings: Any) -> Study:
         "estimators": {"arx-rls-wide": {"kind": "arx-rls", "start_covariance": 1e8}},
     }
     return Study.model_validate({**study, **settings})
+
+
+def run_benchmark(study: Study, *progress: Any) -> list[dict[str, Any]]:
+    """The study's rows as the command line prints them."""
+    return [row.data() for row in benchmark.method_rows(study, *progress)]
 
 
 @pytest.fixture(scope="module")
@@ -256,7 +262,7 @@ GOOD, BAD = [2.2, 3.6, 5.0], [math.nan, math.inf, -1e9]
 def test_means_are_over_the_estimates_that_did_not_fail():
     status = [Status.SUCCESSFUL, Status.UNPHYSICAL, Status.SUCCESSFUL, Status.NOT_FINITE]
     mixed = outcome(status, [GOOD, BAD, [1.4, 4.0, 5.5], BAD])
-    row = benchmark.table_row(STUDY, PLANT.description, ("m", "e"), mixed)
+    row = benchmark.table_row(STUDY, PLANT.description, ("m", "e"), mixed).data()
     assert (row["evaluations"], row["failed"]) == (4, 2)
     assert row["failures"] == {"not_finite": 1, "unphysical": 1}
     errors = {"J_p": [10, 30], "K_pu": [10, 0], "D_p": [0, 10]}
@@ -273,9 +279,11 @@ def test_means_are_over_the_estimates_that_did_not_fail():
 
 def test_violations_and_outputs_are_those_of_all_episodes():
     status = [Status.UNPHYSICAL, Status.SUCCESSFUL]
-    row = benchmark.table_row(STUDY, PLANT.description, ("m", "e"), outcome(status, [BAD, GOOD]))
+    row = benchmark.table_row(
+        STUDY, PLANT.description, ("m", "e"), outcome(status, [BAD, GOOD])
+    ).data()
     assert row["violations"] == 1
-    assert row["violation_rate"] == {"estimate": 0.5, "ci95": wilson(1, 2)}
+    assert row["violation_rate"] == {"estimate": 0.5, "ci95": list(wilson(1, 2))}
     assert row["max_abs_output"]["mean"] == pytest.approx(10)
     assert row["max_abs_output"]["sd"] == pytest.approx(0, abs=1e-12)
 
@@ -283,14 +291,14 @@ def test_violations_and_outputs_are_those_of_all_episodes():
 def test_an_estimate_far_outside_its_own_interval_is_counted():
     status = [Status.SUCCESSFUL] * 3
     wrong = outcome(status, [GOOD, [2.0, 4.0, 8.1], [4.0, 0.1, 5.0]])
-    row = benchmark.table_row(STUDY, PLANT.description, ("m", "e"), wrong)
+    row = benchmark.table_row(STUDY, PLANT.description, ("m", "e"), wrong).data()
     assert row["beyond_6_std_errors"] == 2
 
 
 def test_where_every_estimate_failed_there_is_no_mean():
     row = benchmark.table_row(
         STUDY, PLANT.description, ("m", "e"), outcome([Status.UNPHYSICAL] * 2, [BAD, BAD])
-    )
+    ).data()
     assert (row["evaluations"], row["failed"]) == (2, 2)
     plain = json_ready(row)
     for name in PARAMETERS:
@@ -304,13 +312,49 @@ def test_where_every_estimate_failed_there_is_no_mean():
 # The run folder
 
 
-def test_a_run_folder_holds_study_and_rows(rows, tmp_path):
-    study = tiny()
-    write_benchmark(study, rows, {"table.md": b"shown"}, tmp_path / "run")
-    folder = tmp_path / "run"
-    assert {f.name for f in folder.iterdir()} == {
-        "table.json", "table.md", "study.json", "run.json",
+def test_a_study_without_agents_needs_no_folder_and_leaves_one_where_asked(tmp_path):
+    study, folder = tiny(), tmp_path / "run"
+    table = run_study(study)
+    assert run_study(study, folder) == table
+    assert {f.name for f in folder.iterdir()} - {".lock"} == {
+        "methods.json", "table.json", "table.md", "table.csv", "table.tex", "errors.png",
+        "episodes.json", "study.json", "run.json",
     }  # fmt: skip
-    assert json.loads((folder / "table.json").read_text()) == {"rows": json_ready(rows)}
-    assert (folder / "table.md").read_bytes() == b"shown"
+    content = json.loads((folder / "table.json").read_text())
+    assert content == {"rows": [row.data() for row in table.rows]}
+    assert (folder / "table.md").read_text() == table.markdown()
     assert Study.model_validate(json.loads((folder / "study.json").read_text())) == study
+
+
+def test_a_run_folder_is_resumed_by_its_study_and_replaced_where_asked(tmp_path):
+    folder = tmp_path / "run"
+    run_study(tiny(), folder)
+    made = (folder / "methods.json").stat().st_mtime_ns
+    run_study(tiny(), folder)
+    assert (folder / "methods.json").stat().st_mtime_ns == made
+    with pytest.raises(ValueError, match="another study: its 'seed' differs"):
+        run_study(tiny(), folder, seed=6)
+    table = run_study(tiny(), folder, seed=6, overwrite=True)
+    assert finished_table(folder) == table
+    assert table.study.seed == 6
+
+
+def test_a_study_with_signals_to_design_needs_a_run_folder():
+    with pytest.raises(ValueError, match="'tiny' has signals to design: it needs a run folder"):
+        run_study(tiny(clairvoyant={"plants": 2}))
+
+
+def test_a_table_shows_itself_and_is_filtered_and_sorted(rows):
+    table = run_study(tiny(), estimators=["arx-rls-wide", "nls"])
+    assert repr(table).startswith("tiny\nmethod")
+    assert max(map(len, repr(table).splitlines())) <= 80
+    assert "<td>prbs</td>" in table._repr_html_()
+    assert [row.data() for row in table.only("arx-rls-wide").rows] == rows
+    order = table.only("nls").sorted_by("D_p").rows
+    assert (
+        order[0].relative_error_percent["D_p"].mean <= order[1].relative_error_percent["D_p"].mean
+    )
+    with pytest.raises(ValueError, match=r"unknown estimator 'nsl'.*'nls'"):
+        table.only("nsl")
+    with pytest.raises(ValueError, match=r"unknown column 'D_q'.*'D_p'"):
+        table.sorted_by("D_q")

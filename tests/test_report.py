@@ -4,6 +4,7 @@ import io
 import math
 import subprocess
 import sys
+from collections.abc import Sequence
 from typing import Any
 
 import matplotlib.figure
@@ -15,6 +16,7 @@ from catalogue import TwoMasses
 from excite.description import HALF_95, PlantDescription
 from excite.plant import EMPS, Aero2, CartPole
 from excite.record import Record
+from excite.record.rows import Difference, EstimateSummary, Row, StudyFacts
 from excite.report.figure import PLOT_ENDINGS, kept_samples, require_plot_path, save
 from excite.report.figures import (
     autocorrelation_figure,
@@ -27,19 +29,8 @@ from excite.report.figures import (
 )
 from excite.report.numbers import digits_for, number
 from excite.report.study_figures import agents_figure, curves_figure
-from excite.report.tables import (
-    all_cells,
-    benchmark_csv,
-    benchmark_markdown,
-    differences_markdown,
-    fitting_tables,
-    footnotes,
-    html_table,
-    reference_cells,
-    table_cells,
-    table_header,
-    text_table,
-)
+from excite.report.study_table import StudyTable, footnotes
+from excite.report.tables import fitting_tables, html_table, text_table
 
 AERO2 = Aero2.definition
 
@@ -91,39 +82,59 @@ def test_an_estimate_without_a_useful_error_shows_five_digits(error):
 # Tables
 
 
-def row(method: str, estimator: str, size: float, failed: int = 0) -> dict[str, Any]:
-    error = {"mean": size, "sd": size / 3, "median": 0.9 * size, "rms": 1.1 * size}
-    none = dict.fromkeys(error, math.nan)
+def row(method: str, estimator: str, size: float, failed: int = 0) -> Row:
+    numbers = {"mean": size, "sd": size / 3, "median": 0.9 * size, "rms": 1.1 * size}
+    error = dict.fromkeys(numbers) if failed == 50 else numbers
     names = ("J_p", "K_pu", "D_p")
-    return {
-        "method": method,
-        "estimator": estimator,
-        "evaluations": 50,
-        "failed": failed,
-        "violations": 1,
-        "violation_rate": {"estimate": 0.02, "ci95": (0.0035, 0.105)},
-        "max_abs_output": {"output": "pitch", "mean": 20.1, "sd": 7.7, "unit": "deg"},
-        "relative_error_percent": {n: dict(none if failed == 50 else error) for n in names},
-        "cramer_rao_percent": {n: size / (10 + i) for i, n in enumerate(names)},
-    }
+    return Row.model_validate(
+        {
+            "method": method,
+            "estimator": estimator,
+            "evaluations": 50,
+            "failed": failed,
+            "failures": {},
+            "violations": 1,
+            "violation_rate": {"estimate": 0.02, "ci95": (0.0035, 0.105)},
+            "max_abs_output": {"output": "pitch", "mean": 20.1, "sd": 7.7, "unit": "deg"},
+            "log_det_information": 40.0,
+            "log_det_information_sd": 1.0,
+            "relative_error_percent": dict.fromkeys(names, error),
+            "cramer_rao_percent": {n: size / (10 + i) for i, n in enumerate(names)},
+            "rms_over_cramer_rao": dict.fromkeys(names, 1.0),
+            "coverage95_percent": dict.fromkeys(names, 95.0),
+            "beyond_6_std_errors": 0,
+        }
+    )
 
 
-ROWS = [
+ROWS = (
     row("random", "arx-rls", 8.125), row("random", "nls", 1 / 3),
     row("chirp", "arx-rls", 0.75, failed=2), row("chirp", "nls", 0.05, failed=50),
-]  # fmt: skip
+)  # fmt: skip
 REFERENCE = {
     "relative_error_percent": {"J_p": (8.23, 6.61), "K_pu": (10.18, 5.14), "D_p": (3026.0, 2067.0)},
     "max_abs_output": (11.2, 4.6),
     "violations": "0/100",
 }
+BARE = {
+    "name": "bare", "plant": "aero2", "episodes": 50, "num_steps": 500, "seed": 0, "spread": 0.3,
+    "estimators": {"arx-rls": {"kind": "arx-rls"}, "nls": {"kind": "nls"}},
+}  # fmt: skip
 STUDY = {
-    "name": "short",
+    **BARE,
     "title": "A title",
     "reference": {"random": REFERENCE},
     "source": "Table 9 of somebody",
     "inferred": ["the first thing", "the second thing"],
 }
+
+
+def table_of(rows: Sequence[Row] = ROWS, **changes: Any) -> StudyTable:
+    return StudyTable(rows=tuple(rows), study=StudyFacts.model_validate({**STUDY, **changes}))
+
+
+def all_cells(reference: dict[str, Any]) -> list[list[str]]:
+    return table_of(reference=reference).cells()[1]
 
 
 def markdown_table(text: str) -> list[list[str]]:
@@ -132,53 +143,55 @@ def markdown_table(text: str) -> list[list[str]]:
 
 
 def test_every_line_of_a_markdown_table_has_the_columns_of_its_header():
-    table = markdown_table(benchmark_markdown(ROWS, STUDY))
+    table = markdown_table(table_of().markdown())
     assert table[0] == [
         "method", "estimator", "J_p error %", "bound %", "K_pu error %", "bound %",
         "D_p error %", "bound %", "max pitch deg", "violations (95 %)", "failed",
+        "log det",
     ]  # fmt: skip
     assert {len(line) for line in table} == {len(table[0])}
     assert set(table[1]) == {"---"}
 
 
 def test_a_markdown_row_shows_what_its_row_says():
-    table = markdown_table(benchmark_markdown(ROWS, STUDY))
+    table = markdown_table(table_of().markdown())
     assert table[2] == [
         "random", "arx-rls", "8.12 ± 2.71", "0.81", "8.12 ± 2.71", "0.74", "8.12 ± 2.71", "0.68",
-        "20.1 ± 7.70", "1/50 (0.4–10.5 %)", "0/50",
+        "20.1 ± 7.70", "1/50 (0.4–10.5 %)", "0/50", "40.00",
     ]  # fmt: skip
-    assert [line[-1] for line in table[2:]] == ["0/50", "0/50", "–", "2/50", "50/50"]
+    assert [line[-2] for line in table[2:]] == ["0/50", "0/50", "–", "2/50", "50/50"]
 
 
 def test_a_mean_over_nothing_is_a_dash():
-    assert table_cells(ROWS[3])[2] == "– ± –"
+    assert all_cells({})[3][2] == "– ± –"
 
 
 def test_a_published_row_stands_below_those_of_its_method():
-    cells = all_cells(ROWS, STUDY["reference"])
+    cells = all_cells(STUDY["reference"])
     assert [line[:2] for line in cells] == [
         ["random", "arx-rls"], ["random", "nls"], ["random", "as published"],
         ["chirp", "arx-rls"], ["chirp", "nls"],
     ]  # fmt: skip
     assert cells[2][2:] == [
-        "8.23 ± 6.61", "–", "10.2 ± 5.14", "–", "3026 ± 2067", "–", "11.2 ± 4.60", "0/100", "–",
+        "8.23 ± 6.61", "–", "10.2 ± 5.14", "–", "3026 ± 2067", "–", "11.2 ± 4.60", "0/100",
+        "–", "–",
     ]  # fmt: skip
-    assert len(all_cells(ROWS, {})) == len(ROWS)
+    assert len(all_cells({})) == len(ROWS)
 
 
 def test_a_published_number_stands_in_the_column_of_its_parameter():
     """Whatever the order in the study file, and where a parameter was not published."""
     errors = REFERENCE["relative_error_percent"]
     turned = {**REFERENCE, "relative_error_percent": dict(reversed(errors.items()))}
-    assert all_cells(ROWS, {"random": turned}) == all_cells(ROWS, {"random": REFERENCE})
+    assert all_cells({"random": turned}) == all_cells({"random": REFERENCE})
     part = {**REFERENCE, "relative_error_percent": {"D_p": errors["D_p"]}}
-    cells = all_cells(ROWS, {"random": part})[2]
-    assert len(cells) == len(table_header(ROWS))
+    cells = all_cells({"random": part})[2]
+    assert len(cells) == len(table_of().cells()[0])
     assert cells[2:7] == ["–", "–", "–", "–", "3026 ± 2067"]
 
 
 def test_a_table_is_broken_between_columns_where_it_is_too_wide():
-    header, cells = table_header(ROWS), all_cells(ROWS, STUDY["reference"])
+    header, cells = table_of().cells()
     assert fitting_tables(header, cells, 1000) == [(header, cells)]
     for width in (10, 60, 80, 120):
         tables = fitting_tables(header, cells, width)
@@ -194,7 +207,7 @@ def test_a_table_is_broken_between_columns_where_it_is_too_wide():
 
 
 def test_a_table_as_text_fits_and_breaks_no_name_and_no_interval():
-    text = text_table("all", table_header(ROWS), all_cells(ROWS, STUDY["reference"]), labels=2)
+    text = text_table("all", *table_of().cells(), labels=2)
     assert max(map(len, text.splitlines())) <= 80
     long = "a mean of 0.0249998 ± 2.8e-7 is as good as 0.024999 to 0.025001, " * 3
     text = text_table("", ["name", "words"], [["J_p", long.strip()]], width=44)
@@ -210,35 +223,38 @@ def test_a_table_in_a_notebook_shows_signs_of_markup_as_they_are():
 
 
 def test_footnotes_tell_what_was_inferred_and_where_rows_were_published():
-    notes = footnotes(STUDY)
+    table = table_of()
+    notes = footnotes(table.study)
     assert "Published rows: Table 9 of somebody." in notes
     assert notes[-1].startswith("Inferred")
     assert "the first thing; the second thing" in notes[-1]
-    text = benchmark_markdown(ROWS, STUDY)
+    text = table.markdown()
     assert text.startswith("# A title\n")
     assert all(f"\n{note}\n" in text for note in notes)
-    assert len(footnotes({"name": "bare"})) == 1
-    assert benchmark_markdown(ROWS, {"name": "bare"}).startswith("# bare\n")
+    bare = StudyTable(rows=ROWS, study=StudyFacts.model_validate(BARE))
+    assert len(footnotes(bare.study)) == 1
+    assert bare.markdown().startswith("# bare\n")
 
 
 def test_csv_reads_back_to_the_numbers_of_the_rows():
-    read = list(csv.DictReader(io.StringIO(benchmark_csv(ROWS))))
+    read = list(csv.DictReader(io.StringIO(table_of().csv())))
     assert len(read) == len(ROWS)
     for line, r in zip(read, ROWS, strict=True):
-        assert (line["method"], line["estimator"]) == (r["method"], r["estimator"])
+        assert (line["method"], line["estimator"]) == (r.method, r.estimator)
         for key in ("evaluations", "failed", "violations"):
-            assert float(line[key]) == r[key]
-        assert float(line["max_abs_pitch_deg_mean"]) == r["max_abs_output"]["mean"]
-        assert float(line["max_abs_pitch_deg_sd"]) == r["max_abs_output"]["sd"]
-        for name, error in r["relative_error_percent"].items():
-            for part, value in error.items():
-                np.testing.assert_equal(float(line[f"{name}_error_percent_{part}"]), value)
-            assert float(line[f"{name}_cramer_rao_percent"]) == r["cramer_rao_percent"][name]
+            assert float(line[key]) == getattr(r, key)
+        assert float(line["max_abs_pitch_deg_mean"]) == r.max_abs_output.mean
+        assert float(line["max_abs_pitch_deg_sd"]) == r.max_abs_output.sd
+        for name, error in r.relative_error_percent.items():
+            for part in ("mean", "sd", "median", "rms"):
+                value = float(line[f"{name}_error_percent_{part}"])
+                np.testing.assert_equal(value, getattr(error, part))
+            assert float(line[f"{name}_cramer_rao_percent"]) == r.cramer_rao_percent[name]
 
 
 def test_csv_keeps_names_that_hold_a_comma_together():
-    comma = [{**ROWS[0], "method": "slow, then fast"}]
-    (line,) = csv.DictReader(io.StringIO(benchmark_csv(comma)))
+    comma = [ROWS[0].model_copy(update={"method": "slow, then fast"})]
+    (line,) = csv.DictReader(io.StringIO(table_of(comma).csv()))
     assert line["method"] == "slow, then fast"
     assert float(line["evaluations"]) == 50
 
@@ -253,16 +269,13 @@ def test_differences_of_the_first_estimator_stand_with_their_intervals():
         ("RL(all)", "chirp", "another", gap(9.0, 8.0, 10.0)),
     ]
     keys = ("method", "minus", "estimator", "relative_error_percent")
-    section = differences_markdown([dict(zip(keys, pair, strict=True)) for pair in pairs])
+    differences = [Difference.model_validate(dict(zip(keys, p, strict=True))) for p in pairs]
+    section = table_of().model_copy(update={"differences": tuple(differences)}).markdown()
     assert "| RL(all) | chirp | -0.500 (-0.750 to -0.250) |" in section
     assert "| RL(K_pu) | chirp | – (– to –) |" in section
     assert "paper's" in section
     assert "9.00" not in section
-    assert differences_markdown([]) == ""
-
-
-def test_reference_cells_go_with_the_header():
-    assert len(reference_cells(ROWS[0], REFERENCE)) == len(table_header(ROWS))
+    assert "Differences" not in table_of().markdown()
 
 
 # Figures
@@ -278,15 +291,37 @@ def record_of(d: PlantDescription, samples: int = 60) -> Record:
     )
 
 
-def result_of(d: PlantDescription) -> dict[str, Any]:
+def summary(
+    params: dict[str, tuple[float, float, str]],
+    fit: dict[str, float] | None = None,
+    correlation: Sequence[Sequence[float]] = (),
+) -> EstimateSummary:
+    """A result with these estimates, standard errors and units."""
+    data = {
+        name: {
+            "estimate": value, "std_error": error, "unit": unit, "held": math.isnan(error),
+            "ci95": (value - HALF_95 * error, value + HALF_95 * error),
+            "relative_to_nominal": None,
+        }
+        for name, (value, error, unit) in params.items()
+    }  # fmt: skip
+    none = {"plant_hash": "", "initial_state": "known", "validation": [], "files": [],
+            "whiteness_p_value": {}, "structure_p_value": {}, "verdict": []}  # fmt: skip
+    about = {"plant": "aero2", "estimator": "nls", "status": "successful", "params": data}
+    return EstimateSummary.of(
+        {**none, **about, "fit_percent": fit or {}, "correlation": correlation}
+    )
+
+
+def result_of(
+    d: PlantDescription, fit: float = 97.1234, **changed: tuple[float, float]
+) -> EstimateSummary:
     """As `identify` says it, the last parameter held."""
-    params = {
-        p.name: {"estimate": p.nominal, "std_error": 0.01 * abs(p.nominal), "unit": p.unit}
-        for p in d.parameters
-    }
-    params[d.parameters[-1].name]["std_error"] = math.nan
-    fits = {o.name: 97.1234 for o in d.outputs}
-    return {"estimator": "nls", "status": "successful", "params": params, "fit_percent": fits}
+    params = {p.name: (p.nominal, 0.01 * abs(p.nominal)) for p in d.parameters}
+    params[d.parameters[-1].name] = (d.parameters[-1].nominal, math.nan)
+    params |= changed
+    named = {p.name: (*params[p.name], p.unit) for p in d.parameters}
+    return summary(named, {o.name: fit for o in d.outputs})
 
 
 def figures_of(d: PlantDescription) -> dict[str, matplotlib.figure.Figure]:
@@ -389,17 +424,16 @@ def test_figures_bear_what_has_no_number(tmp_path):
     save(benchmark_figure(failed, "failed"), tmp_path / "a.svg")
     nothing: dict[str, float | None] = {"J_p": None, "K_pu": None, "D_p": None}
     save(information_figure(AERO2, record_of(AERO2), nothing), tmp_path / "b.svg")
-    result, record = result_of(AERO2), record_of(AERO2)
-    for p in result["params"].values():
-        p["estimate"] = p["std_error"] = math.nan
+    record, none = record_of(AERO2), (math.nan, math.nan)
+    result = result_of(AERO2, math.nan, J_p=none, K_pu=none, D_p=none)
     simulated = np.full_like(record.outputs, np.nan)
-    result["fit_percent"]["pitch"] = math.nan
     save(identification_figure(AERO2, result, record, simulated), tmp_path / "c.svg")
     assert len(list(tmp_path.iterdir())) == 3
 
 
 def test_a_method_without_an_error_says_why():
-    collapsed = [{**row("RL(all)", e, 1.0, failed=50), "viable_seeds": 0} for e in ("a", "nls")]
+    none = {"viable_seeds": 0}
+    collapsed = [row("RL(all)", e, 1.0, failed=50).model_copy(update=none) for e in ("a", "nls")]
     rows = [row("chirp", "a", 1.0), row("chirp", "nls", 1.0, failed=50), *collapsed]
     for axis in benchmark_figure(rows, "A title").axes:
         names = [label.get_text() for label in axis.get_xticklabels()]
@@ -460,8 +494,8 @@ def test_nothing_of_a_figure_with_one_agent_lies_beyond_its_edge(d):
     alone = {"an agent with a long name": [curve_of(d)]}
     one = {"an agent with a long name": (record_of(d), np.ones((60, len(d.parameters))))}
     rows = [row("chirp", name, 1.0) for name in ("arx-rls", "arx-rls-wide", "nls")]
-    errors = [{**r, "relative_error_percent": {"J_p": r["relative_error_percent"]["J_p"]}}
-              for r in rows]  # fmt: skip
+    first = {"relative_error_percent": {"J_p": rows[0].relative_error_percent["J_p"]}}
+    errors = [r.model_copy(update=first) for r in rows]
     for figure in (
         curves_figure(d, alone, title),
         agents_figure(d, one, title),
@@ -475,20 +509,16 @@ def test_nothing_of_a_figure_with_one_agent_lies_beyond_its_edge(d):
 
 
 def test_an_estimate_of_zero_can_be_drawn(tmp_path):
-    result, record = result_of(AERO2), record_of(AERO2)
-    result["params"]["K_pu"] |= {"estimate": 0.0, "std_error": 1.0}
+    result, record = result_of(AERO2, K_pu=(0.0, 1.0)), record_of(AERO2)
     save(identification_figure(AERO2, result, record, record.outputs), tmp_path / "a.svg")
     assert (tmp_path / "a.svg").is_file()
 
 
 def test_an_ellipse_holds_95_percent_of_a_normal_distribution():
     sd, correlation = np.array([0.02, 0.5]), np.array([[1.0, -0.8], [-0.8, 1.0]])
-    param = {"estimate": 2.0, "std_error": 0.02}
-    other = {"estimate": -5.0, "std_error": 0.5}
-    held = {"estimate": 1.0, "std_error": None}
-    result = {"params": {"a": param, "b": held, "c": other}, "correlation": np.eye(3).tolist()}
-    result["correlation"][0][2] = -0.8
-    figure = correlation_figure(result)
+    params = {"a": (2.0, 0.02, ""), "b": (1.0, math.nan, ""), "c": (-5.0, 0.5, "")}
+    table = [[1.0, 0.0, -0.8], [0.0, 1.0, 0.0], [-0.8, 0.0, 1.0]]
+    figure = correlation_figure(summary(params, correlation=table))
     assert figure is not None
     (axis,) = figure.axes
     assert (axis.get_xlabel(), axis.get_ylabel()) == ("a [%]", "c [%]")
@@ -502,8 +532,7 @@ def test_an_ellipse_holds_95_percent_of_a_normal_distribution():
 
 
 def test_without_a_pair_there_is_no_ellipse():
-    param = {"estimate": 2.0, "std_error": 0.02}
-    assert correlation_figure({"params": {"a": param}, "correlation": [[1.0]]}) is None
+    assert correlation_figure(summary({"a": (2.0, 0.02, "")}, correlation=[[1.0]])) is None
 
 
 def test_the_autocorrelation_of_white_noise_lies_between_the_dashed_lines():

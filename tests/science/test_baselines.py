@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 from experiments import ROOT
 
+from excite.study.evaluation import method_rows
 from excite.study.spec import Study, read_study
-from excite.study.tasks import run_benchmark
 
 PARAMETERS = ("J_p", "K_pu", "D_p")
 
@@ -16,7 +16,7 @@ PARAMETERS = ("J_p", "K_pu", "D_p")
 def baselines() -> tuple[Study, dict[tuple[str, str], dict[str, Any]]]:
     study = read_study(ROOT / "studies" / "baselines.toml")
     study = study.changed(estimators="arx-rls,nls", episodes=200)
-    return study, {(r["method"], r["estimator"]): r for r in run_benchmark(study)}
+    return study, {(r.method, r.estimator): r.data() for r in method_rows(study)}
 
 
 @pytest.mark.parametrize("method", ["random", "prbs", "chirp"])

@@ -136,7 +136,7 @@ def test_efficiency_compares_with_the_clairvoyant_signals_on_their_plants(folder
 
 
 def test_bounds_of_shorter_experiments_are_larger(folder):
-    for row in study_table(folder / "run")["rows"]:
+    for row in study_table(folder / "run").data()["rows"]:
         if row["method"] != "clairvoyant":
             bound = row["bound_by_length"]
             assert bound["num_steps"] == [30, 60]

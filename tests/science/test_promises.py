@@ -4,8 +4,8 @@ from typing import Any
 
 import pytest
 
+from excite.study.evaluation import method_rows
 from excite.study.spec import study_from
-from excite.study.tasks import run_benchmark
 
 POLICIES = ("aero2", "aero2-goals", "aero2-damping")
 
@@ -28,7 +28,7 @@ def rows() -> dict[tuple[str, str], Any]:
         },
         "promises",
     )
-    return {(row["method"], row["estimator"]): row for row in run_benchmark(study)}
+    return {(row.method, row.estimator): row.data() for row in method_rows(study)}
 
 
 def mean_errors(row: dict[str, Any]) -> dict[str, float]:

@@ -21,7 +21,7 @@ from excite.policy import read_policy
 from excite.study import table
 from excite.study.engine import local_engine
 from excite.study.folder import seed_folder, study_of
-from excite.study.run import _live, opened, run_study
+from excite.study.run import _live, opened, run_tasks
 from excite.study.spec import read_study, study_from
 from excite.study.table import (
     across_seeds,
@@ -122,12 +122,12 @@ def test_a_report_needs_nothing_but_the_run_folder(run, tmp_path):
     episodes = json.loads((run / "episodes.json").read_text())
     assert list(episodes) == ["chirp", "RL(all)", "RL(K_pu)"]
     seeds = {name: own["seed"] for name, own in episodes.items() if "seed" in own}
-    assert seeds == finished_table(run)["best_seeds"]
+    assert seeds == finished_table(run).best_seeds
     for own in episodes.values():
         assert len(own["inputs"]["voltage"]) == len(own["estimate_over_true"]["J_p"]) == 61
     about = json.loads((run / "run.json").read_text())
     assert about["command"].endswith(f"--out {run} --workers 1")
-    assert finished_table(run)["bound_curves"] == []
+    assert finished_table(run).bound_curves == ()
     out = tmp_path / "report.html"
     done = excite("report", run, "--out", out)
     assert done.returncode == 0, done.stderr
@@ -139,7 +139,7 @@ def test_a_report_needs_nothing_but_the_run_folder(run, tmp_path):
 
 
 def test_rows_are_methods_then_agents_with_what_a_benchmark_row_has(run):
-    content = finished_table(run)
+    content = finished_table(run).data()
     assert [(r["method"], r["estimator"]) for r in content["rows"]] == [
         (m, e) for m in ("chirp", "RL(all)", "RL(K_pu)") for e in ("arx-rls", "arx-rls-wide")
     ]
@@ -165,7 +165,7 @@ def test_policies_of_different_seeds_and_agents_differ(run):
 
 
 def test_differences_are_paired_over_seeds(run):
-    content = finished_table(run)
+    content = finished_table(run).data()
     pair = next(
         d for d in content["differences"]
         if (d["method"], d["minus"], d["estimator"]) == ("RL(K_pu)", "RL(all)", "arx-rls-wide")
@@ -191,7 +191,7 @@ def test_differences_are_paired_over_seeds(run):
 def test_the_table_command_prints_what_was_written(run):
     shown = excite("study", "table", run, "--json")
     assert shown.returncode == 0, shown.stderr
-    assert json.loads(shown.stdout)["rows"] == finished_table(run)["rows"]
+    assert json.loads(shown.stdout)["rows"] == finished_table(run).data()["rows"]
     assert "viable" in excite("study", "table", run).stdout
 
 
@@ -335,7 +335,7 @@ def test_a_file_in_the_way_of_a_folder_is_said_and_nothing_is_written(run, tmp_p
     (tmp_path / "seeds").write_text("mine")
     study = read_study(run.parent / "tiny.toml")
     with pytest.raises(ValueError, match=r"/seeds is a file where a folder is needed"):
-        run_study(study, tmp_path, local_engine(1))
+        run_tasks(study, tmp_path, local_engine(1))
     assert not (tmp_path / "study.json").exists()
 
 
@@ -344,7 +344,7 @@ def test_a_time_between_checkpoints_that_is_none_is_said(run, tmp_path, monkeypa
     monkeypatch.setenv("EXCITE_CHECKPOINT_SECONDS", text)
     study = read_study(run.parent / "tiny.toml")
     with pytest.raises(ValueError, match=f"EXCITE_CHECKPOINT_SECONDS must be .* got '{text}'"):
-        run_study(study, tmp_path / "run", local_engine(1))
+        run_tasks(study, tmp_path / "run", local_engine(1))
     assert not (tmp_path / "run").exists()
 
 
@@ -528,7 +528,7 @@ def test_words_of_a_study_may_change(run, tmp_path):
 def test_a_folder_in_use_is_refused(run):
     study = read_study(run.parent / "tiny.toml")
     with opened(study, run), pytest.raises(ValueError, match="another process"):
-        run_study(study, run, local_engine(1))
+        run_tasks(study, run, local_engine(1))
 
 
 @pytest.mark.parametrize(

@@ -221,5 +221,9 @@ def show_table(
     """
     from ..report.tables import text_table
 
-    width = shutil.get_terminal_size().columns if sys.stdout.isatty() else 80
-    click.echo(text_table(title, header, list(rows), width, labels) + "\n")
+    click.echo(text_table(title, header, list(rows), screen_width(), labels) + "\n")
+
+
+def screen_width() -> int:
+    """Columns of the terminal; 80 where there is none."""
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() else 80

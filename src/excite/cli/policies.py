@@ -6,7 +6,6 @@ from typing import Any
 
 import click
 
-from .benchmark import show_comparison
 from .options import (
     NUMBERS,
     WholeNumber,
@@ -18,6 +17,7 @@ from .options import (
     show_table,
     warnings_shown,
 )
+from .study import show_comparison
 
 
 @click.command()
@@ -76,12 +76,12 @@ def evaluate(policy: str, as_json: bool, **options: Any) -> None:
 
     on_rig, filtered, noise = (options.pop(n) for n in ("on_rig", "filtered", "noise"))
     with warnings_shown(), progress_bar(f"evaluating {policy}") as progress:
-        study, rows = evaluated(
+        found = evaluated(
             policy, rig=on_rig, filter=filtered, noise=merged(noise), progress=progress, **options
         )
     if as_json:
-        settings = study.model_dump(mode="json", exclude_unset=True)
-        show_json({"policy_hash": policy_at(policy).hash, "study": settings, "rows": rows})
+        settings = found.study.data()
+        show_json({"policy_hash": policy_at(policy).hash, "study": settings, **found.data()})
     else:
-        show_comparison(rows, study.model_dump(), None)
-        click.echo(f"log det of the Fisher information: {rows[0]['log_det_information']:.2f}")
+        show_comparison(found)
+        click.echo(f"log det of the Fisher information: {found.rows[0].log_det_information:.2f}")

@@ -1,36 +1,54 @@
-"""`excite study`: trains and compares the agents of a study file, and shows the table."""
+"""`excite study`: compares methods, trains agents, and shows the table."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from .benchmark import comparison_files, episodes_file, show_comparison, study_in
 from .options import (
     OUT_FILE,
     RunFailedError,
     WholeNumber,
-    cache_folder,
     command_line,
     computing,
     json_option,
+    plot_option,
     progress_bar,
+    screen_width,
     show_json,
     show_table,
 )
 
+if TYPE_CHECKING:
+    from ..report.study_table import StudyTable
+    from ..study.spec import Study
+
 
 @click.group()
 def study() -> None:
-    """Train the agents of a study, resume it, print its table."""
+    """Compare methods, train agents, resume, print the table."""
+
+
+def changes(command: Callable[..., Any]) -> Callable[..., Any]:
+    """The options that change a study; shared with `benchmark`."""
+    for option in (
+        click.option("--overwrite", is_flag=True, help="Replace the run folder if it exists."),
+        click.option("--estimators", metavar="NAME,...", help="Instead of the study's."),
+        click.option("--seed", type=click.IntRange(0, 2**63 - 1), help="Instead of the study's."),
+        click.option("--episodes", type=click.IntRange(min=1), help="Instead of the study's."),
+    ):
+        command = option(command)
+    return command
 
 
 @study.command()
-@click.argument("study_name", metavar="STUDY")
-@click.option("--out", type=OUT_FILE, required=True, metavar="FOLDER", help="Its run folder.")
+@click.argument("study", metavar="STUDY")
+@click.option("--out", type=OUT_FILE, metavar="FOLDER", help="Run folder; needed with agents.")
+@changes
 @click.option(
     "--engine",
     type=click.Choice(["local", "dask"]),
@@ -42,64 +60,74 @@ def study() -> None:
 @click.option(
     "--workers", type=WholeNumber(1), help="Processes of the local engine; default one a core."
 )
+@plot_option
 @json_option
 @computing
-def run(
-    study_name: str, out: Path, engine: str, address: str | None, workers: int | None,
-    as_json: bool,
-) -> None:  # fmt: skip
-    """Train what STUDY lacks in its run folder, then write its table and figures.
+def run(study: str, out: Path | None, plot: Path | None, as_json: bool, **options: Any) -> None:
+    """Compare the methods of STUDY under identical conditions; train its agents first.
 
     STUDY is the name of a shipped study (`excite study list`) or a file, path/to/study.toml.
-
-    Interrupted at any moment, the same command goes on where it was.
+    Without agents it needs no run folder. Rerun the same command to resume where it was
+    interrupted.
     """
-    chosen = study_in(study_name)
-    run_study_here(chosen, out, as_json, engine, address, workers)
+    run_study_here(study_in(study), out, as_json, plot, **options)
 
 
 def run_study_here(
-    chosen: Any,
-    out: Path,
-    as_json: bool,
-    engine: str = "local",
-    address: str | None = None,
-    workers: int | None = None,
+    chosen: Study, out: Path | None, as_json: bool, plot: Path | None = None, **options: Any
 ) -> None:
-    """Runs a study, writes and shows its table; shared with `train`."""
-    from ..study.run import run_study
-
-    if engine == "local":
-        _require_trainer(chosen, out)
-    machine = _engine(engine, address, workers)
+    """Runs a study and shows its table; shared with `benchmark` and `train`."""
+    from ..study.run import StudyFailedError, run_study
 
     def finished(name: str) -> None:
         click.echo(f"finished: {name}", err=True)
 
+    def waiting() -> None:
+        text = f"waiting for workers of the scheduler at {options['address']}"
+        click.echo(text, err=True)
+
+    told = {"on_done": finished, "on_wait": waiting, "command": command_line()}
     try:
         with progress_bar(chosen.name) as progress:
-            failures = run_study(chosen, out, machine, progress, finished, command_line())
-        if failures:
-            raise _failed(failures, out)
-        _finish(chosen, out)
-        _show(out, as_json)
+            found = run_study(chosen, out, progress=progress, **told, **options)
+    except StudyFailedError as error:
+        raise RunFailedError(str(error)) from None
     except KeyboardInterrupt:
-        kept = f"what is finished is kept in {out}, the same command goes on"
+        if not (chosen.agents or chosen.clairvoyant):
+            raise
+        kept = f"what is finished is kept in {out}; rerun the same command to resume"
         click.echo(f"excite: interrupted; {kept}", err=True)
         sys.exit(130)
+    if plot is not None:
+        from ..report.figure import save
+
+        save(found.plot(), plot)
+    show_comparison(found, out, as_json)
 
 
-def _failed(failures: dict[str, Exception], out: Path) -> Exception:
-    """One error for all tasks that failed; the user's mistake where every one of them is."""
-    names: dict[str, list[str]] = {}
-    for name, error in failures.items():
-        names.setdefault(str(error), []).append(name)
-    reasons = "; ".join(f"{', '.join(some)}: {reason}" for reason, some in names.items())
-    is_mistake = all(isinstance(error, ValueError) for error in failures.values())
-    return (ValueError if is_mistake else RunFailedError)(
-        f"{len(failures)} task{'s' * (len(failures) > 1)} failed ({reasons}); what is finished "
-        f"is kept in {out}, the same command tries the rest again"
-    )
+def study_in(name: str) -> Study:
+    """A shipped study or one in a file, its warnings on stderr; shared with `benchmark`."""
+    from ..study.catalogue import study_path
+    from ..study.spec import read_study
+
+    return warned(read_study(study_path(name)))
+
+
+def warned(study: Study) -> Study:
+    """The study, after its warnings on stderr; shared with `evaluate`."""
+    for warning in study.warnings():
+        click.echo(f"warning: {warning}", err=True)
+    return study
+
+
+def show_comparison(found: StudyTable, out: Path | None = None, as_json: bool = False) -> None:
+    """A study's table and footnotes on stdout, or its numbers; shared with `evaluate`."""
+    if as_json:
+        show_json(found.data())
+        return
+    click.echo(found.text(screen_width()))
+    if out is not None:
+        click.echo(f"run folder: {out}")
 
 
 @study.command("list")
@@ -123,87 +151,17 @@ def list_studies(as_json: bool) -> None:
 
 @study.command()
 @click.argument("folder", type=OUT_FILE, metavar="FOLDER")
+@click.option("--estimator", metavar="NAME", help="Only the rows of this estimator.")
+@click.option("--sort", metavar="COLUMN", help="A parameter, or a column of table.csv.")
 @json_option
 @computing
-def table(folder: Path, as_json: bool) -> None:
+def table(folder: Path, estimator: str | None, sort: str | None, as_json: bool) -> None:
     """Print the table of a finished study."""
-    _show(folder, as_json)
-
-
-def _require_trainer(chosen: Any, out: Path) -> None:
-    """Raises ValueError where seeds are left to train and a library is missing."""
-    from importlib.util import find_spec
-
-    from ..study.folder import seed_folder
-
-    agents = [name for name, agent in chosen.agents.items() if agent.method == "ppo"]
-    folders = [seed_folder(out, a, seed) for a in agents for seed in range(chosen.seeds)]
-    if all((folder / "metrics.json").is_file() for folder in folders):
-        return
-    missing = [n for n in ("stable_baselines3", "torch", "tensorboard") if find_spec(n) is None]
-    if missing:
-        raise ValueError(f"training needs {', '.join(missing)}: pip install 'excite[ppo]'")
-
-
-def _engine(engine: str, address: str | None, workers: int | None) -> Any:
-    from ..study.cluster import dask_engine
-    from ..study.engine import local_engine
-    from ..study.workers import num_cores
-
-    if engine == "dask":
-        if address is None:
-            raise ValueError("--engine dask needs --address tcp://HOST:PORT of its scheduler")
-        if workers is not None:
-            raise ValueError("--workers is for the local engine; a Dask cluster has its own")
-        waiting = f"waiting for workers of the scheduler at {address}"
-        return dask_engine(address, lambda: click.echo(waiting, err=True))
-    if address is not None:
-        raise ValueError("--address is for --engine dask")
-    return local_engine(workers or num_cores(), cache_folder())
-
-
-def _finish(chosen: Any, folder: Path) -> None:
-    """Writes the table and the figures into the run folder."""
-    from ..files import write_bytes, write_json
-    from ..report.figure import image
-    from ..report.frontier import frontier_figure, lengths_figure
-    from ..report.study_figures import agents_figure, curves_figure
-    from ..report.tables import benchmark_latex, differences_csv, differences_markdown
-    from ..study.episodes import example_episodes
-    from ..study.table import best_seeds, learning_curves, study_table
-
-    content, settings = study_table(folder), chosen.model_dump()
-    rows, title = content["rows"], chosen.title or chosen.name
-    shown = {
-        **comparison_files(rows, settings),
-        "table.tex": benchmark_latex(rows, settings).encode(),
-        "differences.csv": differences_csv(content["differences"]).encode(),
-    }
-    shown["table.md"] += differences_markdown(content["differences"]).encode()
-    if chosen.clairvoyant is not None:
-        shown["frontier.png"] = image(frontier_figure(rows, title), "png")
-    if chosen.lengths:
-        shown["lengths.png"] = image(lengths_figure(rows, title), "png")
-    seeds = best_seeds(chosen, folder)
-    episodes = example_episodes(chosen, folder, seeds)
-    shown["episodes.json"] = episodes_file(chosen, episodes)
-    if chosen.agents:
-        plant, bounds = chosen.build_plant().description, chosen.bound_curves()
-        curves = curves_figure(plant, learning_curves(chosen, folder), title, bounds)
-        played = agents_figure(plant, {agent: episodes[agent] for agent in seeds}, title)
-        shown |= {"curves.png": image(curves, "png"), "episodes.png": image(played, "png")}
-        content |= {"best_seeds": seeds, "bound_curves": bounds}
-    for name, data in shown.items():
-        write_bytes(folder / name, data)
-    write_json(folder / "table.json", content)
-
-
-def _show(folder: Path, as_json: bool) -> None:
-    from ..study.folder import study_of
     from ..study.table import finished_table
 
-    content, settings = finished_table(folder), study_of(folder).model_dump()
-    if as_json:
-        show_json(content)
-    else:
-        show_comparison(content["rows"], settings, folder)
+    found = finished_table(folder)
+    if estimator is not None:
+        found = found.only(estimator)
+    if sort is not None:
+        found = found.sorted_by(sort)
+    show_comparison(found, folder, as_json)

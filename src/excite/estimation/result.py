@@ -14,6 +14,7 @@ from .. import __version__
 from ..description import HALF_95, Named, PlantDescription, names_of
 from ..files import csv_text, new_run_folder, write_json
 from ..record import Record, write_record
+from ..record.rows import EstimateSummary
 from ..report.results import data_frame, identification_html, identification_text, wrapped
 from .diagnosis import correlation, fit_percent
 
@@ -100,20 +101,20 @@ class Identification:
         return {n: fit_percent(measured[:, i], simulated[:, i]) for i, n in enumerate(outputs)}
 
     def __str__(self) -> str:
-        return identification_text(self.to_dict())
+        return identification_text(self.summary())
 
     def __repr__(self) -> str:
         return wrapped(str(self))
 
     def _repr_html_(self) -> str:
-        return identification_html(self.to_dict())
+        return identification_html(self.summary())
 
     def plot(self) -> Figure:
         """Measured against simulated outputs of the first record, residuals, intervals."""
         from ..report.figures import identification_figure
 
         first = self.fitted[0]
-        return identification_figure(self.plant, self.to_dict(), first.record, first.simulated)
+        return identification_figure(self.plant, self.summary(), first.record, first.simulated)
 
     def to_pandas(self) -> DataFrame:
         """One row a parameter: estimate, standard error, 95 % interval, unit.
@@ -131,6 +132,10 @@ class Identification:
             "held": [name in self.held for name in self.params],
         }
         return data_frame(columns, list(self.params))
+
+    def summary(self) -> EstimateSummary:
+        """The result as tables, figures and reports read it."""
+        return EstimateSummary.of(self.to_dict())
 
     def to_dict(self) -> dict[str, object]:
         """The result as JSON-ready data; docs/reference/machine-readable.md lists its keys."""

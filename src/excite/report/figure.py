@@ -12,17 +12,20 @@ import textwrap
 from collections.abc import Collection, Iterator, Sequence
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
+import matplotlib.axes
 import matplotlib.axis
 import matplotlib.figure
-import matplotlib.pyplot as plt
 import matplotlib.ticker
 import numpy as np
 
 from ..description import Input, Output, PlantDescription, display_unit
 from ..files import require_folder, write_bytes
 from ..record import Record
+
+Axes = np.ndarray
+"""A grid of Matplotlib's axes: rows, columns."""
 
 # Distinguishable with any colour vision (M. Okabe and K. Ito, 2008).
 BLUE, ORANGE, GREEN, RED, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#767676"
@@ -50,11 +53,10 @@ def image(figure: matplotlib.figure.Figure, kind: str) -> bytes:
     """A figure as the content of a file of this kind: png, svg or pdf."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format=kind, dpi=150)
-    plt.close(figure)
     return buffer.getvalue()
 
 
-PAGE_STYLE: dict[Any, Any] = {
+PAGE_STYLE: dict[str, object] = {
     "svg.fonttype": "none",  # text stays text: it can be searched, and the file is smaller
     "svg.hashsalt": "excite",  # the same figure is the same file
     "text.parse_math": False,  # a name with $ is a name
@@ -71,7 +73,7 @@ _PAGE_COLOURS["#000000"] = "currentColor"
 class _PlainLog(matplotlib.ticker.LogFormatter):
     """Powers of ten as numbers, without mathematics that a page would have to set."""
 
-    def _num_to_string(self, x: float, *_: Any) -> str:
+    def _num_to_string(self, x: float, *_: object) -> str:
         return f"{x:g}"
 
 
@@ -91,7 +93,6 @@ def inline_svg(figure: matplotlib.figure.Figure, prefix: str) -> str:
                 _set_plain(axis)
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
-    plt.close(figure)
     svg = buffer.getvalue()
     svg = re.sub("<metadata>.*?</metadata>|<style.*?</style>", "", svg, flags=re.DOTALL)
     used = set(re.findall(r'(?:href="|url\()#(\w+)', svg))
@@ -120,24 +121,29 @@ def _of_page(tag: str, prefix: str, used: Collection[str]) -> str:
     return re.sub("#[0-9a-f]{6}", lambda m: _PAGE_COLOURS.get(m[0], m[0]), tag)
 
 
+class _Figure(matplotlib.figure.Figure):
+    """A figure that a notebook shows; pyplot, whose state is the user's, is not involved."""
+
+    def _repr_png_(self) -> bytes:
+        return image(self, "png")
+
+
 def colour_of(i: int) -> str:
     """Colour of the i-th thing in a picture."""
     return _COLOURS[i % len(_COLOURS)]
 
 
 def new_figure(
-    rows: int, columns: int = 1, height: float = 2.2, width: float = 8.0, sharey: Any = False
-) -> tuple:
+    rows: int,
+    columns: int = 1,
+    height: float = 2.2,
+    width: float = 8.0,
+    sharey: Literal["row"] | bool = False,
+) -> tuple[matplotlib.figure.Figure, Axes]:
     """A figure and its grid of axes; height of one row and width of all, in inches."""
-    plt.switch_backend("agg")
-    figure, axes = plt.subplots(
-        rows,
-        columns,
-        figsize=(max(width, _MIN_WIDTH), height * rows + 0.6),
-        sharey=sharey,
-        squeeze=False,
-        layout="constrained",
-    )
+    size = max(width, _MIN_WIDTH), height * rows + 0.6
+    figure = _Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(rows, columns, sharey=sharey, squeeze=False)
     for axis in axes.ravel():
         axis.spines[["top", "right"]].set_visible(False)
         axis.grid(alpha=0.25)
@@ -149,7 +155,7 @@ def add_title(figure: matplotlib.figure.Figure, title: str) -> None:
     figure.suptitle(textwrap.fill(title, int(9 * figure.get_figwidth())))
 
 
-def add_legend(figure: matplotlib.figure.Figure, *axes: Any) -> None:
+def add_legend(figure: matplotlib.figure.Figure, *axes: matplotlib.axes.Axes) -> None:
     """One legend below all axes, where it hides nothing."""
     entries = {}
     for axis in axes:
@@ -202,7 +208,7 @@ def kept_samples(values: Sequence[np.ndarray], points: int) -> np.ndarray:
     return np.array(sorted(kept))
 
 
-def draw_levels(axis: Any, part: Output, largest: float) -> None:
+def draw_levels(axis: matplotlib.axes.Axes, part: Output, largest: float) -> None:
     """Both safety levels, where the output comes near enough for them to fit the picture."""
     factor = display_unit(part.unit)[1]
     words = ((part.warning_level, ORANGE, "warning"), (part.critical_level, RED, "critical"))
@@ -215,7 +221,7 @@ def draw_levels(axis: Any, part: Output, largest: float) -> None:
             axis.axhline(sign * level * factor, color=colour, ls="--", lw=1, label=label)
 
 
-def draw_episodes(axes: Any, description: PlantDescription, records: Sequence[Record]) -> None:
+def draw_episodes(axes: Axes, description: PlantDescription, records: Sequence[Record]) -> None:
     """One column an experiment; one row an input, then one row an output."""
     for i, part in enumerate(description.inputs):
         axes[i, 0].set(ylabel=axis_label(part))

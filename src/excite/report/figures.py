@@ -5,14 +5,15 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
+import matplotlib.axes
 import matplotlib.figure
 import numpy as np
 from jaxtyping import Float
 
 from ..description import HALF_95, PlantDescription, display_unit
 from ..record import Record
+from ..record.rows import EstimatedParameter, EstimateSummary, Row
 from .figure import (
     BLUE,
     GREEN,
@@ -31,7 +32,7 @@ from .numbers import digits_for, number
 
 def identification_figure(
     description: PlantDescription,
-    result: Mapping[str, Any],
+    result: EstimateSummary,
     record: Record,
     simulated: Float[np.ndarray, "sample output"],
 ) -> matplotlib.figure.Figure:
@@ -47,27 +48,27 @@ def identification_figure(
         )
         top.plot(time, factor * measured, color=GREY, lw=1.6, label="measured")
         top.plot(time, factor * model, color=BLUE, lw=1, ls="--", label="simulated")
-        fit = result["fit_percent"][part.name]
+        fit = result.fit_percent[part.name]
         top.set(ylabel=axis_label(part), title=f"{part.name}: fit {number(fit, 4)} %")
         below.plot(time, factor * residual, color=ORANGE, lw=0.8)
         below.set(ylabel=f"residual [{display_unit(part.unit)[0]}]")
     axes[-2, 0].set(xlabel="time [s]")
-    _draw_intervals(axes[-1, 0], result["params"])
+    _draw_intervals(axes[-1, 0], result.params)
     add_legend(figure, axes[0, 0])
-    add_title(figure, f"{description.name}: {result['estimator']}, {result['status']}")
+    add_title(figure, f"{description.name}: {result.estimator}, {result.status}")
     return figure
 
 
-def _draw_intervals(axis: Any, params: Mapping[str, Mapping[str, Any]]) -> None:
+def _draw_intervals(axis: matplotlib.axes.Axes, params: Mapping[str, EstimatedParameter]) -> None:
     """95 % intervals in percent of the estimate."""
     for i, (name, p) in enumerate(params.items()):
-        value, error = p["estimate"], p["std_error"]
-        if error is None or not math.isfinite(error):
+        value, error = p.estimate, p.std_error
+        if not math.isfinite(error):
             axis.text(0, i, f"{name} held", color=GREY, va="center", ha="center")
             continue
         half = 100 * HALF_95 * error / (abs(value) or math.nan)
         axis.errorbar(0, i, xerr=half, color=BLUE, fmt="o", capsize=4, ms=4)
-        text = f"{number(value, digits_for(value, error))} {p['unit']}"
+        text = f"{number(value, digits_for(value, error))} {p.unit}"
         axis.annotate(text, (0, i), (0, 7), textcoords="offset points", ha="center", fontsize=8)
     axis.set_yticks(range(len(params)), params)
     axis.set(ylim=(len(params) - 0.4, -0.9), xlabel="95 % interval [% of the estimate]")
@@ -94,14 +95,10 @@ def autocorrelation_figure(
     return figure
 
 
-def correlation_figure(result: Mapping[str, Any]) -> matplotlib.figure.Figure | None:
+def correlation_figure(result: EstimateSummary) -> matplotlib.figure.Figure | None:
     """95 % ellipse of every pair of estimated parameters; None where there is no pair."""
-    params = list(result["params"].items())
-    free = [
-        i
-        for i, (_, p) in enumerate(params)
-        if p["estimate"] and math.isfinite(p["std_error"] or math.nan)
-    ]
+    params = list(result.params.items())
+    free = [i for i, (_, p) in enumerate(params) if p.has_interval]
     pairs = list(itertools.combinations(free, 2))
     if not pairs:
         return None
@@ -112,9 +109,9 @@ def correlation_figure(result: Mapping[str, Any]) -> matplotlib.figure.Figure | 
     for axis in axes.ravel()[len(pairs) :]:
         axis.set_visible(False)
     for axis, (i, j) in zip(axes.ravel(), pairs, strict=False):
-        correlation = result["correlation"][i][j]
+        correlation = result.correlation[i][j]
         # Radius at which two normal variables lie within 95 times in 100.
-        radii = [245 * p["std_error"] / abs(p["estimate"]) for _, p in (params[i], params[j])]
+        radii = [245 * p.std_error / abs(p.estimate) for _, p in (params[i], params[j])]
         rest = math.sqrt(max(0.0, 1 - correlation**2))
         tilted = correlation * np.cos(angle) + rest * np.sin(angle)
         axis.fill(radii[0] * np.cos(angle), radii[1] * tilted, color=BLUE, alpha=0.2, lw=0)
@@ -177,24 +174,24 @@ def information_figure(
     return figure
 
 
-def benchmark_figure(rows: Sequence[Mapping[str, Any]], title: str) -> matplotlib.figure.Figure:
+def benchmark_figure(rows: Sequence[Row], title: str) -> matplotlib.figure.Figure:
     """Mean relative error of each method and estimator beside its Cramér-Rao bound."""
-    names = list(rows[0]["relative_error_percent"])
-    methods = list(dict.fromkeys(row["method"] for row in rows))
-    estimators = list(dict.fromkeys(row["estimator"] for row in rows))
+    names = rows[0].parameters
+    methods = list(dict.fromkeys(row.method for row in rows))
+    estimators = list(dict.fromkeys(row.estimator for row in rows))
     each = max(3.2, 0.3 * len(methods))  # inches
     figure, axes = new_figure(1, len(names), height=each, width=each * len(names))
     for axis, name in zip(axes[0], names, strict=True):
         for e, estimator in enumerate(estimators):
-            chosen = [r for r in rows if r["estimator"] == estimator]
+            chosen = [r for r in rows if r.estimator == estimator]
             place = [
-                methods.index(r["method"]) + 0.12 * (e - (len(estimators) - 1) / 2) for r in chosen
+                methods.index(r.method) + 0.12 * (e - (len(estimators) - 1) / 2) for r in chosen
             ]
-            means = [r["relative_error_percent"][name]["mean"] for r in chosen]
+            means = [r.relative_error_percent[name].mean for r in chosen]
             axis.plot(place, means, "o", color=colour_of(e), ms=6, label=estimator)
         for m, method in enumerate(methods):
             # What an efficient estimator's mean error would be: sqrt(2 / pi) of the bound.
-            bound = next(r for r in rows if r["method"] == method)["cramer_rao_percent"][name]
+            bound = next(r for r in rows if r.method == method).cramer_rao_percent[name]
             label = "attainable (0.80 of the bound)" if m == 0 else None
             axis.hlines(0.798 * bound, m - 0.35, m + 0.35, color=GREY, lw=2, label=label)
         ticks = [method + _absent(rows, method, name) for method in methods]
@@ -208,13 +205,13 @@ def benchmark_figure(rows: Sequence[Mapping[str, Any]], title: str) -> matplotli
     return figure
 
 
-def _absent(rows: Sequence[Mapping[str, Any]], method: str, name: str) -> str:
+def _absent(rows: Sequence[Row], method: str, name: str) -> str:
     """Why a method, or one of its estimators, has no error to be drawn."""
     absent = [
         row
         for row in rows
-        if row["method"] == method and math.isnan(row["relative_error_percent"][name]["mean"])
+        if row.method == method and math.isnan(row.relative_error_percent[name].mean)
     ]
-    if any(row.get("viable_seeds") == 0 for row in absent):
+    if any(row.viable_seeds == 0 for row in absent):
         return " (collapsed)"
-    return f" ({', '.join(row['estimator'] for row in absent)} failed)" if absent else ""
+    return f" ({', '.join(row.estimator for row in absent)} failed)" if absent else ""

@@ -3,32 +3,31 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import matplotlib.figure
 
+from ..record.rows import Row
 from .figure import add_legend, add_title, colour_of, new_figure
 
 _MARKERS = "osD^vP*X<>hpd"  # as many as share no factor with the colours
 
 
-def frontier_figure(rows: Sequence[Mapping[str, Any]], title: str) -> matplotlib.figure.Figure:
+def frontier_figure(rows: Sequence[Row], title: str) -> matplotlib.figure.Figure:
     """Information of every method against its violation rate, with the rate's interval."""
-    first = [row for row in rows if row["estimator"] == rows[0]["estimator"]]
+    first = [row for row in rows if row.estimator == rows[0].estimator]
     figure, axes = new_figure(1, 1, height=4.6, width=7.6)
     axis, below = axes[0, 0], -math.inf
-    chosen = [(i, row) for i, row in enumerate(first) if "log_det_information" in row]
-    values = [row["log_det_information"] for _, row in chosen]
+    values = [row.log_det_information for row in first]
     gap = (max(values, default=0.0) - min(values, default=0.0)) / 26  # of two lines of text
-    for i, row in sorted(chosen, key=lambda pair: pair[1]["log_det_information"]):
-        rate, (low, high) = row["violation_rate"]["estimate"], row["violation_rate"]["ci95"]
+    for i, row in sorted(enumerate(first), key=lambda pair: pair[1].log_det_information):
+        rate, (low, high) = row.violation_rate.estimate, row.violation_rate.ci95
         bars = [[100 * max(0.0, rate - low)], [100 * max(0.0, high - rate)]]
-        value, style = row["log_det_information"], {"color": colour_of(i)}
+        value, style = row.log_det_information, {"color": colour_of(i)}
         axis.errorbar(100 * rate, value, xerr=bars, marker="o", ms=5, capsize=2, **style)
         below = max(below + gap, value)
         axis.annotate(
-            row["method"], (100 * high, value), (100 * max(high, 0.001) * 1.15, below),
+            row.method, (100 * high, value), (100 * max(high, 0.001) * 1.15, below),
             va="center", fontsize=7.5, **style,
         )  # fmt: skip
     axis.set_xscale("symlog", linthresh=0.1)
@@ -38,20 +37,19 @@ def frontier_figure(rows: Sequence[Mapping[str, Any]], title: str) -> matplotlib
     return figure
 
 
-def lengths_figure(rows: Sequence[Mapping[str, Any]], title: str) -> matplotlib.figure.Figure:
+def lengths_figure(rows: Sequence[Row], title: str) -> matplotlib.figure.Figure:
     """Least standard deviation of each parameter against the length of the experiment."""
-    first = [row for row in rows if row["estimator"] == rows[0]["estimator"]]
-    chosen = [row for row in first if "bound_by_length" in row]
-    names = list(rows[0]["relative_error_percent"])
+    first = [row for row in rows if row.estimator == rows[0].estimator]
+    chosen = [(row.method, row.bound_by_length) for row in first if row.bound_by_length]
+    names = rows[0].parameters
     figure, axes = new_figure(1, len(names), height=4.0, width=3.6 * len(names))
     for axis, name in zip(axes[0], names, strict=True):
-        for i, row in enumerate(chosen):
-            bound = row["bound_by_length"]
-            percent = bound["cramer_rao_percent"][name]
+        for i, (method, bound) in enumerate(chosen):
+            percent = bound.cramer_rao_percent[name]
             marker = _MARKERS[i % len(_MARKERS)]
             axis.plot(
-                bound["num_steps"], percent, color=colour_of(i), marker=marker, ms=4, lw=1,
-                label=row["method"],
+                bound.num_steps, percent, color=colour_of(i), marker=marker, ms=4, lw=1,
+                label=method,
             )  # fmt: skip
         axis.set(yscale="log", title=name, xlabel="samples")
     axes[0, 0].set(ylabel="Cramér-Rao bound [%]")

@@ -5,17 +5,15 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 
 from .. import __version__
-from ..files import read_json
 from .figure import MAX_POINTS, PAGE_STYLE, at_most
-from .sections.elements import Section, paragraph, text
-from .sections.experiment import Experiment, comparison, experiment_section, read_experiment
-from .sections.record import Recorded, read_recorded, record_section
-from .sections.study import StudyRun, common_methods, read_study_run, study_section
+from .sections.elements import Marker, Run, Section, paragraph, text
+from .sections.experiment import Experiment, comparison, read_experiment
+from .sections.record import read_recorded
+from .sections.study import StudyRun, common_methods, read_study_run
 
 MAX_BYTES = 3_000_000
 """Size above which a page is drawn again with shorter lines: it is to be sent by mail."""
@@ -24,10 +22,9 @@ _TOO_LARGE = (
     f"This page is larger than {MAX_BYTES / 1e6:g} MB: its runs are easier to send on several."
 )
 _STYLE = Path(__file__).with_name("page.css")
-_KINDS: dict[str, tuple[Callable[..., Any], Callable[[Any, str], Section]]] = {
-    "excite identification": (read_experiment, experiment_section),
-    "excite study": (read_study_run, study_section),
-    "excite benchmark": (read_study_run, study_section),
+_KINDS: dict[str, Callable[[Marker], Run]] = {
+    "excite identification": read_experiment,
+    "excite study": read_study_run,
 }
 _DRAWING = threading.Lock()  # Matplotlib's settings are those of the whole process
 
@@ -40,8 +37,8 @@ def report_html(
     Of long records, its lines show the extremes of every stretch, fewer where the page gets large.
 
     Args:
-        runs: folders of `excite identify`, `excite benchmark` and `excite study run`, and
-            records (.csv, .mat) with their sidecar.
+        runs: folders of `excite identify` and `excite study run`, and records
+             (.csv, .mat) with their sidecar.
         progress: called with what is drawn, how many are done, and how many there are.
 
     Raises:
@@ -58,25 +55,28 @@ def report_html(
 
 
 def _drawn(
-    every: Sequence[tuple[Any, Callable[[Any, str], Section]]],
+    every: Sequence[Run],
     runs: Sequence[Path],
     progress: Callable[[str, int, int], None],
 ) -> str:
     """The page, its lines as long as they may be now."""
     sections = []
-    for i, (own, section) in enumerate(every):
+    for i, run in enumerate(every):
         progress(runs[i].name, i, len(runs))
-        sections.append(section(own, f"run{i + 1}"))
+        sections.append(run.section(f"run{i + 1}"))
     progress("done", len(runs), len(runs))
-    return _document(sections, _beside([own for own, _ in every]))
+    return _document(sections, _beside(every))
 
 
-def _beside(runs: Sequence[Any]) -> str:
+def _beside(runs: Sequence[Run]) -> str:
     """What several experiments, and several studies, have in common; numbers as in the contents."""
-    numbered = {f"{i}. {run.folder.absolute().name}": run for i, run in enumerate(runs, 1)
-                if not isinstance(run, Recorded)}  # fmt: skip
-    experiments = {n: run for n, run in numbered.items() if isinstance(run, Experiment)}
-    studies = {n: run for n, run in numbered.items() if isinstance(run, StudyRun)}
+    experiments: dict[str, Experiment] = {}
+    studies: dict[str, StudyRun] = {}
+    for i, run in enumerate(runs, 1):
+        if isinstance(run, Experiment):
+            experiments[f"{i}. {run.marker.folder.absolute().name}"] = run
+        elif isinstance(run, StudyRun):
+            studies[f"{i}. {run.marker.folder.absolute().name}"] = run
     parts = []
     if len(experiments) > 1:
         parts.append(("Experiments side by side", comparison(experiments)))
@@ -85,20 +85,14 @@ def _beside(runs: Sequence[Any]) -> str:
     return "".join(f"<section>\n<h2>{h}</h2>\n{b}</section>\n" for h, b in parts if b)
 
 
-def _read(path: Path) -> tuple[Any, Callable[[Any, str], Section]]:
-    """A run as its section wants it, and the section."""
+def _read(path: Path) -> Run:
+    """A run folder or a record, whatever kind it is of."""
     if path.is_file():
-        return read_recorded(path), record_section
+        return read_recorded(path)
     if not path.exists():
         raise ValueError(f"{path}: no such folder or record")
-    if not (path / "run.json").is_file():
-        raise ValueError(f"{path} is no run folder: it has no run.json")
-    about = read_json(path / "run.json", "kind")
-    kind = str(about["kind"])
-    if kind not in _KINDS:
-        raise ValueError(f"{path} is a run of another kind: {kind!r}")
-    read, section = _KINDS[kind]
-    return read(path, about), section
+    marker = Marker.read(path, _KINDS)
+    return _KINDS[marker.kind](marker)
 
 
 def _document(sections: Sequence[Section], beside: str) -> str:

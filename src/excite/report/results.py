@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..description import PlantDescription, display_unit
 from ..record import Record
+from ..record.rows import EstimateSummary
 from .numbers import number
 from .tables import (
     Table,
@@ -50,39 +51,38 @@ def wrapped(text: str) -> str:
 # ------------------------------------------------------------------------- identification
 
 
-def _estimates(result: Data) -> tuple[str, Table]:
+def _estimates(result: EstimateSummary) -> tuple[str, Table]:
     title = (
-        f"{result['plant']}, {result['estimator']}, initial state {result['initial_state']}: "
-        f"{result['status']}"
+        f"{result.plant}, {result.estimator}, initial state {result.initial_state}: {result.status}"
     )
-    rows = [parameter_cells(name, p)[:-1] for name, p in result["params"].items()]
+    rows = [parameter_cells(name, p)[:-1] for name, p in result.params.items()]
     return title, (parameter_header()[:-1], rows)
 
 
-def _judgement(result: Data) -> list[str]:
+def _judgement(result: EstimateSummary) -> list[str]:
     """Fits, tests of the residual, verdict and correlation, one a line."""
     lines = [
         f"{name}: fit {number(percent, 4)} %, {residual_in_words(result, name)}"
-        for name, percent in result["fit_percent"].items()
+        for name, percent in result.fit_percent.items()
     ]
     lines += [
-        f"{v['file']}: held-out {name} fit {number(percent, 4)} %"
-        for v in result["validation"]
-        for name, percent in v["fit_percent"].items()
+        f"{v.file}: held-out {name} fit {number(percent, 4)} %"
+        for v in result.validation
+        for name, percent in v.fit_percent.items()
     ]
-    lines += result["verdict"]
-    if len(result["params"]) > 1:
+    lines += result.verdict
+    if len(result.params) > 1:
         lines.append(f"largest correlation: {largest_correlation(result)}")
     return lines
 
 
-def identification_text(result: Data) -> str:
+def identification_text(result: EstimateSummary) -> str:
     """Parameters with their intervals, and how far to trust them, as plain text."""
     title, (header, rows) = _estimates(result)
     return "\n".join([text_table(title, header, rows), "", *_judgement(result)])
 
 
-def identification_html(result: Data) -> str:
+def identification_html(result: EstimateSummary) -> str:
     """The same for a notebook."""
     title, (header, rows) = _estimates(result)
     return html_table(title, header, rows) + _paragraphs(_judgement(result))

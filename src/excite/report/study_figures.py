@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any
 
+import matplotlib.axes
 import matplotlib.figure
 import numpy as np
 
@@ -55,7 +55,9 @@ def _column_title(text: str) -> str:
     return textwrap.fill(text, 28)
 
 
-def _draw_band(axis: Any, seeds: Sequence[Curve], column: str, colour: str) -> None:
+def _draw_band(
+    axis: matplotlib.axes.Axes, seeds: Sequence[Curve], column: str, colour: str
+) -> None:
     """Median, quartiles and extremes over the seeds, in percent."""
     steps = seeds[0]["steps"] / 1e6
     values = 100 * np.stack([seed[column] for seed in seeds])
@@ -98,7 +100,7 @@ def agents_figure(
 
 
 def _draw_running(
-    axes: Any,
+    axes: np.ndarray,
     description: PlantDescription,
     records: Sequence[Record],
     running: Sequence[np.ndarray],

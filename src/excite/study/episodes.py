@@ -5,13 +5,13 @@ All play on the same plant with the same noise, that of the first evaluation epi
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Array, Float
 
 from ..description import PlantDescription, names_of
 from ..environment import run_episodes
@@ -67,7 +67,10 @@ def _excitations(
 
 
 def _running(
-    study: Study, plant: AbstractPlant, inputs: Any, measured: Any
+    study: Study,
+    plant: AbstractPlant,
+    inputs: Float[Array, "time input"],
+    measured: Float[Array, "sample output"],
 ) -> tuple[str, np.ndarray]:
     for name, estimator in study.build_estimators(plant).items():
         if isinstance(estimator, ARX) and isinstance(plant, AbstractARXPlant):
@@ -77,19 +80,19 @@ def _running(
 
 def episodes_data(
     description: PlantDescription, episodes: Mapping[str, tuple[Record, np.ndarray]]
-) -> dict[str, Any]:
+) -> dict[str, dict[str, object]]:
     """Episodes as JSON-ready data; docs/reference/machine-readable.md documents the keys."""
 
-    def columns(parts: Any, values: np.ndarray) -> dict[str, list[float]]:
-        return dict(zip(names_of(parts), map(_rounded, np.transpose(values)), strict=True))
+    def columns(names: Sequence[str], values: np.ndarray) -> dict[str, list[float]]:
+        return dict(zip(names, map(_rounded, np.transpose(values)), strict=True))
 
     return {
         name: {
             **record.metadata,
             "time": _rounded(record.time),
-            "inputs": columns(description.inputs, record.inputs),
-            "outputs": columns(description.outputs, record.outputs),
-            "estimate_over_true": columns(description.parameters, estimates),
+            "inputs": columns(names_of(description.inputs), record.inputs),
+            "outputs": columns(names_of(description.outputs), record.outputs),
+            "estimate_over_true": columns(names_of(description.parameters), estimates),
         }
         for name, (record, estimates) in episodes.items()
     }

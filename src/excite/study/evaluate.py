@@ -10,9 +10,10 @@ from pathlib import Path
 from ..description import unknown
 from ..plant import AbstractARXPlant, AbstractPlant
 from ..policy import POLICY_ENDING, Policy, mismatch, policy_path, read_policy, shipped_policies
+from ..report.study_table import StudyTable
 from ..training.checkpoint import Progress
-from .spec import Study, plant_tables, study_from
-from .tasks import run_benchmark
+from .evaluation import compared
+from .spec import plant_tables, study_from
 
 
 def evaluate(
@@ -27,7 +28,7 @@ def evaluate(
     rig: bool = False,
     filter: bool = False,
     progress: Progress = lambda *_: None,
-) -> tuple[Study, list[dict[str, object]]]:
+) -> StudyTable:
     """Scores a policy on plants drawn at random.
 
         >>> import excite as ex
@@ -74,7 +75,7 @@ def evaluate(
         study = study_from(settings, "evaluate").changed(estimators=estimators).checked("evaluate")
         if (warning := mismatch(trained, built.description)) is not None:
             warnings.warn(f"{name}: {warning}", stacklevel=2)
-        return study, run_benchmark(study, progress)
+        return compared(study, progress)
 
 
 def policy_at(policy: str | Path) -> Policy:

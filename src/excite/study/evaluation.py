@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -22,6 +21,8 @@ from ..estimation import AbstractEstimator, stack_experiments
 from ..excitation import AbstractExcitation
 from ..information import d_optimality, require_noise
 from ..plant import AbstractPlant
+from ..record.rows import BoundByLength, Row, StudyFacts
+from ..report.study_table import StudyTable
 from ..rig.filter import SafetyFilter
 from ..rig.simulated import bodies, evaluate_on_rig, readings_per_sample
 from ..safety import Supervision, Trip
@@ -56,7 +57,8 @@ def episode_keys(study: Study) -> Key[Array, " episode"]:
     return jax.random.split(jax.random.key(study.seed), study.episodes)
 
 
-Play = Callable[[AbstractExcitation, Any], tuple[Episodes, dict[str, np.ndarray]]]
+Keys = Key[Array, " episode"]
+Play = Callable[[AbstractExcitation, Keys], tuple[Episodes, dict[str, np.ndarray]]]
 """Plays an excitation once for every key; with what else happened on a rig."""
 
 
@@ -75,7 +77,7 @@ def player_of(study: Study, plant: AbstractPlant) -> Play:
     rules, numbers = Supervision.of(plant.description), study.rig.numbers()
     safety = SafetyFilter.of(plant, study.spread) if study.rig.filter else None
 
-    def play(excitation: AbstractExcitation, keys: Any) -> tuple[Episodes, dict[str, np.ndarray]]:
+    def play(excitation: AbstractExcitation, keys: Keys) -> tuple[Episodes, dict[str, np.ndarray]]:
         many = bodies(plant, readings_per_sample(plant), study.spread, keys, **numbers)
         on_rig = plant, excitation, many, rules, study.num_steps
         episodes, runs = evaluate_on_rig(*on_rig)
@@ -96,7 +98,7 @@ def evaluate_method(
     name: str,
     excitation: AbstractExcitation,
     progress: Callable[[int], None] = lambda _: None,
-) -> tuple[list[dict[str, Any]], Float[np.ndarray, " input"]]:
+) -> tuple[list[Row], Float[np.ndarray, " input"]]:
     """One row an estimator for one method, and each input's root mean square.
 
     The latter counts from the middle of the input's limits.
@@ -118,20 +120,17 @@ def evaluate_method(
         squares.append(np.mean(inputs**2, axis=1))
         for e, estimator in estimators.items():
             outcomes[e].append(outcome(plant, estimator, episodes, on_rig))
-    own = _of_method(study, plant, excitation)
-    rows = [
-        {**table_row(study, plant.description, (name, e), joined(parts)), **own}
-        for e, parts in outcomes.items()
-    ]
+    rows = [table_row(study, plant.description, (name, e), joined(o)) for e, o in outcomes.items()]
+    if study.lengths:
+        bounds = {"bound_by_length": _bound_by_length(study, plant, excitation)}
+        rows = [row.model_copy(update=bounds) for row in rows]
     return rows, np.sqrt(np.concatenate(squares).mean(axis=0))
 
 
-def _of_method(
+def _bound_by_length(
     study: Study, plant: AbstractPlant, excitation: AbstractExcitation
-) -> dict[str, Any]:
-    """Bounds of shorter experiments, where the study asks for them; signals are replanned."""
-    if not study.lengths:
-        return {}
+) -> BoundByLength:
+    """Bounds of shorter experiments; signals are planned again for each length."""
     keys = episode_keys(study)[:CHUNK]
     bounds = [
         np.asarray(run_episodes(plant, excitation, length, study.spread, keys).bound).mean(axis=0)
@@ -139,9 +138,10 @@ def _of_method(
     ]
     names = names_of(plant.definition.parameters)
     percent = {
-        n: (100 * values).tolist() for n, values in zip(names, np.transpose(bounds), strict=True)
+        n: tuple((100 * values).tolist())
+        for n, values in zip(names, np.transpose(bounds), strict=True)
     }
-    return {"bound_by_length": {"num_steps": list(study.lengths), "cramer_rao_percent": percent}}
+    return BoundByLength(num_steps=tuple(study.lengths), cramer_rao_percent=percent)
 
 
 def outcome(
@@ -168,3 +168,28 @@ def outcome(
 def joined(parts: list[Outcome]) -> Outcome:
     """Several batches as one."""
     return jax.tree.map(lambda *arrays: np.concatenate(arrays), *parts)
+
+
+def method_rows(study: Study, progress: Progress = lambda *_: None) -> list[Row]:
+    """Rows of the study's methods in order, each with all estimators."""
+    plant = study.build_plant()
+    methods, rows = study.build_methods(plant), []
+    parts = num_chunks(study)
+    for m, (name, excitation) in enumerate(methods.items()):
+
+        def in_method(c: int, name: str = name, before: int = m * parts) -> None:
+            progress(name, before + c, len(methods) * parts)
+
+        rows += evaluate_method(study, plant, name, excitation, in_method)[0]
+    progress("done", len(methods) * parts, len(methods) * parts)
+    return rows
+
+
+def compared(study: Study, progress: Progress = lambda *_: None) -> StudyTable:
+    """The table of a study that has neither agents nor clairvoyant signals."""
+    return StudyTable(rows=tuple(method_rows(study, progress)), study=facts(study))
+
+
+def facts(study: Study) -> StudyFacts:
+    """The study as tables and reports read it."""
+    return StudyFacts.model_validate(study.model_dump())

@@ -21,7 +21,7 @@ def seed_folder(folder: Path, agent: str, seed: int) -> Path:
     return folder / "seeds" / folder_word(agent) / str(seed)
 
 
-def agent_settings(study: Study, plant: AbstractPlant, agent: str) -> dict[str, Any]:
+def agent_settings(study: Study, plant: AbstractPlant, agent: str) -> dict[str, object]:
     """All that decides what a seed of an agent becomes but the plant, JSON-ready."""
     own = study.agent(agent).settings(plant)
     return {**own, "spread": study.spread, "num_steps": study.num_steps}
@@ -52,7 +52,7 @@ def read_json(path: Path, *keys: str) -> dict[str, Any]:
     Raises:
         ValueError: where it cannot be read, or holds something else.
     """
-    return files.read_json(path, *keys, advice=_advice(path))
+    return files.read_json(path, *keys, advice=advice(path))
 
 
 _REMEDIES = {
@@ -66,14 +66,15 @@ _REMEDIES = {
 
 def read_columns(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
     """Columns of a CSV file of a run folder, these among them; ValueError for another file."""
-    return files.read_columns(path, names, advice=_advice(path))
+    return files.read_columns(path, names, advice=advice(path))
 
 
-def _advice(path: Path) -> str:
+def advice(path: Path) -> str:
+    """What helps where a file of a run folder is damaged."""
     of_seed = f"delete {path.parent}: 'excite study run' trains that seed from the beginning"
     return _REMEDIES.get(path.name, of_seed)
 
 
 def damaged(path: Path) -> ValueError:
     """The error for a file of a run folder that is not as it was written, and what helps."""
-    return files.damaged(path, _advice(path))
+    return files.damaged(path, advice(path))

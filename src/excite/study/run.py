@@ -1,4 +1,4 @@
-"""A study with agents: what is missing is trained, what is finished is kept.
+"""A study as a job: what is missing is computed, what is finished is kept, tables are written.
 
 A run folder grows: `seeds/AGENT/N/` holds the policy, learning curve and metrics of one
 finished seed (while it runs, its checkpoint and logs), `methods.json` the rows of the
@@ -10,22 +10,45 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import json
 import os
-from collections.abc import Callable, Iterator, Mapping
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
+
+import jax
 
 from .. import __version__
-from ..files import csv_text, json_ready, took_lock, write_bytes, write_json
+from ..files import (
+    csv_text,
+    json_ready,
+    new_run_folder,
+    require_free_run_folder,
+    took_lock,
+    write_bytes,
+    write_json,
+)
 from ..plant import AbstractPlant
 from ..policy import POLICY_ENDING, read_policy
 from ..record.read import SIGNAL_ENDINGS
-from .engine import Engine, run
-from .evaluation import Progress
+from ..record.rows import Rows
+from ..report.figure import image
+from ..report.frontier import frontier_figure, lengths_figure
+from ..report.study_figures import agents_figure, curves_figure
+from ..report.study_table import StudyTable, differences_csv
+from .catalogue import study_path
+from .cluster import dask_engine
+from .engine import Engine, local_engine, run
+from .episodes import episodes_data, example_episodes
+from .evaluation import Progress, compared, method_rows
 from .folder import agent_settings, fingerprint, read_json, seed_folder, study_of
 from .progress import read_progress, remove_progress
-from .spec import Study
+from .spec import Study, read_study
+from .table import best_seeds, learning_curves, study_table
 from .tasks import clairvoyant_task, methods_task, seed_task
+from .workers import num_cores
 
 KIND = "excite study"
 FREE = {"name", "title", "inferred", "ours", "reference", "source"}
@@ -35,6 +58,146 @@ FREE |= {"agents", "decision", "training", "gradient", "seeds"}
 _Target = tuple[str, str, int]
 
 _TASKS = {"methods": methods_task, "clairvoyant": clairvoyant_task, "seed": seed_task}
+
+
+class StudyFailedError(RuntimeError):
+    """Tasks of a study failed in spite of all tries; the message says which and why."""
+
+
+def run_study(
+    study: Study | str | Path,
+    out: str | Path | None = None,
+    *,
+    episodes: int | None = None,
+    seed: int | None = None,
+    estimators: str | Sequence[str] | None = None,
+    engine: Literal["local", "dask"] = "local",
+    workers: int | None = None,
+    address: str | None = None,
+    overwrite: bool = False,
+    progress: Progress = lambda *_: None,
+    on_done: Callable[[str], None] = lambda _: None,
+    on_wait: Callable[[], None] = lambda: None,
+    command: str = "",
+) -> StudyTable:
+    """Compares the methods of a study, and trains its agents; rerun it to resume.
+
+    Args:
+        study: a study, a file, or the name of a shipped study.
+        out: run folder; a study without agents needs none.
+        episodes, seed, estimators: in place of the study's.
+        engine: processes of this machine, or a Dask cluster.
+        workers: processes of the local engine; default one a core.
+        address: of the cluster's scheduler, tcp://HOST:PORT.
+        overwrite: whether a run in `out` is replaced and not resumed.
+        progress: called with what is being computed, how much is done, and how much there is.
+        on_done: called with the name of every task that was finished.
+        on_wait: called when the cluster has no worker yet.
+        command: kept in the run folder for those who want to do it again.
+
+    Raises:
+        ValueError: for a study, an option or a folder that cannot be used.
+        StudyFailedError: where tasks failed; what is finished is kept.
+    """
+    chosen = study if isinstance(study, Study) else read_study(study_path(study))
+    names = estimators if isinstance(estimators, str | None) else ",".join(estimators)
+    chosen = chosen.changed(episodes=episodes, seed=seed, estimators=names)
+    machine = _engine(engine, workers, address, on_wait)
+    what = "agents to train" if chosen.agents else "signals to design" if chosen.clairvoyant else ""
+    if out is None:
+        if what:
+            raise ValueError(f"the study {chosen.name!r} has {what}: it needs a run folder (--out)")
+        return compared(chosen, progress)
+    folder = Path(out)
+    place: contextlib.AbstractContextManager[Path] = contextlib.nullcontext(folder)
+    if overwrite:
+        require_free_run_folder(folder, overwrite)
+    if not what and engine == "local":
+        machine = None
+        if overwrite or not folder.exists():  # the folder appears when all of it is written
+            place = new_run_folder(folder, overwrite)
+    elif overwrite and folder.exists():
+        shutil.rmtree(folder)
+    if machine is not None and engine == "local":
+        _require_trainer(chosen, folder)
+    with place as where:
+        failures = run_tasks(chosen, where, machine, progress, on_done, command)
+        if failures:
+            raise _failed(failures, folder)
+        return write_table(chosen, where)
+
+
+def _engine(
+    engine: Literal["local", "dask"],
+    workers: int | None,
+    address: str | None,
+    on_wait: Callable[[], None],
+) -> Engine:
+    if engine == "dask":
+        if address is None:
+            raise ValueError("--engine dask needs --address tcp://HOST:PORT of its scheduler")
+        if workers is not None:
+            raise ValueError("--workers is for the local engine; a Dask cluster has its own")
+        return dask_engine(address, on_wait)
+    if address is not None:
+        raise ValueError("--address is for --engine dask")
+    cache = jax.config.jax_compilation_cache_dir
+    return local_engine(workers or num_cores(), Path(cache) if cache else None)
+
+
+def _require_trainer(study: Study, folder: Path) -> None:
+    """Raises ValueError where seeds are left to train and a library is missing."""
+    agents = [name for name, agent in study.agents.items() if agent.method == "ppo"]
+    folders = [seed_folder(folder, a, seed) for a in agents for seed in range(study.seeds)]
+    if all((folder / "metrics.json").is_file() for folder in folders):
+        return
+    missing = [n for n in ("stable_baselines3", "torch", "tensorboard") if find_spec(n) is None]
+    if missing:
+        raise ValueError(f"training needs {', '.join(missing)}: pip install 'excite[ppo]'")
+
+
+def _failed(failures: Mapping[str, Exception], folder: Path) -> Exception:
+    """One error for all tasks that failed; the user's mistake where every one of them is."""
+    names: dict[str, list[str]] = {}
+    for name, error in failures.items():
+        names.setdefault(str(error), []).append(name)
+    reasons = "; ".join(f"{', '.join(some)}: {reason}" for reason, some in names.items())
+    is_mistake = all(isinstance(error, ValueError) for error in failures.values())
+    return (ValueError if is_mistake else StudyFailedError)(
+        f"{len(failures)} task{'s' * (len(failures) > 1)} failed ({reasons}); what is finished "
+        f"is kept in {folder}; rerun the same command to resume"
+    )
+
+
+def write_table(study: Study, folder: Path) -> StudyTable:
+    """Writes the table and the figures of a finished study into its run folder."""
+    table, plant = study_table(folder), study.build_plant().description
+    rows, title = table.rows, table.study.heading
+    seeds = best_seeds(study, folder)
+    episodes = example_episodes(study, folder, seeds)
+    content = json.dumps(json_ready(episodes_data(plant, episodes)), ensure_ascii=False)
+    files = {
+        "table.md": table.markdown().encode(),
+        "table.csv": table.csv().encode(),
+        "table.tex": table.latex().encode(),
+        "errors.png": image(table.plot(), "png"),
+        "episodes.json": content.encode(),
+    }
+    if study.clairvoyant is not None:
+        files["frontier.png"] = image(frontier_figure(rows, title), "png")
+    if study.lengths:
+        files["lengths.png"] = image(lengths_figure(rows, title), "png")
+    if study.agents:
+        bounds = study.bound_curves()
+        curves = curves_figure(plant, learning_curves(study, folder), title, bounds)
+        played = agents_figure(plant, {agent: episodes[agent] for agent in seeds}, title)
+        files["differences.csv"] = differences_csv(table.differences).encode()
+        files |= {"curves.png": image(curves, "png"), "episodes.png": image(played, "png")}
+        table = table.model_copy(update={"best_seeds": seeds, "bound_curves": tuple(bounds)})
+    for name, data in files.items():
+        write_bytes(folder / name, data)
+    write_json(folder / "table.json", table.data())
+    return table
 
 
 @contextlib.contextmanager
@@ -175,10 +338,10 @@ def _differing(study: Study, plant: AbstractPlant, agent: str, metrics: Path) ->
     return f" ({', '.join(names)})" if names else ""
 
 
-def run_study(
+def run_tasks(
     study: Study,
     folder: Path,
-    engine: Engine,
+    engine: Engine | None,
     progress: Progress = lambda *_: None,
     on_done: Callable[[str], None] = lambda _: None,
     command: str = "",
@@ -186,6 +349,7 @@ def run_study(
     """Computes what the run folder lacks.
 
     Args:
+        engine: None for this process, which can evaluate methods only.
         progress: called about once a second, in thousandths of a task.
         on_done: called with the name of every task that was finished.
         command: that runs it, kept in `run.json` for those who want to do it again.
@@ -198,8 +362,13 @@ def run_study(
         if tasks:  # a table of before is not that of this study
             (folder / "table.json").unlink(missing_ok=True)
         before = len(targets) - len(tasks)
+        if engine is None:
+            if "methods" in tasks:
+                rows = method_rows(study, progress)
+                _keep(targets["methods"], folder, Rows(rows=tuple(rows)).data())
+            return {}
 
-        def finished(name: str, result: Any) -> None:
+        def finished(name: str, result: Mapping[str, Any]) -> None:
             _keep(targets[name], folder, result)
             on_done(name)
 
@@ -246,7 +415,7 @@ def _missing(
     return tasks
 
 
-def _keep(target: _Target, folder: Path, result: Any) -> None:
+def _keep(target: _Target, folder: Path, result: Mapping[str, Any]) -> None:
     """Writes what a task returned; the file that marks it as finished last."""
     kind, agent, seed = target
     if kind != "seed":

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Iterable, Mapping
 
 import equinox as eqx
 import numpy as np
@@ -12,6 +11,7 @@ from jaxtyping import Float
 
 from ..description import HALF_95, PlantDescription, display_unit, names_of
 from ..estimation import Status
+from ..record.rows import ErrorStatistics, LargestOutput, MeanSd, Rate, RigCounts, Row
 from ..safety import watched_output
 from .spec import Study
 
@@ -36,8 +36,8 @@ class Outcome(eqx.Module):
 
 def table_row(
     study: Study, description: PlantDescription, names: tuple[str, str], outcome: Outcome
-) -> dict[str, Any]:
-    """One row of the table; its keys are documented in docs/reference/machine-readable.md.
+) -> Row:
+    """One row of the table.
 
     Args:
         names: of method and estimator.
@@ -49,49 +49,44 @@ def table_row(
     violations, count = int(outcome.is_violation.sum()), len(good)
     watched = watched_output(description)
     unit, factor = display_unit(description.outputs[watched].unit)
+    params = names_of(description.parameters)
     reasons = ["tripped"] * int(is_tripped.sum())
     reasons += [Status(s).name.lower() for s in outcome.status[~good & ~is_tripped]]
 
-    def by_name(values: Any) -> dict[str, Any]:
-        return dict(zip(names_of(description.parameters), values, strict=True))
+    seen = {name: int(counts.sum()) for name, counts in outcome.on_rig.items()}
+    row = Row(
+        method=names[0],
+        estimator=names[1],
+        evaluations=count,
+        failed=int(count - good.sum()),
+        failures={reason: reasons.count(reason) for reason in sorted(set(reasons))},
+        violations=violations,
+        violation_rate=violation_rate(violations, count),
+        max_abs_output=LargestOutput(
+            output=description.outputs[watched].name,
+            unit=unit,
+            **dict(mean_sd(factor * outcome.max_abs_output[:, watched])),
+        ),
+        log_det_information=float(outcome.log_det.mean()),
+        log_det_information_sd=mean_sd(outcome.log_det).sd,
+        relative_error_percent=dict(
+            zip(params, (_error(100 * np.abs(e)) for e in error.T), strict=True)
+        ),
+        cramer_rao_percent=_by_name(params, 100 * outcome.bound.mean(axis=0)),
+        rms_over_cramer_rao=_by_name(params, _rms(error) / _rms(outcome.bound[good])),
+        coverage95_percent=_by_name(params, 100 * _fraction(np.abs(error) < HALF_95 * std_error)),
+        beyond_6_std_errors=int(np.any(np.abs(error) > 6 * std_error, axis=1).sum()),
+    )
+    if seen:
+        row = row.model_copy(update={"on_rig": RigCounts(**seen)})
+    if study.clairvoyant is not None:  # over the plants that its signals are designed for
+        mean = float(outcome.log_det[: study.clairvoyant.plants].mean())
+        row = row.model_copy(update={"log_det_of_clairvoyant_plants": mean})
+    return row
 
-    return {
-        "method": names[0],
-        "estimator": names[1],
-        "evaluations": count,
-        "failed": int(count - good.sum()),
-        "failures": {reason: reasons.count(reason) for reason in sorted(set(reasons))},
-        "violations": violations,
-        "violation_rate": violation_rate(violations, count),
-        **_on_rig(outcome.on_rig),
-        "max_abs_output": {
-            "output": description.outputs[watched].name,
-            **mean_sd(factor * outcome.max_abs_output[:, watched]),
-            "unit": unit,
-        },
-        "log_det_information": float(outcome.log_det.mean()),
-        "log_det_information_sd": mean_sd(outcome.log_det)["sd"],
-        **_paired_log_det(study, outcome),
-        "relative_error_percent": by_name(_error(100 * np.abs(e)) for e in error.T),
-        "cramer_rao_percent": by_name(100 * outcome.bound.mean(axis=0)),
-        "rms_over_cramer_rao": by_name(_rms(error) / _rms(outcome.bound[good])),
-        "coverage95_percent": by_name(100 * _fraction(np.abs(error) < HALF_95 * std_error)),
-        "beyond_6_std_errors": int(np.any(np.abs(error) > 6 * std_error, axis=1).sum()),
-    }
 
-
-def _on_rig(seen: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """What a row has beside the rest where experiments were made on a simulated rig."""
-    return {"on_rig": {name: int(counts.sum()) for name, counts in seen.items()}} if seen else {}
-
-
-def _paired_log_det(study: Study, outcome: Outcome) -> dict[str, float]:
-    """Mean over the plants that the clairvoyant signals are designed for."""
-    if study.clairvoyant is None:
-        return {}
-    return {
-        "log_det_of_clairvoyant_plants": float(outcome.log_det[: study.clairvoyant.plants].mean())
-    }
+def _by_name(params: Iterable[str], values: np.ndarray) -> dict[str, float]:
+    return dict(zip(params, values.tolist(), strict=True))
 
 
 def _rms(values: Float[np.ndarray, "episode param"]) -> Float[np.ndarray, " param"]:
@@ -103,25 +98,28 @@ def _fraction(values: np.ndarray) -> Float[np.ndarray, " param"]:
     return values.mean(axis=0) if len(values) else np.full(values.shape[1], np.nan)
 
 
-def mean_sd(values: np.ndarray) -> dict[str, float]:
+def mean_sd(values: np.ndarray) -> MeanSd:
     """Mean and standard deviation, where there are any."""
-    return {
-        "mean": float(values.mean()) if values.size else math.nan,
-        "sd": float(values.std(ddof=1)) if values.size > 1 else math.nan,
-    }
+    return MeanSd(
+        mean=float(values.mean()) if values.size else math.nan,
+        sd=float(values.std(ddof=1)) if values.size > 1 else math.nan,
+    )
 
 
-def _error(values: np.ndarray) -> dict[str, float]:
-    """Mean and standard deviation of errors, and what a few large ones do not move."""
-    if not values.size:
-        return {**mean_sd(values), "median": math.nan, "rms": math.nan}
-    rms = float(np.sqrt(np.mean(values**2)))
-    return {**mean_sd(values), "median": float(np.median(values)), "rms": rms}
+def _error(values: np.ndarray) -> ErrorStatistics:
+    """Mean and standard deviation of errors, and the median, which a few large ones do not move."""
+    size = mean_sd(values)
+    return ErrorStatistics(
+        mean=size.mean,
+        sd=size.sd,
+        median=float(np.median(values)) if values.size else math.nan,
+        rms=float(np.sqrt(np.mean(values**2))) if values.size else math.nan,
+    )
 
 
-def violation_rate(violations: int, count: int) -> dict[str, Any]:
-    """The rate and its interval, as rows have it."""
-    return {"estimate": violations / count, "ci95": wilson(violations, count)}
+def violation_rate(violations: int, count: int) -> Rate:
+    """The rate and its 95 % interval."""
+    return Rate(estimate=violations / count, ci95=wilson(violations, count))
 
 
 def wilson(successes: int, count: int) -> tuple[float, float]:

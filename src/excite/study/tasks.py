@@ -13,7 +13,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TypedDict
 
 import equinox as eqx
 import jax
@@ -24,22 +24,34 @@ from jaxtyping import Array, Float, Key
 from .. import __version__
 from ..environment import Env, Episodes, run_episodes
 from ..excitation import PolicyExcitation, Replay
-from ..files import new_run_folder, write_bytes, write_json
+from ..files import write_bytes
 from ..plant import AbstractPlant
 from ..policy import Policy
+from ..record.rows import Rows, SeedMetrics
 from ..training.checkpoint import Checkpoint, Trained
 from ..training.signals import clairvoyant_signals, signal_env
 from .agent import Agent
-from .evaluation import Progress, episode_keys, evaluate_method, num_chunks, outcome
+from .evaluation import episode_keys, evaluate_method, method_rows, outcome
 from .folder import agent_settings, fingerprint
 from .progress import write_progress
 from .spec import Study, study_from
 from .statistics import table_row
 
+Data = dict[str, object]
+"""JSON-ready: what a worker sends back."""
+
+
+class SeedResult(TypedDict):
+    """What the training of a seed leaves: policy file, learning curve, `SeedMetrics` as data."""
+
+    policy: bytes
+    curve: list[dict[str, float]]
+    metrics: Data
+
 
 @contextlib.contextmanager
 def unpacked(
-    settings: Mapping[str, Any], source: Mapping[str, Any]
+    settings: Mapping[str, object], source: Mapping[str, str | None]
 ) -> Iterator[tuple[Study, AbstractPlant]]:
     """The study of a task and its plant; a user's plant file lies here while it is needed.
 
@@ -49,10 +61,10 @@ def unpacked(
     """
     settings = dict(settings)
     with tempfile.TemporaryDirectory() as folder:
-        if source["text"] is not None:
+        if (text := source["text"]) is not None:
             path, _, class_name = str(settings["plant"]).rpartition(":")
             file = Path(folder) / Path(path).name
-            file.write_text(source["text"], encoding="utf-8")
+            file.write_text(text, encoding="utf-8")
             settings["plant"] = f"{file}:{class_name}"
         study = study_from(settings, "study")
         plant = study.build_plant()
@@ -60,7 +72,7 @@ def unpacked(
             raise ValueError(
                 f"the plant {plant.definition.name!r} of this worker is another one "
                 f"(hash {plant.description.hash[:8]}) than that of the study "
-                f"({source['hash'][:8]})"
+                f"({str(source['hash'])[:8]})"
             )
         yield study, plant
 
@@ -70,13 +82,13 @@ COLLAPSED = 0.01
 
 
 def seed_task(
-    study: Mapping[str, Any],
-    plant: Mapping[str, Any],
+    study: Mapping[str, object],
+    plant: Mapping[str, str | None],
     agent: str,
     seed: int,
     folder: str | None,
     checkpoint_seconds: float,
-) -> dict[str, Any]:
+) -> SeedResult:
     """A trained policy, its learning curve, and how it does in the evaluation.
 
     Args:
@@ -101,16 +113,20 @@ def seed_task(
             **agent_settings(chosen, built, agent),
         }
         policy = Policy(built.description, env.layout, trained.weights, provenance)
-        metrics = {
-            "agent": agent,
-            "seed": seed,
-            **_evaluated(chosen, built, agent, policy),
-            "validation": trained.validation,
-            "train_seconds": seconds,
-            "resumed_at_steps": keeper.resumed_at_steps,
-            "fingerprint": mark,
-        }
-        return {"policy": policy.to_bytes(), "curve": trained.curve, "metrics": metrics}
+        rows, rms = evaluate_method(chosen, built, agent, PolicyExcitation.of(policy))
+        limit = np.array(policy.layout.input_half)
+        metrics = SeedMetrics(
+            agent=agent,
+            seed=seed,
+            rows=rows,
+            rms_input_fraction=float(np.max(rms / limit)),
+            viable=bool(np.any(rms >= COLLAPSED * limit)),
+            validation=trained.validation,
+            train_seconds=seconds,
+            resumed_at_steps=keeper.resumed_at_steps,
+            fingerprint=mark,
+        )
+        return {"policy": policy.to_bytes(), "curve": trained.curve, "metrics": metrics.data()}
 
 
 def _trained(env: Env, agent: Agent, seed: int, keeper: _Keeper) -> Trained:
@@ -118,16 +134,6 @@ def _trained(env: Env, agent: Agent, seed: int, keeper: _Keeper) -> Trained:
     own = {"log_folder": keeper.log_folder} if agent.method == "ppo" else {}
     train = importlib.import_module(f"excite.training.{agent.method}").train
     return train(env, agent.training, seed, resume=keeper.saved(), on_boundary=keeper.keep, **own)
-
-
-def _evaluated(study: Study, plant: AbstractPlant, agent: str, policy: Policy) -> dict[str, Any]:
-    rows, rms = evaluate_method(study, plant, agent, PolicyExcitation.of(policy))
-    limit = np.array(policy.layout.input_half)
-    return {
-        "rows": rows,
-        "rms_input_fraction": float(np.max(rms / limit)),
-        "viable": bool(np.any(rms >= COLLAPSED * limit)),
-    }
 
 
 class _Keeper:
@@ -173,58 +179,16 @@ class _Keeper:
             self.last = time.monotonic()
 
 
-def run_benchmark(study: Study, progress: Progress = lambda *_: None) -> list[dict[str, Any]]:
-    """Rows of the study's methods in order, each with all estimators."""
-    plant = study.build_plant()
-    methods, rows = study.build_methods(plant), []
-    parts = num_chunks(study)
-    for m, (name, excitation) in enumerate(methods.items()):
-
-        def in_method(c: int, name: str = name, before: int = m * parts) -> None:
-            progress(name, before + c, len(methods) * parts)
-
-        rows += evaluate_method(study, plant, name, excitation, in_method)[0]
-    progress("done", len(methods) * parts, len(methods) * parts)
-    return rows
-
-
-def methods_task(study: Mapping[str, Any], plant: Mapping[str, Any]) -> dict[str, Any]:
-    """Rows of a study's own methods; what a worker is called for."""
+def methods_task(study: Mapping[str, object], plant: Mapping[str, str | None]) -> Data:
+    """Rows of a study's methods."""
     with unpacked(study, plant) as (chosen, _):
-        return {"rows": run_benchmark(chosen)}
-
-
-def write_benchmark(
-    study: Study,
-    rows: list[dict[str, Any]],
-    shown: Mapping[str, bytes],
-    path: Path,
-    overwrite: bool = False,
-    command: str = "",
-) -> None:
-    """Leaves a run folder: the study, its rows as JSON, and what people look at.
-
-    Args:
-        shown: tables, figures and episodes, ready made, by file name.
-        command: that made it, for those who want to do it again.
-
-    Raises:
-        ValueError: where `path` holds something else, or a run and not `overwrite`.
-    """
-    with new_run_folder(path, overwrite) as folder:
-        for name, content in shown.items():
-            (folder / name).write_bytes(content)
-        write_json(folder / "table.json", {"rows": rows})
-        plant = study.build_plant().description
-        write_json(folder / "study.json", study.model_dump())
-        about = {"kind": "excite benchmark", "excite": __version__, "command": command}
-        write_json(folder / "run.json", {**about, "plant": plant.to_dict()})
+        return Rows(rows=method_rows(chosen)).data()
 
 
 METHOD = "clairvoyant"
 
 
-def clairvoyant_task(study: Mapping[str, Any], plant: Mapping[str, Any]) -> dict[str, Any]:
+def clairvoyant_task(study: Mapping[str, object], plant: Mapping[str, str | None]) -> Data:
     """Rows of the clairvoyant signals, and how well their starts agree."""
     with unpacked(study, plant) as (chosen, built):
         if chosen.clairvoyant is None:
@@ -237,8 +201,8 @@ def clairvoyant_task(study: Mapping[str, Any], plant: Mapping[str, Any]) -> dict
             table_row(chosen, built.description, (METHOD, name), outcome(built, e, episodes))
             for name, e in chosen.build_estimators(built).items()
         ]
-        spread = np.ptp(design.worth_by_start, axis=1)
-        return {"rows": rows, "log_det_spread_of_starts": spread.tolist()}
+        spread = np.ptp(design.worth_by_start, axis=1).tolist()
+        return Rows(rows=rows, log_det_spread_of_starts=spread).data()
 
 
 @eqx.filter_jit

@@ -9,7 +9,6 @@ from pathlib import Path
 from ..plant import AbstractARXPlant, AbstractPlant
 from ..policy import Policy, read_policy
 from ..training.checkpoint import Progress
-from .engine import local_engine
 from .folder import seed_folder
 from .objectives import decision_of, rewards_of
 from .run import run_study
@@ -83,9 +82,7 @@ def train(
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary if out is None else out)
         study = _compared_with_a_chirp(plant, noise, folder.absolute().name, settings, agents)
-        failures = run_study(study, folder, local_engine(workers), progress)
-        if failures:
-            raise ValueError("; ".join(f"{name}: {error}" for name, error in failures.items()))
+        run_study(study, folder, workers=workers, progress=progress)
         ((name, seed),) = best_seeds(study, folder).items()
         return read_policy(seed_folder(folder, name, seed) / "policy.safetensors")
 

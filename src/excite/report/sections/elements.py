@@ -5,17 +5,17 @@ Everything that comes from a file passes `text`, so that it is shown and never o
 
 from __future__ import annotations
 
+import abc
 import contextlib
 import html
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import matplotlib.figure
 
-from ...description import PlantDescription, display_unit
-from ...files import damaged
+from ...description import Input, Output, PlantDescription, display_unit
+from ...files import damaged, read_json
 from ...record import Record, read_record
 from ..figure import inline_svg
 from ..numbers import number
@@ -45,6 +45,50 @@ class Section:
         return self.source.absolute().name
 
 
+@dataclass(frozen=True)
+class Marker:
+    """`run.json`: what a run folder is.
+
+    Attributes:
+        folder: that it lies in.
+        kind: of run.
+        plant: that it is about.
+        version: of the program that made it.
+        command: that made it; empty where it is not known.
+        policies: by method, the hash of its policy.
+    """
+
+    folder: Path
+    kind: str
+    plant: PlantDescription
+    version: str
+    command: str
+    policies: Mapping[str, str]
+
+    @classmethod
+    def read(cls, folder: Path, kinds: Collection[str]) -> Marker:
+        """Of a run folder; ValueError where it is damaged, missing or of another kind."""
+        path = folder / "run.json"
+        if not path.is_file():
+            raise ValueError(f"{folder} is no run folder: it has no run.json")
+        content = read_json(path, "kind")
+        if content["kind"] not in list(kinds):
+            raise ValueError(f"{folder} is a run of another kind: {content['kind']!r}")
+        with understood(path, "rerun the command that made this run folder"):
+            plant = PlantDescription.from_dict(content["plant"])
+            policies = dict(content.get("policies") or {})
+        words = (str(content.get(key) or "") for key in ("excite", "command"))
+        return cls(folder, str(content["kind"]), plant, *words, policies)
+
+
+class Run(abc.ABC):
+    """What a report shows in one section."""
+
+    @abc.abstractmethod
+    def section(self, name: str) -> Section:
+        """What the report says of it; `name` begins the names of its figures."""
+
+
 @contextlib.contextmanager
 def understood(path: Path, advice: str = "") -> Iterator[None]:
     """Whatever in a file is not as it was written becomes one sentence that names the file."""
@@ -54,7 +98,7 @@ def understood(path: Path, advice: str = "") -> Iterator[None]:
         raise damaged(path, advice) from error
 
 
-def text(value: Any) -> str:
+def text(value: object) -> str:
     """A value as text of a page, whatever characters are in it."""
     return html.escape(str(value))
 
@@ -108,7 +152,7 @@ def table(
     )
 
 
-def facts(pairs: Iterable[tuple[str, Any]]) -> str:
+def facts(pairs: Iterable[tuple[str, object]]) -> str:
     """Names and values below each other; values in words, those that say nothing left out."""
     rows = [(name, in_words(value)) for name, value in pairs]
     body = "".join(f"<dt>{text(n)}</dt><dd>{text(v)}</dd>\n" for n, v in rows if v)
@@ -140,7 +184,7 @@ def command(kept: str | None, likely: str) -> str:
     return f"{heading('Do it again')}{remark}<pre><code>{text(kept or likely)}</code></pre>\n"
 
 
-def in_words(value: Any) -> str:
+def in_words(value: object) -> str:
     """Settings as people read them: 'amplitude 7.2, clock 4'; nothing for none."""
     if isinstance(value, Mapping):
         return ", ".join(f"{k} {words}" for k, v in value.items() if (words := in_words(v)))
@@ -219,11 +263,11 @@ def signals_table(d: PlantDescription, records: Collection[Record]) -> str:
     return table(["signal", "unit", "smallest", "largest", "levels"], rows)
 
 
-def _reached(part: Any, size: float) -> str:
+def _reached(part: Input | Output, size: float) -> str:
     """Which safety level an output reached."""
-    for word in ("critical", "warning"):
-        level = getattr(part, f"{word}_level", None)
+    if isinstance(part, Input) or not (part.critical_level or part.warning_level):
+        return "–"
+    for word, level in (("critical", part.critical_level), ("warning", part.warning_level)):
         if level is not None and size >= level:
             return f"{word} level reached, as measured"
-    has_levels = getattr(part, "critical_level", None) or getattr(part, "warning_level", None)
-    return "below both" if has_levels else "–"
+    return "below both"

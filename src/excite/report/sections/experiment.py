@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ...description import RARE, PlantDescription, display_unit, names_of
-from ...files import read_columns, read_json
+from ...files import read_columns
 from ...record import Record
+from ...record.rows import EstimatedParameter, EstimateSummary
 from ..figures import (
     autocorrelation_figure,
     correlation_figure,
@@ -22,6 +22,8 @@ from ..figures import (
 from ..numbers import number
 from ..tables import largest_correlation, parameter_cells, parameter_header, residual_cells
 from .elements import (
+    Marker,
+    Run,
     Section,
     bullets,
     command,
@@ -48,36 +50,63 @@ _ADVICE = "'excite identify --out' writes it again"
 
 
 @dataclass(frozen=True)
-class Experiment:
+class Experiment(Run):
     """The run folder of an identification, as it was read.
 
     Attributes:
-        folder: where it lies.
+        marker: the content of `run.json`, and the folder.
         plant: what was fitted.
         result: the content of `estimate.json`.
-        about: the content of `run.json`.
         records, simulated: what was measured, and the outputs of the estimated plant.
     """
 
-    folder: Path
+    marker: Marker
     plant: PlantDescription
-    result: Mapping[str, Any]
-    about: Mapping[str, Any]
+    result: EstimateSummary
     records: Sequence[Record]
     simulated: Sequence[np.ndarray]
 
+    def section(self, name: str) -> Section:
+        """What the report says of an identification."""
+        d, result = self.plant, self.result
+        with understood(self.marker.folder / "estimate.json", _ADVICE):
+            cells = [parameter_cells(n, p) for n, p in result.params.items()]
+            parts = [
+                heading("Parameters"),
+                table(parameter_header(), cells),
+                _truth(self),
+                heading("What the data can see"),
+                bullets(result.verdict),
+                heading("Measured"),
+                signals_table(d, self.records),
+                _figures(self, name),
+                heading("Residual"),
+                table(*_residuals(self), labels=1),
+                paragraph(_TESTS),
+                figure(
+                    autocorrelation_figure(d, _residual_values(self)),
+                    f"{name}-white",
+                    "Autocorrelation of the residual; 95 % of that of white noise lies between "
+                    "the dashed lines.",
+                ),
+                _correlation(result, name),
+                heading("Settings and provenance"),
+                _provenance(self),
+                command(self.marker.command, _likely_command(result)),
+            ]
+        title = f"{d.name}: {result.estimator}, {result.status}"
+        return Section(title, self.marker.folder, "".join(parts))
 
-def read_experiment(folder: Path, about: Mapping[str, Any]) -> Experiment:
+
+def read_experiment(marker: Marker) -> Experiment:
     """The experiment in a run folder.
 
     Raises:
         ValueError: for a file that is damaged or missing.
     """
-    with understood(folder / "run.json", _ADVICE):
-        plant = PlantDescription.from_dict(about["plant"])
-    result = read_json(folder / "estimate.json", "params", "fit_percent", "files", advice=_ADVICE)
-    with understood(folder / "estimate.json", _ADVICE):
-        count = len(result["files"])
+    folder, plant = marker.folder, marker.plant
+    result = EstimateSummary.read(folder / "estimate.json", _ADVICE)
+    count = len(result.files)
     records, simulated = [], []
     for i in range(1, count + 1):
         ending = "" if count == 1 else f"_{i}"
@@ -87,55 +116,24 @@ def read_experiment(folder: Path, about: Mapping[str, Any]) -> Experiment:
         with understood(path, _ADVICE):
             values = np.stack([columns[name] for name in names], axis=1)
             simulated.append(values.reshape(records[-1].outputs.shape))
-    return Experiment(folder, plant, result, about, records, simulated)
-
-
-def experiment_section(experiment: Experiment, name: str) -> Section:
-    """What the report says of an identification; `name` begins the names of its figures."""
-    d, result, records = experiment.plant, experiment.result, experiment.records
-    with understood(experiment.folder / "estimate.json", _ADVICE):
-        parts = [
-            heading("Parameters"),
-            table(parameter_header(), [parameter_cells(n, p) for n, p in result["params"].items()]),
-            _truth(experiment),
-            heading("What the data can see"),
-            bullets(result["verdict"]),
-            heading("Measured"),
-            signals_table(d, records),
-            _figures(experiment, name),
-            heading("Residual"),
-            table(*_residuals(experiment), labels=1),
-            paragraph(_TESTS),
-            figure(
-                autocorrelation_figure(d, _residual_values(experiment)),
-                f"{name}-white",
-                "Autocorrelation of the residual; 95 % of that of white noise lies between the "
-                "dashed lines.",
-            ),
-            _correlation(result, name),
-            heading("Settings and provenance"),
-            _provenance(experiment),
-        ]
-        title = f"{d.name}: {result['estimator']}, {result['status']}"
-        parts.append(command(experiment.about.get("command"), _likely_command(experiment)))
-    return Section(title, experiment.folder, "".join(parts))
+    return Experiment(marker, plant, result, records, simulated)
 
 
 def _truth(experiment: Experiment) -> str:
     """Estimates beside the parameters of a simulated plant; nothing for a real one."""
     true = experiment.records[0].metadata.get("params")
-    params = experiment.result["params"]
+    params = experiment.result.params
     others = [record.metadata.get("params") for record in experiment.records]
     if not isinstance(true, Mapping) or set(true) != set(params) or any(o != true for o in others):
         return ""
     rows = []
     for name, p in params.items():
-        error = 100 * (p["estimate"] / true[name] - 1) if p["estimate"] and true[name] else None
-        low, high = p["ci95"]
-        inside = "–" if low is None else "yes" if low <= true[name] <= high else "no"
-        rows.append([name, p["unit"], number(true[name], 5), f"{number(error)} %", inside])
+        error = 100 * (p.estimate / true[name] - 1) if p.estimate and true[name] else None
+        low, high = p.ci95
+        inside = "–" if math.isnan(low) else "yes" if low <= true[name] <= high else "no"
+        rows.append([name, p.unit, number(true[name], 5), f"{number(error)} %", inside])
     header = ["symbol", "unit", "true", "error", "inside the interval"]
-    return paragraph("The record is simulated; these are its plant's own parameters:") + table(
+    return paragraph("The record is simulated; these are the true parameters:") + table(
         header, rows
     )
 
@@ -145,7 +143,7 @@ def _figures(experiment: Experiment, name: str) -> str:
     d, parts = experiment.plant, []
     pairs = list(zip(experiment.records, experiment.simulated, strict=True))
     for i, (record, simulated) in enumerate(pairs[:_MAX_RECORDS], 1):
-        file = experiment.result["files"][i - 1]
+        file = experiment.result.files[i - 1]
         parts += [
             figure(episode_figure(d, record), f"{name}-in{i}", f"{file}: inputs and outputs."),
             figure(
@@ -171,16 +169,16 @@ def _residuals(experiment: Experiment) -> tuple[list[str], list[list[str]]]:
     for i, part in enumerate(experiment.plant.outputs):
         unit, factor = display_unit(part.unit)
         size = f"{number(factor * float(np.sqrt(np.mean(residuals[:, i] ** 2))))} {unit}"
-        fit = f"{number(result['fit_percent'][part.name], 4)} %"
+        fit = f"{number(result.fit_percent[part.name], 4)} %"
         rows.append([part.name, fit, size, *residual_cells(result, part.name)])
-    for held_out in result["validation"]:
-        for output, percent in held_out["fit_percent"].items():
-            label = f"{output}, held out: {held_out['file']}"
+    for held_out in result.validation:
+        for output, percent in held_out.fit_percent.items():
+            label = f"{output}, held out: {held_out.file}"
             rows.append([label, f"{number(percent, 4)} %", *"–––––"])
     return ["output", "fit", "RMS residual", "white", "p", "follows the input", "p"], rows
 
 
-def _correlation(result: Mapping[str, Any], name: str) -> str:
+def _correlation(result: EstimateSummary, name: str) -> str:
     drawn = correlation_figure(result)
     if drawn is None:
         return ""
@@ -195,14 +193,14 @@ def _provenance(experiment: Experiment) -> str:
     result = experiment.result
     own = facts(
         [
-            ("estimator", result["estimator"]),
-            ("initial state", result["initial_state"]),
-            ("excite", experiment.about.get("excite")),
+            ("estimator", result.estimator),
+            ("initial state", result.initial_state),
+            ("excite", experiment.marker.version),
         ]
     )
     rows = [
         [file, *_lengths(record), origin_in_words(record)]
-        for file, record in zip(result["files"], experiment.records, strict=True)
+        for file, record in zip(result.files, experiment.records, strict=True)
     ]
     header = ["record", "samples", "sampling time", "duration", "origin"]
     return own + table(header, rows, labels=1) + folded("The plant", plant_facts(experiment.plant))
@@ -213,32 +211,30 @@ def _lengths(record: Record) -> list[str]:
     return [str(len(record.time)), f"{record.dt:.4g} s", f"{duration:.4g} s"]
 
 
-def _likely_command(experiment: Experiment) -> str:
-    """For folders of before the command was kept."""
-    result = experiment.result
-    files = shlex.join(result["files"])
+def _likely_command(result: EstimateSummary) -> str:
+    """Where it was made by a program."""
+    files = shlex.join(result.files)
     return (
-        f"excite identify {files} --plant {result['plant']} --estimator {result['estimator']} "
-        "--out RUN"
+        f"excite identify {files} --plant {result.plant} --estimator {result.estimator} --out RUN"
     )
 
 
 def comparison(numbered: Mapping[str, Experiment]) -> str:
     """Estimates, with their intervals, and fits of several experiments side by side, by title."""
     header, experiments = ["", "unit", *numbered], list(numbered.values())
-    names = {n: p["unit"] for e in experiments for n, p in e.result["params"].items()}
-    outputs = list(dict.fromkeys(n for e in experiments for n in e.result["fit_percent"]))
-    rows = [["status", "", *(e.result["status"] for e in experiments)]]
-    rows.append(["estimator", "", *(e.result["estimator"] for e in experiments)])
+    names = {n: p.unit for e in experiments for n, p in e.result.params.items()}
+    outputs = list(dict.fromkeys(n for e in experiments for n in e.result.fit_percent))
+    rows = [["status", "", *(e.result.status for e in experiments)]]
+    rows.append(["estimator", "", *(e.result.estimator for e in experiments)])
     for name, unit in names.items():
-        rows.append([name, unit, *(_interval(name, e.result["params"]) for e in experiments)])
+        rows.append([name, unit, *(_interval(name, e.result.params) for e in experiments)])
     for output in outputs:
-        fits = [number(e.result["fit_percent"].get(output), 4) for e in experiments]
+        fits = [number(e.result.fit_percent.get(output), 4) for e in experiments]
         rows.append([f"fit of {output}", "%", *fits])
     return table(header, rows, name="Experiments side by side")
 
 
-def _interval(name: str, params: Mapping[str, Any]) -> str:
+def _interval(name: str, params: Mapping[str, EstimatedParameter]) -> str:
     if name not in params:
         return "–"
     _, _, estimate, _, interval, _ = parameter_cells(name, params[name])

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from ...description import PlantDescription
 from ...files import read_json
 from ...record import RECORD_KIND, Record
 from ..figures import episode_figure
 from .elements import (
+    Run,
     Section,
     facts,
     figure,
@@ -28,12 +28,39 @@ _ABOUT_THE_FILE = ("kind", "plant", "plant_hash", "dt", "provenance", "ended", "
 
 
 @dataclass(frozen=True)
-class Recorded:
+class Recorded(Run):
     """A record and the plant that its sidecar names."""
 
     path: Path
     plant: PlantDescription
     record: Record
+
+    def section(self, name: str) -> Section:
+        """What the report says of a record."""
+        d, record = self.plant, self.record
+        with understood(self.path.with_suffix(".json")):
+            ended = _ended(record.metadata)
+            about = facts(
+                [
+                    ("samples", len(record.time)),
+                    ("sampling time", f"{record.dt:.4g} s"),
+                    ("duration", f"{record.time[-1] - record.time[0]:.4g} s"),
+                    ("true parameters", record.metadata.get("params")),
+                    *((record.metadata.get("provenance") or {}).items()),
+                    *((k, v) for k, v in record.metadata.items() if k not in _ABOUT_THE_FILE),
+                ]
+            )
+        caption = f"{self.path.name}: inputs, outputs."
+        parts = [
+            ended,
+            heading("Measured"),
+            signals_table(d, [record]),
+            figure(episode_figure(d, record), f"{name}-in", caption),
+            heading("Settings and provenance"),
+            about,
+            folded("The plant", plant_facts(d)),
+        ]
+        return Section(f"{d.name}: a record", self.path, "".join(parts))
 
 
 def read_recorded(path: Path) -> Recorded:
@@ -58,34 +85,7 @@ def read_recorded(path: Path) -> Recorded:
     return Recorded(path, plant, record_in(path, plant))
 
 
-def record_section(recorded: Recorded, name: str) -> Section:
-    """What the report says of a record; `name` begins the names of its figures."""
-    d, record = recorded.plant, recorded.record
-    with understood(recorded.path.with_suffix(".json")):
-        ended = _ended(record.metadata)
-        about = facts(
-            [
-                ("samples", len(record.time)),
-                ("sampling time", f"{record.dt:.4g} s"),
-                ("duration", f"{record.time[-1] - record.time[0]:.4g} s"),
-                ("true parameters", record.metadata.get("params")),
-                *((record.metadata.get("provenance") or {}).items()),
-                *((k, v) for k, v in record.metadata.items() if k not in _ABOUT_THE_FILE),
-            ]
-        )
-    parts = [
-        ended,
-        heading("Measured"),
-        signals_table(d, [record]),
-        figure(episode_figure(d, record), f"{name}-in", f"{recorded.path.name}: inputs, outputs."),
-        heading("Settings and provenance"),
-        about,
-        folded("The plant", plant_facts(d)),
-    ]
-    return Section(f"{d.name}: a record", recorded.path, "".join(parts))
-
-
-def _ended(metadata: Mapping[str, Any]) -> str:
+def _ended(metadata: Mapping[str, object]) -> str:
     """How an experiment on a rig ended; nothing for a simulation."""
     if "ended" not in metadata:
         return ""
@@ -94,5 +94,7 @@ def _ended(metadata: Mapping[str, Any]) -> str:
         return paragraph(
             "The experiment has not ended, or was killed: its record stops where it is."
         )
+    if not isinstance(ended, Mapping):
+        raise TypeError("how it ended")
     details = {k: v for k, v in ended.items() if k != "reason"}
     return heading("How it ended") + paragraph(ended["reason"]) + facts(details.items())

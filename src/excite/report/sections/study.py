@@ -1,22 +1,29 @@
-"""Studies and benchmarks: methods and agents compared on common plants and noise."""
+"""Studies: methods and agents compared on common plants and noise."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ...description import PlantDescription, names_of
-from ...files import folder_word, numbers_of, read_columns, read_json
+from ...files import folder_word, read_columns, read_json
 from ...record import Record
+from ...record.rows import EpisodeData, Options, StudyFacts
 from ..figures import benchmark_figure
 from ..frontier import frontier_figure, lengths_figure
 from ..study_figures import Curve, agents_figure, curves_figure
-from ..tables import DIFFERENCES, all_cells, differences_cells, footnotes, table_cells, table_header
+from ..study_table import (
+    DIFFERENCES,
+    StudyTable,
+    common_table,
+    difference_cells,
+    footnotes,
+)
 from .elements import (
+    Marker,
+    Run,
     Section,
     bullets,
     command,
@@ -35,86 +42,54 @@ _BESIDE = 4  # episodes and learning curves in one figure
 _LEARNING = "Policies without exploration noise, while they learn: median and band over the seeds."
 _COMPARED = ("plant", "episodes", "num_steps", "seed", "seeds", "spread", "sensor", "rig",
              "decision", "training", "gradient")  # fmt: skip
-_UNTRAINED = {"viable_seeds": None, "seeds": None, "train_seconds": None}
+_ADVICE = "rerun 'excite study run' to write it again"
 
 
 @dataclass(frozen=True)
-class StudyRun:
-    """The run folder of a study or benchmark, as it was read.
+class StudyRun(Run):
+    """The run folder of a study, as it was read.
 
     Attributes:
-        folder: where it lies.
-        plant: that it is about.
-        settings: the content of `study.json`.
-        about: the content of `run.json`.
-        content: the content of `table.json`.
+        marker: the content of `run.json`, and the folder.
+        table: what the study found, and its settings.
     """
 
-    folder: Path
-    plant: PlantDescription
-    settings: Mapping[str, Any]
-    about: Mapping[str, Any]
-    content: Mapping[str, Any]
+    marker: Marker
+    table: StudyTable
 
-    @property
-    def title(self) -> str:
-        """As tables and figures show it."""
-        return self.settings["title"] or self.settings["name"]
+    def section(self, name: str) -> Section:
+        """What the report says of a study."""
+        t = self.table
+        notes = "".join(map(paragraph, footnotes(t.study)))
+        parts = [
+            table(*t.cells(), name=t.study.heading),
+            f'<div class="notes">\n{notes}</div>\n',
+            _comparisons(t, name),
+            _learning(self, name),
+            _episodes(self, name),
+            _differences(t),
+            _settings(self),
+        ]
+        return Section(t.study.heading, self.marker.folder, "".join(parts))
 
 
-def read_study_run(folder: Path, about: Mapping[str, Any]) -> StudyRun:
+def read_study_run(marker: Marker) -> StudyRun:
     """The study in a run folder.
 
     Raises:
         ValueError: for a study that is not finished, and a file that is damaged or missing.
     """
-    advice = _advice(about)
-    with understood(folder / "run.json", advice):
-        plant = PlantDescription.from_dict(about["plant"])
-    settings = read_json(folder / "study.json", "name", "title", "estimators", advice=advice)
+    folder = marker.folder
+    study = StudyFacts.read(folder / "study.json", _ADVICE)
     if not (folder / "table.json").is_file():
-        raise ValueError(
-            f"{folder}: the study is not finished; {about.get('command') or _command(about)!r} "
-            "goes on with it"
-        )
-    content = read_json(folder / "table.json", "rows", advice=advice)
-    return StudyRun(folder, plant, settings, about, content)
+        again = marker.command or "excite study run"
+        raise ValueError(f"{folder}: the study is not finished; rerun {again!r} to resume")
+    return StudyRun(marker, StudyTable.in_folder(folder, study, _ADVICE))
 
 
-def _command(about: Mapping[str, Any]) -> str:
-    return "excite study run" if about["kind"] == "excite study" else "excite benchmark"
-
-
-def _advice(about: Mapping[str, Any]) -> str:
-    return f"{_command(about)!r} writes it again"
-
-
-def study_section(run: StudyRun, name: str) -> Section:
-    """What the report says of a study; `name` begins the names of its figures."""
-    advice = _advice(run.about)
-    with understood(run.folder / "study.json", advice):
-        notes = "".join(map(paragraph, footnotes(run.settings)))
-        curves = {a: _curve_files(run, a) for a in run.settings.get("agents", {})}
-        settings = _settings(run)
-    with understood(run.folder / "table.json", advice):
-        numbers = [_table(run), f'<div class="notes">\n{notes}</div>\n', _comparisons(run, name)]
-        differences = _differences(run)
-    shown = [*numbers, _learning(run, curves, name), _episodes(run, name), differences, settings]
-    return Section(run.title, run.folder, "".join(shown))
-
-
-def _table(run: StudyRun) -> str:
-    """The table beside the published rows."""
-    rows = run.content["rows"]
-    if run.about["kind"] == "excite study":
-        rows = [{**_UNTRAINED, **row} for row in rows]
-    cells = all_cells(rows, run.settings.get("reference", {}))
-    return table(table_header(rows), cells, name=run.title)
-
-
-def _comparisons(run: StudyRun, name: str) -> str:
+def _comparisons(found: StudyTable, name: str) -> str:
     """Error against bound, information against violations, bound against length."""
-    rows, title = numbers_of(run.content["rows"]), run.title
+    rows, title = found.rows, found.study.heading
     parts = [
         heading("Error against bound"),
         figure(
@@ -124,7 +99,7 @@ def _comparisons(run: StudyRun, name: str) -> str:
             "would reach with the same data.",
         ),
     ]
-    if len({row["method"] for row in rows if "log_det_information" in row}) > 1:
+    if len({row.method for row in rows}) > 1:
         parts += [
             heading("Information against violations"),
             figure(
@@ -133,7 +108,7 @@ def _comparisons(run: StudyRun, name: str) -> str:
                 "Information of each method, and how many experiments reach the critical level.",
             ),
         ]
-    if any("bound_by_length" in row for row in rows):
+    if any(row.bound_by_length for row in rows):
         parts += [
             heading("Bound against length"),
             figure(
@@ -145,66 +120,57 @@ def _comparisons(run: StudyRun, name: str) -> str:
     return "".join(parts)
 
 
-def _learning(run: StudyRun, paths: Mapping[str, Sequence[Path]], name: str) -> str:
-    """Learning curves of all agents; nothing where they are not kept.
-
-    Args:
-        paths: of the curves, by agent, one a seed.
-    """
+def _learning(run: StudyRun, name: str) -> str:
+    """Learning curves of all agents; nothing where they are not kept."""
+    folder, study, plant = run.marker.folder / "seeds", run.table.study, run.marker.plant
+    paths = {
+        agent: [folder / folder_word(agent) / f"{seed}/curve.csv" for seed in range(study.seeds)]
+        for agent in study.agents
+    }
     if not all(path.is_file() for files in paths.values() for path in files):
         return ""
-    names = ("steps", "violation_rate", *(f"relative_error_{p.name}" for p in run.plant.parameters))
+    names = ("steps", "violation_rate", *(f"relative_error_{p.name}" for p in plant.parameters))
     advice = "delete its folder: 'excite study run' trains that seed again"
     curves: dict[str, Sequence[Curve]] = {
         agent: [read_columns(path, names, advice) for path in files]
         for agent, files in paths.items()
     }
-    bounds = run.content.get("bound_curves", [a for a in paths if _is_for_information(run, a)])
     figures = []
     for i, part in enumerate(_groups(list(paths)), 1):
-        with understood(run.folder / "seeds", advice):
-            drawn = curves_figure(run.plant, {a: curves[a] for a in part}, run.title, bounds)
+        chosen = {agent: curves[agent] for agent in part}
+        with understood(folder, advice):
+            drawn = curves_figure(plant, chosen, study.heading, run.table.bound_curves)
         figures.append(figure(drawn, f"{name}-curves{i}", _LEARNING))
     return heading("Learning") * bool(figures) + "".join(figures)
 
 
-def _curve_files(run: StudyRun, agent: str) -> list[Path]:
-    seeds = run.folder / "seeds" / folder_word(agent)
-    return [seeds / str(seed) / "curve.csv" for seed in range(run.settings["seeds"])]
-
-
-def _is_for_information(run: StudyRun, agent: str) -> bool:
-    """Whether an agent says that it is rewarded with information; for older folders."""
-    own = run.settings["agents"][agent].get("decision", {})
-    return {**run.settings.get("decision", {}), **own}.get("reward") == "information"
-
-
 def _episodes(run: StudyRun, name: str) -> str:
     """One episode of each method and agent; nothing where none is kept."""
-    path = run.folder / "episodes.json"
+    path, plant = run.marker.folder / "episodes.json", run.marker.plant
     caption = "Inputs, outputs with their safety levels, and estimates while data come in."
     if not path.is_file():
         return ""
-    content = numbers_of(read_json(path, advice=_advice(run.about)))
-    figures = []
-    with understood(path, _advice(run.about)):
-        episodes = {n: _episode(run.plant, own) for n, own in content.items()}
+    figures, content = [], read_json(path, advice=_ADVICE)
+    with understood(path, _ADVICE):
+        episodes = {n: _episode(plant, EpisodeData.model_validate(e)) for n, e in content.items()}
         for i, part in enumerate(_groups(list(episodes)), 1):
-            drawn = agents_figure(run.plant, {n: episodes[n] for n in part}, run.title)
+            chosen = {method: episodes[method] for method in part}
+            drawn = agents_figure(plant, chosen, run.table.study.heading)
             figures.append(figure(drawn, f"{name}-episodes{i}", caption))
     return heading("One episode each") + "".join(figures)
 
 
-def _episode(d: PlantDescription, own: Mapping[str, Any]) -> tuple[Record, np.ndarray]:
+def _episode(d: PlantDescription, data: EpisodeData) -> tuple[Record, np.ndarray]:
     """A record and running estimates, as `episodes.json` has them."""
 
-    def stacked(key: str, parts: Any) -> np.ndarray:
-        return np.stack([np.array(own[key][n], float) for n in names_of(parts)], axis=1)
+    def stacked(columns: Mapping[str, Sequence[float]], names: Sequence[str]) -> np.ndarray:
+        return np.stack([np.array(columns[name]) for name in names], axis=1)
 
-    about = {key: own[key] for key in ("seed", "estimator") if key in own}
-    values = stacked("inputs", d.inputs), stacked("outputs", d.outputs)
-    estimates = stacked("estimate_over_true", d.parameters)
-    return Record(np.array(own["time"], float), *values, about), estimates
+    about = {"estimator": data.estimator} | ({} if data.seed is None else {"seed": data.seed})
+    inputs = stacked(data.inputs, names_of(d.inputs))
+    outputs = stacked(data.outputs, names_of(d.outputs))
+    record = Record(np.array(data.time), inputs, outputs, about)
+    return record, stacked(data.estimate_over_true, names_of(d.parameters))
 
 
 def _groups(names: Sequence[str]) -> list[Sequence[str]]:
@@ -213,54 +179,53 @@ def _groups(names: Sequence[str]) -> list[Sequence[str]]:
     return [list(part) for part in np.array_split(np.array(names, object), count or 1) if len(part)]
 
 
-def _differences(run: StudyRun) -> str:
-    differences = run.content.get("differences")
-    if not differences:
+def _differences(found: StudyTable) -> str:
+    if not found.differences:
         return ""
-    title = f"Differences, {differences[0]['estimator']}"
-    return folded(title, paragraph(DIFFERENCES) + table(*differences_cells(differences)))
+    title = f"Differences, {found.differences[0].estimator}"
+    return folded(title, paragraph(DIFFERENCES) + table(*difference_cells(found.differences)))
 
 
 def _settings(run: StudyRun) -> str:
     """Every choice of the study in words, and where it comes from."""
-    s, about = run.settings, run.about
+    s, marker = run.table.study, run.marker
     common = [
-        ("plant", s["plant"]),
-        *((key, s[key]) for key in ("episodes", "num_steps", "seed", "spread", "sensor")),
-        ("training seeds of each agent", s["seeds"] if s.get("agents") else None),
-        *((key, s.get(key)) for key in ("lengths", "clairvoyant")),
-        *((f"{key}, of all agents", s.get(key)) for key in ("decision", "training", "gradient")),
-        ("source of the published rows", s.get("source")),
-        ("excite", about.get("excite")),
-        ("policies (SHA-256)", about.get("policies")),
+        ("plant", s.plant),
+        ("episodes", s.episodes),
+        ("num_steps", s.num_steps),
+        ("seed", s.seed),
+        ("spread", s.spread),
+        ("sensor", s.sensor),
+        ("training seeds of each agent", s.seeds if s.agents else None),
+        ("lengths", s.lengths),
+        ("clairvoyant", s.clairvoyant and s.clairvoyant.data()),
+        ("decision, of all agents", s.decision),
+        ("training, of all agents", s.training),
+        ("gradient, of all agents", s.gradient),
+        ("source of the published rows", s.source),
+        ("excite", marker.version),
+        ("policies (SHA-256)", marker.policies),
     ]
     agents = [
-        [
-            n,
-            a["method"],
-            in_words(a["targets"]) or "all",
-            in_words(a["decision"]),
-            in_words(a["training"]),
-        ]
-        for n, a in s.get("agents", {}).items()
+        [n, a.method, in_words(a.targets) or "all", in_words(a.decision), in_words(a.training)]
+        for n, a in s.agents.items()
     ]
     parts = [heading("Settings and provenance"), facts(common)]
-    parts += _choices("method", "excitation", s.get("methods", {}))
-    parts += _choices("estimator", "kind", s["estimators"])
+    parts += _choices("method", "excitation", s.methods)
+    parts += _choices("estimator", "kind", s.estimators)
     if agents:
         parts.append(table(["agent", "trained by", "for", "decision", "training"], agents, 5))
-    for word, key in (("Inferred, not stated by the source", "inferred"), ("Our own", "ours")):
-        if s.get(key):
-            parts += [paragraph(f"{word}:"), bullets(s[key])]
-    likely = f"{_command(about)} {s['name']}.toml --out FOLDER"
-    again = command(about.get("command"), likely)
-    return "".join([*parts, folded("The plant", plant_facts(run.plant)), again])
+    for words, lines in (("Inferred, not stated by the source", s.inferred), ("Ours", s.ours)):
+        if lines:
+            parts += [paragraph(f"{words}:"), bullets(lines)]
+    again = command(marker.command, f"excite study run {s.name}.toml --out FOLDER")
+    return "".join([*parts, folded("The plant", plant_facts(marker.plant)), again])
 
 
-def _choices(what: str, kind: str, choices: Mapping[str, Mapping[str, Any]]) -> list[str]:
+def _choices(what: str, kind: str, choices: Mapping[str, Options]) -> list[str]:
     """A table of methods or estimators and their options; nothing where there are none."""
     rows = [
-        [name, own[kind], in_words({k: v for k, v in own.items() if k != kind})]
+        [name, str(own[kind]), in_words({k: v for k, v in own.items() if k != kind})]
         for name, own in choices.items()
     ]
     return [table([what, kind, "options"], rows, 3)] if rows else []
@@ -271,45 +236,26 @@ def common_methods(numbered: Mapping[str, StudyRun]) -> str:
 
     Studies whose plants have other parameters or outputs are not compared.
     """
-    groups: dict[Any, dict[str, StudyRun]] = {}
+    groups: dict[tuple[str, ...], dict[str, StudyRun]] = {}
     for title, run in numbered.items():
-        with understood(run.folder / "table.json", _advice(run.about)):
-            first = run.content["rows"][0]
-            alike = *first["relative_error_percent"], *_largest(first)
+        first = run.table.rows[0]
+        alike = (*first.parameters, first.max_abs_output.output, first.max_abs_output.unit)
         groups.setdefault(alike, {})[title] = run
     return "".join(_compared(group) for group in groups.values() if len(group) > 1)
 
 
-def _largest(row: Mapping[str, Any]) -> tuple[str, str]:
-    """Which output a row tells the largest value of, and its unit."""
-    return row["max_abs_output"]["output"], row["max_abs_output"]["unit"]
-
-
 def _compared(group: Mapping[str, StudyRun]) -> str:
     """The table of common methods, and how the studies differ."""
-    rows: dict[tuple[str, str], dict[str, Mapping[str, Any]]] = {}
-    for title, run in group.items():
-        for row in run.content["rows"]:
-            rows.setdefault((row["method"], row["estimator"]), {})[title] = row
-    common = {own: by_title for own, by_title in rows.items() if len(by_title) > 1}
-    if not common:
+    common = common_table({title: run.table for title, run in group.items()})
+    if common is None:
         return paragraph(f"{' and '.join(group)} have no method and estimator in common.")
-    every = [row for by_title in common.values() for row in by_title.values()]
-    keys = set[str].intersection(*(set(row) for row in every)) - {"on_rig"}
-    cells = []
-    for by_title in common.values():
-        for title, row in by_title.items():
-            method, estimator, *rest = table_cells({k: row[k] for k in keys})
-            cells.append([method, estimator, title, *rest])
-    method, estimator, *rest = table_header([{k: every[0][k] for k in keys}])
-    header = [method, estimator, "study", *rest]
-    beside = table(header, cells, 3, name="methods in several studies")
-    return beside + _settings_beside(group)
+    return table(*common, 3, name="methods in several studies") + _settings_beside(group)
 
 
 def _settings_beside(group: Mapping[str, StudyRun]) -> str:
     """The settings in which studies differ: what a difference in their numbers may come from."""
-    every = [_flat({key: run.settings.get(key) for key in _COMPARED}) for run in group.values()]
+    studies = [run.table.study for run in group.values()]
+    every = [_flat({key: getattr(study, key) for key in _COMPARED}) for study in studies]
     rows = []
     for key in dict.fromkeys(key for own in every for key in own):
         words = [own.get(key, "–") for own in every]
@@ -321,7 +267,7 @@ def _settings_beside(group: Mapping[str, StudyRun]) -> str:
     return paragraph("Settings in which they differ; a dash is the default:") + differ
 
 
-def _flat(settings: Mapping[str, Any]) -> dict[str, str]:
+def _flat(settings: Mapping[str, object]) -> dict[str, str]:
     """Settings in words, those of a group each by its own name."""
     flat = {}
     for key, value in settings.items():

@@ -1,0 +1,301 @@
+"""What studies and identifications leave on disk, as types: rows, differences, estimates.
+
+They are computed in `study` and `estimation`, kept as JSON (docs/machine-readable.md lists the
+keys) and shown by `report`. A number that does not exist is NaN here and `null` in a file.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Self
+
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Strict,
+    ValidationError,
+    model_validator,
+)
+
+from ..files import damaged, json_ready, read_json
+
+
+def _or_nan(value: object) -> object:
+    return math.nan if value is None else value
+
+
+Count = Annotated[int, Strict()]
+Number = Annotated[float, Strict(), BeforeValidator(_or_nan)]
+MaybeNumber = Annotated[float | None, BeforeValidator(_or_nan)]
+"""NaN for a number that does not exist; None, its default, where it was not asked for."""
+Interval = tuple[Number, Number]
+Options = dict[str, object]
+
+
+class Saved(BaseModel):
+    """Part of a file of a run folder."""
+
+    model_config = ConfigDict(frozen=True)
+
+    @classmethod
+    def read(cls, path: Path, advice: str = "") -> Self:
+        """The content of a JSON file.
+
+        Args:
+            advice: what helps where the file is damaged; it ends the message.
+
+        Raises:
+            ValueError: where it cannot be read, or holds something else.
+        """
+        try:
+            return cls.model_validate(read_json(path, advice=advice))
+        except ValidationError:
+            raise damaged(path, advice) from None
+
+    def data(self) -> dict[str, object]:
+        """The content as JSON-ready data, as far as it was set."""
+        return json_ready(self.model_dump(exclude_unset=True))
+
+
+class MeanSd(Saved):
+    """Mean and standard deviation."""
+
+    mean: Number
+    sd: Number
+
+
+class ErrorStatistics(MeanSd):
+    """Of the relative errors of one parameter [%]; `all_seeds` includes those not viable."""
+
+    median: Number
+    rms: Number
+    all_seeds: MeanSd | None = None
+
+
+class Rate(Saved):
+    """A rate and its 95 % interval (Wilson)."""
+
+    estimate: Number
+    ci95: Interval
+
+
+class LargestOutput(MeanSd):
+    """Largest magnitude of the watched output, in the unit in which people read it."""
+
+    output: str
+    unit: str
+
+
+class RigCounts(Saved):
+    """Experiments on a simulated rig that the supervisor ended, and the safety filter's part."""
+
+    trips: Count
+    filtered_violations: Count | None = None
+    filtered_trips: Count | None = None
+    interventions: Count | None = None
+
+
+class BoundByLength(Saved):
+    """Mean Cramér-Rao bound [%] of shorter experiments, by parameter."""
+
+    num_steps: tuple[Count, ...]
+    cramer_rao_percent: dict[str, tuple[Number, ...]]
+
+
+class Row(Saved):
+    """One method and one estimator over all episodes, or an agent over all its seeds."""
+
+    method: str
+    estimator: str
+    evaluations: Count
+    failed: Count
+    failures: dict[str, Count]
+    violations: Count
+    violation_rate: Rate
+    on_rig: RigCounts | None = None
+    max_abs_output: LargestOutput
+    log_det_information: Number
+    log_det_information_sd: Number
+    log_det_of_clairvoyant_plants: MaybeNumber = None
+    relative_error_percent: dict[str, ErrorStatistics]
+    cramer_rao_percent: dict[str, Number]
+    rms_over_cramer_rao: dict[str, Number]
+    coverage95_percent: dict[str, Number]
+    beyond_6_std_errors: Count
+    bound_by_length: BoundByLength | None = None
+    viable_seeds: Count | None = None
+    seeds: Count | None = None
+    train_seconds: float | None = None
+    d_efficiency: MaybeNumber = None
+
+    @model_validator(mode="after")
+    def _require_same_parameters(self) -> Self:
+        names = self.relative_error_percent.keys()
+        parts = (self.cramer_rao_percent, self.rms_over_cramer_rao, self.coverage95_percent)
+        if not names or any(part.keys() != names for part in parts):
+            raise ValueError("columns differ in their parameters")
+        if self.seeds is not None:
+            errors = self.relative_error_percent.values()
+            if None in (self.viable_seeds, self.train_seconds, *(e.all_seeds for e in errors)):
+                raise ValueError("the row of an agent is incomplete")
+        return self
+
+    @property
+    def parameters(self) -> list[str]:
+        """Names of the plant's parameters."""
+        return list(self.relative_error_percent)
+
+
+class Rows(Saved):
+    """`methods.json`, and `clairvoyant.json` with how far the starts of the search differ."""
+
+    rows: tuple[Row, ...]
+    log_det_spread_of_starts: tuple[Number, ...] = ()
+
+
+class SeedMetrics(Saved):
+    """`metrics.json` of one seed of an agent."""
+
+    agent: str = ""
+    seed: int = 0
+    rows: tuple[Row, ...]
+    rms_input_fraction: Number = math.nan
+    viable: Annotated[bool, Strict()]
+    validation: dict[str, Number]
+    train_seconds: Number
+    resumed_at_steps: int | None = None
+    fingerprint: str = ""
+
+
+class Gap(Saved):
+    """Mean difference over the seeds and its 95 % interval (Student)."""
+
+    mean: Number
+    ci95: Interval
+    seeds: Count
+
+
+class Difference(Saved):
+    """Mean errors of `method` minus those of `minus` [points of percent], by parameter."""
+
+    method: str
+    minus: str
+    estimator: str
+    relative_error_percent: dict[str, Gap]
+
+
+class EpisodeData(Saved):
+    """One experiment of `episodes.json`: columns by name."""
+
+    estimator: str = ""
+    seed: int | None = None
+    time: tuple[Number, ...]
+    inputs: dict[str, tuple[Number, ...]]
+    outputs: dict[str, tuple[Number, ...]]
+    estimate_over_true: dict[str, tuple[Number, ...]]
+
+
+class PublishedRow(Saved):
+    """A published row: mean and standard deviation of each column."""
+
+    relative_error_percent: dict[str, tuple[float, float]] = {}
+    max_abs_output: tuple[float, float]
+    violations: str
+    viable_seeds: str = ""
+
+
+class AgentFacts(Saved):
+    """What a study says of one agent."""
+
+    method: str
+    targets: list[str] | None = None
+    decision: Options = {}
+    training: Options = {}
+
+
+class ClairvoyantFacts(Saved):
+    """What a study says of its clairvoyant signals."""
+
+    plants: int
+    starts: int
+
+
+class StudyFacts(Saved):
+    """`study.json` as tables and reports read it; `excite.study.Study` documents the settings."""
+
+    name: str
+    title: str = ""
+    plant: str
+    episodes: int
+    num_steps: int
+    seed: int
+    spread: float
+    sensor: dict[str, Options] = {}
+    methods: dict[str, Options] = {}
+    estimators: dict[str, Options]
+    agents: dict[str, AgentFacts] = {}
+    seeds: int = 1
+    decision: Options = {}
+    training: Options = {}
+    gradient: Options = {}
+    clairvoyant: ClairvoyantFacts | None = None
+    lengths: list[int] = []
+    rig: Options | None = None
+    inferred: list[str] = []
+    ours: list[str] = []
+    reference: dict[str, PublishedRow] = {}
+    source: str = ""
+
+    @property
+    def heading(self) -> str:
+        """The title of tables and figures."""
+        return self.title or self.name
+
+
+class EstimatedParameter(Saved):
+    """One estimate with its standard error and 95 % interval, in `unit`."""
+
+    estimate: Number
+    std_error: Number
+    ci95: Interval
+    unit: str
+    relative_to_nominal: float | None
+    held: bool
+
+    @property
+    def has_interval(self) -> bool:
+        """Whether there are an estimate other than zero and its error."""
+        return bool(self.estimate) and math.isfinite(self.estimate + self.std_error)
+
+
+class HeldOut(Saved):
+    """Fit of a record that was not used, by output [%]."""
+
+    file: str
+    fit_percent: dict[str, Number]
+
+
+class EstimateSummary(Saved):
+    """`estimate.json`: the result of an identification as plain data."""
+
+    plant: str
+    plant_hash: str
+    estimator: str
+    status: str
+    params: dict[str, EstimatedParameter]
+    fit_percent: dict[str, Number]
+    validation: tuple[HeldOut, ...]
+    files: tuple[str, ...]
+    initial_state: str
+    correlation: tuple[tuple[Number, ...], ...]
+    whiteness_p_value: dict[str, Number]
+    structure_p_value: dict[str, Number]
+    verdict: tuple[str, ...]
+
+    @classmethod
+    def of(cls, data: Mapping[str, object]) -> EstimateSummary:
+        """From data as a file or `Identification` has them."""
+        return cls.model_validate(json_ready(data))
