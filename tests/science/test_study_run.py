@@ -16,12 +16,11 @@ import pytest
 import scipy.stats
 from cluster import Cluster, wait_for
 
-from excite.cli.study import _require_trainer
 from excite.policy import read_policy
 from excite.study import table
 from excite.study.engine import local_engine
 from excite.study.folder import seed_folder, study_of
-from excite.study.run import _live, opened, run_tasks
+from excite.study.run import _live, _require_trainer, opened, run_tasks
 from excite.study.spec import read_study, study_from
 from excite.study.table import (
     across_seeds,
