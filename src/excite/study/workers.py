@@ -248,7 +248,8 @@ class Workers:
                 process.kill()
         is_ready = False
         try:
-            is_ready = decoded(process.line()) == READY
+            line = process.line()
+            is_ready = bool(line) and decoded(line) == READY
         except (ValueError, RecursionError) as error:
             _LOG.error("a worker does not start: %s", error)
         if is_ready:

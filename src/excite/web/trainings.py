@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 import secrets
 import signal
 import sys
@@ -33,7 +34,9 @@ if hasattr(os, "nice"):
 if sys.platform == "linux":  # a server that is killed interrupts its trainings
     PR_SET_PDEATHSIG = 1
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGINT)
-os.execv(sys.executable, [sys.executable, "-m", "excite", *sys.argv[1:]])
+    if os.getppid() != int(sys.argv[1]):  # it was killed meanwhile
+        sys.exit(1)
+os.execv(sys.executable, [sys.executable, "-m", "excite", *sys.argv[2:]])
 """
 
 
@@ -72,7 +75,8 @@ class Training:
     async def start(self) -> None:
         """Starts the process."""
         self._process = await asyncio.create_subprocess_exec(
-            sys.executable, "-c", _STEP_BACK, *self.words, "--out", str(self.folder),
+            sys.executable, "-c", _STEP_BACK, str(os.getpid()),
+            *self.words, "--out", str(self.folder),
             stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.DEVNULL,
             stderr=asyncio.subprocess.PIPE, start_new_session=True,
         )  # fmt: skip
