@@ -1,4 +1,4 @@
-"""What a worker tells of a call, and what the page is told: one type for every kind of event.
+"""What a worker is asked and tells, and what the page is told: one type for every kind of event.
 
 They are JSON from the worker to the browser: a number that is not finite is None there.
 """
@@ -11,6 +11,29 @@ Numbers = dict[str, float]
 """By the name of a parameter or an output; NaN where there is none."""
 Rows = list[list[float]]
 """One row a sample, one column a channel."""
+
+
+class ExperimentRequest(TypedDict):
+    """A simulated experiment, and the excitations to compare it with."""
+
+    plant: str
+    excitation: str
+    amplitude: float | None
+    noise: Numbers
+    params: Numbers
+    steps: int
+    seed: int
+    others: list[str]
+
+
+class IdentificationRequest(TypedDict):
+    """How an uploaded file is identified."""
+
+    plant: str
+    estimator: str
+    initial_state: str
+    columns: dict[str, str]
+    scales: Numbers
 
 
 class StartedEvent(TypedDict):

@@ -13,16 +13,26 @@ import shlex
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import cast
 
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike
 
 from .. import __version__
-from ..description import HALF_95, PlantDescription, display_unit, unknown
+from ..description import (
+    HALF_95,
+    Output,
+    Parameter,
+    PlantDescription,
+    display_unit,
+    names_of,
+    unknown,
+)
 from ..estimation import NLS, Experiments, Status, stack_experiments
 from ..estimation.catalogue import ESTIMATORS
-from ..estimation.identify import identify
+from ..estimation.identify import InitialState, identify
 from ..estimation.result import Identification, write_run
 from ..excitation.catalogue import EXCITATIONS, LOOP
 from ..files import write_bytes
@@ -35,14 +45,15 @@ from ..information import (
 )
 from ..plant import AbstractPlant
 from ..plant.catalogue import PLANTS
-from ..policy import mismatch, read_policy, shipped_policies
+from ..policy import Policy, mismatch, read_policy, shipped_policies
 from ..record import columns_in
 from ..report.figure import kept_samples
 from ..report.html import report_html
 from ..safety import critical_levels, is_violation, max_abs_output
 from ..simulation import Experiment, Trajectory
+from .events import ExperimentRequest, IdentificationRequest, ParameterRow, Row
+from .events import JobEvent as Event
 
-Event = dict[str, Any]
 NUM_ESTIMATES = 20
 _FIRST = 40  # samples before the first estimate, the shortest horizon of the estimator
 _RECORD = "record.csv"  # name of a simulated record, here and in the command that makes it
@@ -74,7 +85,7 @@ def catalogue() -> Iterator[Event]:
 def warm_up() -> Iterator[Event]:
     """Compiles what the page offers first, so that a worker's first run starts at once."""
     plant = PLANTS["aero2"]().definition
-    asked = {
+    asked: ExperimentRequest = {
         "plant": plant.name, "excitation": "chirp", "amplitude": plant.inputs[0].amplitude,
         "noise": {}, "params": {}, "steps": 500, "seed": 0, "others": ["prbs", plant.name],
     }  # fmt: skip
@@ -83,7 +94,7 @@ def warm_up() -> Iterator[Event]:
         yield from followed(asked, f"{folder}/run")
 
 
-def _fits(policy: Any, description: PlantDescription) -> bool:
+def _fits(policy: Policy, description: PlantDescription) -> bool:
     try:
         mismatch(policy, description)
     except ValueError:
@@ -91,7 +102,7 @@ def _fits(policy: Any, description: PlantDescription) -> bool:
     return True
 
 
-def _shown(description: PlantDescription) -> dict[str, Any]:
+def _shown(description: PlantDescription) -> dict[str, object]:
     """A description, with the unit in which people read each quantity, and its factor."""
     data = description.to_dict()
     for part in (*data["inputs"], *data["outputs"]):
@@ -102,7 +113,7 @@ def _shown(description: PlantDescription) -> dict[str, Any]:
 # --------------------------------------------------------------------------- experiments
 
 
-def _experiment(asked: Mapping[str, Any], name: str) -> Experiment:
+def _experiment(asked: ExperimentRequest, name: str) -> Experiment:
     """The experiment asked for, or the same with another excitation.
 
     Raises:
@@ -133,7 +144,7 @@ def _plant(name: str) -> AbstractPlant:
     return PLANTS[name]()
 
 
-def episode(asked: Mapping[str, Any]) -> Iterator[Event]:
+def episode(asked: ExperimentRequest) -> Iterator[Event]:
     """All samples of the experiment asked for: what there is to be shown first."""
     own = _experiment(asked, asked["excitation"])
     run, d = own.run(), own.plant.description
@@ -143,13 +154,13 @@ def episode(asked: Mapping[str, Any]) -> Iterator[Event]:
         "excitation": own.name,
         "warning": own.origin.get("warning"),
         "params": _by_name(d.parameters, own.params),
-        "time": run.time,
-        "inputs": run.inputs,
-        "outputs": run.measured,
+        "time": run.time.tolist(),
+        "inputs": run.inputs.tolist(),
+        "outputs": run.measured.tolist(),
     }
 
 
-def followed(asked: Mapping[str, Any], folder: str) -> Iterator[Event]:
+def followed(asked: ExperimentRequest, folder: str) -> Iterator[Event]:
     """Estimates on the way, then the result, then two other excitations beside it.
 
     The run folder of the identification is left at `folder`, the same as that of
@@ -175,7 +186,7 @@ def followed(asked: Mapping[str, Any], folder: str) -> Iterator[Event]:
         yield {"kind": "other", "row": _outcome(other, its_run, its)[0]}
 
 
-def _estimates(own: Experiment, run: Trajectory, information: Any) -> Iterator[Event]:
+def _estimates(own: Experiment, run: Trajectory, information: Array) -> Iterator[Event]:
     """The estimate from the first samples, from more of them, and at last from all."""
     plant, size = _plant(own.plant.definition.name), relative_size(own.plant, own.params)
     data = stack_experiments(plant, [run.inputs], [run.measured], True)
@@ -197,7 +208,7 @@ def _estimates(own: Experiment, run: Trajectory, information: Any) -> Iterator[E
         }
 
 
-def _experiment_again(asked: Mapping[str, Any]) -> str:
+def _experiment_again(asked: ExperimentRequest) -> str:
     """The commands that make the same run folder, one a line."""
     has_amplitude = asked["amplitude"] is not None and asked["excitation"] in EXCITATIONS
     simulate = [
@@ -210,7 +221,7 @@ def _experiment_again(asked: Mapping[str, Any]) -> str:
     return f"{shlex.join(simulate)}\n{shlex.join(identify)}"
 
 
-def _identification_again(asked: Mapping[str, Any], name: str) -> str:
+def _identification_again(asked: IdentificationRequest, name: str) -> str:
     """The command that makes the same run folder of a file."""
     words = [
         "excite", "identify", f"./{name}" if name[0] == "-" else name,
@@ -221,7 +232,7 @@ def _identification_again(asked: Mapping[str, Any], name: str) -> str:
     return shlex.join(words)
 
 
-def _given(option: str, values: Mapping[str, Any]) -> list[str]:
+def _given(option: str, values: Mapping[str, object]) -> list[str]:
     """An option with its assignments, numbers in full; nothing where there are none."""
     pairs = [f"{name}={value}".replace(",", "\\,") for name, value in values.items()]
     return [option, ",".join(pairs)] if pairs else []
@@ -233,8 +244,8 @@ def _first(data: Experiments, count: int) -> Experiments:
 
 
 def _outcome(
-    own: Experiment, run: Trajectory, information: Any
-) -> tuple[Event, Identification | None]:
+    own: Experiment, run: Trajectory, information: Array
+) -> tuple[Row, Identification | None]:
     """A row of the comparison, and what was identified, unless nothing could be."""
     plant, d = _plant(own.plant.definition.name), own.plant.description
     record = dataclasses.replace(own.record(run), source=_RECORD)
@@ -245,7 +256,7 @@ def _outcome(
     except ValueError as error:
         sentence = str(error)
     bound = np.asarray(cramer_rao_bound(information) * relative_size(own.plant, own.params))
-    params = {}
+    params: dict[str, ParameterRow] = {}
     for p, true, least in zip(d.parameters, map(float, own.params), bound, strict=True):
         found = None if result is None or p.name in result.held else result.params[p.name]
         half = None if found is None or result is None else HALF_95 * result.std_error[p.name]
@@ -269,8 +280,8 @@ def _outcome(
     }, result
 
 
-def _by_name(parts: Any, values: Any) -> dict[str, float]:
-    return {part.name: float(value) for part, value in zip(parts, values, strict=True)}
+def _by_name(parts: Sequence[Parameter | Output], values: ArrayLike) -> dict[str, float]:
+    return dict(zip(names_of(parts), map(float, np.asarray(values)), strict=True))
 
 
 # --------------------------------------------------------------------------------- files
@@ -290,14 +301,16 @@ def columns(folder: str, name: str) -> Iterator[Event]:
     yield {"kind": "columns", "columns": {word: len(values) for word, values in table.items()}}
 
 
-def identified(asked: Mapping[str, Any], source: str, name: str, folder: str) -> Iterator[Event]:
+def identified(
+    asked: IdentificationRequest, source: str, name: str, folder: str
+) -> Iterator[Event]:
     """Parameters from an uploaded file; leaves a run folder as `excite identify` does."""
     with contextlib.chdir(source):
         result = identify(
             Path(name),
             _plant(asked["plant"]),
             asked["estimator"],
-            initial_state=asked["initial_state"],
+            initial_state=cast(InitialState, asked["initial_state"]),  # checked there
             columns=asked["columns"],
             scales=asked["scales"],
         )
@@ -310,10 +323,10 @@ def identified(asked: Mapping[str, Any], source: str, name: str, folder: str) ->
         "kind": "identified",
         "plant": _shown(result.plant),
         "identification": result.to_dict(),
-        "time": record.time[kept],
-        "inputs": record.inputs[kept],
-        "outputs": record.outputs[kept],
-        "simulated": fitted.simulated[kept],
+        "time": record.time[kept].tolist(),
+        "inputs": record.inputs[kept].tolist(),
+        "outputs": record.outputs[kept].tolist(),
+        "simulated": fitted.simulated[kept].tolist(),
     }
 
 

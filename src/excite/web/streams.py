@@ -16,8 +16,16 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, StreamingResponse
 from starlette.routing import Route
 
-from .events import Episode, JobEvent, Plan, Samples, StreamEvent
-from .requests import MAX_STEPS, Body, RefusedError, number, numbers, texts, whole, word
+from .events import (
+    Episode,
+    ExperimentRequest,
+    IdentificationRequest,
+    JobEvent,
+    Plan,
+    Samples,
+    StreamEvent,
+)
+from .requests import MAX_STEPS, Asked, Body, RefusedError, number, numbers, texts, whole, word
 from .sessions import Session
 from .workers import Workers
 
@@ -62,7 +70,7 @@ def routes(workers: Workers, body: Body) -> list[Route]:
     ]
 
 
-def _experiment(asked: Mapping[str, object]) -> dict[str, object]:
+def _experiment(asked: Asked) -> ExperimentRequest:
     """An experiment as `excite.web.jobs` takes it: checked names and numbers, nothing else."""
     others = asked.get("others")
     if not isinstance(others, list) or len(others) > 2:
@@ -79,7 +87,7 @@ def _experiment(asked: Mapping[str, object]) -> dict[str, object]:
     }
 
 
-def _identification(asked: Mapping[str, object]) -> dict[str, object]:
+def _identification(asked: Asked) -> IdentificationRequest:
     """An identification, likewise."""
     return {
         "plant": word(asked, "plant"),
@@ -142,7 +150,7 @@ async def _lively(events: AsyncGenerator[JobEvent], stop: asyncio.Event) -> Even
 async def _identified(
     workers: Workers,
     session: Session,
-    asked: Mapping[str, object],
+    asked: IdentificationRequest,
     upload: str,
     stop: asyncio.Event,
 ) -> Events:
@@ -163,7 +171,7 @@ async def _identified(
 async def _played(
     workers: Workers,
     session: Session,
-    asked: Mapping[str, object],
+    asked: ExperimentRequest,
     seconds: float,
     stop: asyncio.Event,
 ) -> Events:
