@@ -12,7 +12,7 @@ help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 16
 
 demo: .venv/core ## the baseline rows of the paper's Table 1, with three estimators, in runs/baselines
-	$(BIN)/excite benchmark studies/baselines.toml --out runs/baselines --overwrite
+	$(BIN)/excite study run baselines --out runs/baselines --overwrite
 
 test: lint types ## style, types, unit and command-line tests
 	$(PYTEST)
@@ -40,13 +40,13 @@ docs: .venv/dev ## this documentation as a site, in site/ (open site/index.html)
 
 results: .venv/core ## the committed results, afresh (minutes in docs/reference/studies.md)
 	for study in baselines nls nls_quantised decay damping damping_encoder damping_noise_free; do \
-	  $(BIN)/excite benchmark studies/$$study.toml --out results/$$study --overwrite || exit 1; \
+	  $(BIN)/excite study run $$study --out results/$$study --overwrite || exit 1; \
 	done
 
 agents: .venv/dev ## the trained agents of the studies, afresh (hours; goes on where it was interrupted)
 	for study in table1 paper frontier emps dc_motor cart_pole aero2_lag half amplitude nls_reward spread reward \
 	    two_minutes sim_to_real; do \
-	  $(BIN)/excite study run studies/$$study.toml --out runs/$$study || exit 1; \
+	  $(BIN)/excite study run $$study --out runs/$$study || exit 1; \
 	done
 
 policies: ## what is shipped in src/excite/policy/shipped, from the results of the studies

@@ -588,7 +588,7 @@ def test_a_benchmark_leaves_table_and_study(run, here):
         ("random", "arx-rls"), ("prbs", "arx-rls"),
     ]  # fmt: skip
     elsewhere = {"bound_by_length", "on_rig"}
-    assert all(set(r) | elsewhere == documented("benchmark") for r in rows)
+    assert all(set(r) | elsewhere == documented("evaluate") for r in rows)
     assert "| prbs | as published |" in (folder / "table.md").read_text()
     table = list(csv.DictReader((folder / "table.csv").read_text().splitlines()))
     assert [float(line["evaluations"]) for line in table] == [8, 8]

@@ -23,6 +23,7 @@ _PLACES = {
     "identify": "estimation.identify",
     "design": "training.design",
     "evaluate": "study.evaluate",
+    "run_study": "study.run",
     # nouns
     "Record": "record.record",
     "read_record": "record.read",
@@ -83,6 +84,7 @@ if TYPE_CHECKING:
     from .simulation import simulate as simulate
     from .study.catalogue import studies as studies
     from .study.evaluate import evaluate as evaluate
+    from .study.run import run_study as run_study
     from .study.spec import Study as Study
     from .study.spec import read_study as read_study
     from .training.design import design as design

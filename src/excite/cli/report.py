@@ -17,8 +17,8 @@ from .options import OUT_FILE, json_option, progress_bar, show_json
 def report(runs: tuple[Path, ...], out: Path, overwrite: bool, as_json: bool) -> None:
     """One page of figures, tables and provenance that needs nothing else.
 
-    RUN is a run folder of `excite identify`, `excite benchmark` or `excite study run`, or a record
-    with its sidecar; several are shown side by side.
+    RUN is a run folder of `excite identify` or `excite study run`, or a record with its
+    sidecar; several are shown side by side.
     """
     from ..files import require_new_file, write_bytes
     from ..report.html import report_html

@@ -12,7 +12,7 @@ import textwrap
 from collections.abc import Collection, Iterator, Sequence
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import matplotlib.axes
 import matplotlib.axis
@@ -56,7 +56,7 @@ def image(figure: matplotlib.figure.Figure, kind: str) -> bytes:
     return buffer.getvalue()
 
 
-PAGE_STYLE: dict[str, object] = {
+PAGE_STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",  # text stays text: it can be searched, and the file is smaller
     "svg.hashsalt": "excite",  # the same figure is the same file
     "text.parse_math": False,  # a name with $ is a name

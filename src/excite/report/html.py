@@ -9,6 +9,7 @@ from pathlib import Path
 import matplotlib
 
 from .. import __version__
+from ..files import write_bytes
 from .figure import MAX_POINTS, PAGE_STYLE, at_most
 from .sections.elements import Marker, Run, Section, paragraph, text
 from .sections.experiment import Experiment, comparison, read_experiment
@@ -52,6 +53,29 @@ def report_html(
         if len(page.encode()) <= MAX_BYTES:
             return page
     return page.replace("<main>\n", f"<main>\n{paragraph(_TOO_LARGE)}", 1)
+
+
+def report(runs: str | Path | Sequence[str | Path], out: str | Path | None = None) -> str:
+    """A report of run folders and records as one HTML page; needs nothing else to be read.
+
+    Args:
+        runs: one or several folders of `excite identify` and `excite study run`, and records
+            with their sidecar.
+        out: file to write, replaced where it exists.
+
+    Returns:
+        The page's text.
+
+    Raises:
+        ValueError: for what cannot be read as one of them, or an `out` that is no .html file.
+    """
+    if out is not None and Path(out).suffix.lower() != ".html":
+        raise ValueError(f"{out}: reports end in .html")
+    paths = [runs] if isinstance(runs, str | Path) else runs
+    page = report_html([Path(path) for path in paths])
+    if out is not None:
+        write_bytes(Path(out), page.encode())
+    return page
 
 
 def _drawn(

@@ -82,6 +82,11 @@ def run_study(
 ) -> StudyTable:
     """Compares the methods of a study, and trains its agents; rerun it to resume.
 
+        >>> import excite as ex
+        >>> table = ex.run_study("nls", episodes=4)
+        >>> table.rows[0].method, table.rows[0].evaluations
+        ('random', 4)
+
     Args:
         study: a study, a file, or the name of a shipped study.
         out: run folder; a study without agents needs none.
@@ -141,7 +146,7 @@ def _engine(
         return dask_engine(address, on_wait)
     if address is not None:
         raise ValueError("--address is for --engine dask")
-    cache = jax.config.jax_compilation_cache_dir
+    cache = jax.config.values["jax_compilation_cache_dir"]
     return local_engine(workers or num_cores(), Path(cache) if cache else None)
 
 
@@ -368,7 +373,7 @@ def run_tasks(
                 _keep(targets["methods"], folder, Rows(rows=tuple(rows)).data())
             return {}
 
-        def finished(name: str, result: Mapping[str, Any]) -> None:
+        def finished(name: str, result: object) -> None:
             _keep(targets[name], folder, result)
             on_done(name)
 
@@ -415,7 +420,7 @@ def _missing(
     return tasks
 
 
-def _keep(target: _Target, folder: Path, result: Mapping[str, Any]) -> None:
+def _keep(target: _Target, folder: Path, result: Any) -> None:
     """Writes what a task returned; the file that marks it as finished last."""
     kind, agent, seed = target
     if kind != "seed":

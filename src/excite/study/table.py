@@ -59,7 +59,7 @@ def study_table(folder: Path) -> StudyTable:
         rows += [across_seeds(metrics, e) for e in range(len(study.estimators))]
     if study.clairvoyant is not None:
         rows = _with_efficiency(study, folder, rows)
-    table = StudyTable(rows=rows, study=facts(study))
+    table = StudyTable(rows=tuple(rows), study=facts(study))
     if not study.agents:
         return table
     return table.model_copy(update={"differences": _differences(study, rows, seeds)})

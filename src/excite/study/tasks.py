@@ -118,7 +118,7 @@ def seed_task(
         metrics = SeedMetrics(
             agent=agent,
             seed=seed,
-            rows=rows,
+            rows=tuple(rows),
             rms_input_fraction=float(np.max(rms / limit)),
             viable=bool(np.any(rms >= COLLAPSED * limit)),
             validation=trained.validation,
@@ -182,7 +182,7 @@ class _Keeper:
 def methods_task(study: Mapping[str, object], plant: Mapping[str, str | None]) -> Data:
     """Rows of a study's methods."""
     with unpacked(study, plant) as (chosen, _):
-        return Rows(rows=method_rows(chosen)).data()
+        return Rows(rows=tuple(method_rows(chosen))).data()
 
 
 METHOD = "clairvoyant"
@@ -202,7 +202,7 @@ def clairvoyant_task(study: Mapping[str, object], plant: Mapping[str, str | None
             for name, e in chosen.build_estimators(built).items()
         ]
         spread = np.ptp(design.worth_by_start, axis=1).tolist()
-        return Rows(rows=rows, log_det_spread_of_starts=spread).data()
+        return Rows(rows=tuple(rows), log_det_spread_of_starts=spread).data()
 
 
 @eqx.filter_jit

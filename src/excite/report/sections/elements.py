@@ -77,8 +77,8 @@ class Marker:
         with understood(path, "rerun the command that made this run folder"):
             plant = PlantDescription.from_dict(content["plant"])
             policies = dict(content.get("policies") or {})
-        words = (str(content.get(key) or "") for key in ("excite", "command"))
-        return cls(folder, str(content["kind"]), plant, *words, policies)
+        version, command = (str(content.get(key) or "") for key in ("excite", "command"))
+        return cls(folder, str(content["kind"]), plant, version, command, policies)
 
 
 class Run(abc.ABC):
