@@ -13,6 +13,7 @@ from pathlib import Path
 # One thread a process: with more, the tests' processes wait for each other's.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"
+os.environ["EXCITE_PROGRESS"] = "0"  # how long a command takes is no matter of its output
 CACHE = os.environ.setdefault(
     "EXCITE_CACHE", str(Path(tempfile.gettempdir()) / f"excite-tests-{os.getuid()}")
 )

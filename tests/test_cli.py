@@ -4,6 +4,7 @@ import json
 import math
 import os
 import pickle
+import re
 import shutil
 import signal
 import subprocess
@@ -20,14 +21,16 @@ import pytest
 from documented import documented, documented_words
 from experiments import NUM_STEPS
 
-from excite.cli import cli, main
-from excite.cli.options import progress_bar
+from excite.cli import cli, completion, main
+from excite.cli.options import Lines, progress_bar
+from excite.estimation.catalogue import ESTIMATORS
 from excite.excitation.catalogue import EXCITATIONS
 from excite.plant import Aero2
 from excite.plant.catalogue import PLANTS
-from excite.policy import Layout, Policy, read_policy
+from excite.policy import Layout, Policy, read_policy, shipped_policies
 from excite.record import read_record
 from excite.report.numbers import number
+from excite.study.catalogue import studies
 
 TESTS = Path(__file__).parent
 COMMANDS = tuple(cli.commands)
@@ -247,6 +250,47 @@ def test_help_opens_without_what_computes():
     assert done.stdout.count("Usage: ") == 1 + len(COMMANDS)
 
 
+def completed(words: str) -> list[str]:
+    """What a shell offers after these words, without importing what computes."""
+    program = (
+        "import sys\n"
+        "from excite.cli import main\n"
+        "try:\n"
+        "    main()\n"
+        "finally:\n"
+        "    slow = {'jax', 'numpy', 'pydantic', 'rich'} & set(sys.modules)\n"
+        "    assert not slow, slow\n"
+    )
+    count = len(words.split(" ")) - 1
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=False,
+        env={**os.environ, "__C_COMPLETE": "bash_complete", "COMP_WORDS": words,
+             "COMP_CWORD": str(count)},
+    )  # fmt: skip
+    assert done.stderr == ""
+    return [line.removeprefix("plain,") for line in done.stdout.splitlines()]
+
+
+@pytest.mark.parametrize(("words", "names"), [
+    ("excite simulate aero2_", ["aero2_lag", "aero2_detailed"]),
+    ("excite simulate aero2 --excitation loop-m", ["loop-multisine"]),
+    ("excite evaluate aero2-d", ["aero2-damping"]),
+    ("excite benchmark x.toml --estimators nls,dec", ["nls,decrement"]),
+    ("excite study run tab", ["table1"]),
+    ("excite identify x.csv --plant my_", ["file,my_"]),
+])  # fmt: skip
+def test_a_shell_completes_names(words, names):
+    assert completed(words) == names
+
+
+def test_names_that_a_shell_completes_are_those_of_the_catalogues():
+    assert completion.plants() == list(PLANTS)
+    assert completion.excitations() == [*EXCITATIONS, *(f"loop-{name}" for name in EXCITATIONS)]
+    assert completion.estimators() == list(ESTIMATORS)
+    assert set(completion.policies()) == set(shipped_policies())
+    assert set(completion.studies()) == set(studies())
+
+
 def test_commands_are_those_that_are_promised():
     assert set(COMMANDS) >= {
         "plants",
@@ -262,6 +306,7 @@ def test_commands_are_those_that_are_promised():
         for single in group.values():
             assert "--json" in {opt for p in single.params for opt in p.opts}
         assert command.help
+        assert "Example:" in (command.epilog or "")
 
 
 @pytest.fixture
@@ -311,7 +356,7 @@ def test_a_policy_that_may_not_excite_is_one_sentence(run, policy, words, senten
 def test_without_a_command_help_is_shown(run):
     answer = run()
     assert answer.code == 0
-    assert "Commands:" in answer.out
+    assert "Usage:" in answer.out
     assert answer.err == ""
 
 
@@ -350,6 +395,18 @@ def test_a_progress_bar_goes_to_stderr_of_a_terminal_alone(run, here, monkeypatc
     answer = run("benchmark", "study.toml", "--episodes", 8, "--json")
     assert "tiny" in answer.err
     assert len(answer.json["rows"]) == 2
+
+
+def test_where_stderr_is_no_terminal_lines_tell_how_far_it_is(monkeypatch, capsys):
+    monkeypatch.setenv("EXCITE_PROGRESS", "0.05")
+    with Lines("designing") as lines:
+        lines.update("trial 1 of 4", 1, 4)
+        time.sleep(0.2)
+        lines.update("trial 2 of 4", 2, 4)
+        time.sleep(0.2)
+    told = capsys.readouterr().err.splitlines()
+    assert re.fullmatch(r"designing: trial 1 of 4, \d+ s so far", told[0])
+    assert re.fullmatch(r"designing: trial 2 of 4, 50 %, \d+ s left", told[-1])
 
 
 # Plants, doctor

@@ -14,6 +14,7 @@ import click
 
 from .. import __version__
 from .benchmark import benchmark
+from .completion import complete_names
 from .design import design
 from .doctor import doctor
 from .export import export
@@ -31,8 +32,55 @@ from .train import train
 
 _DEBUG = "--debug"
 
+_SECTIONS: dict[str, dict[click.Command, str]] = {
+    "Try a plant, identify it": {
+        plants: "excite plants aero2",
+        simulate: "excite simulate aero2 --excitation chirp --out record.csv --plot record.png",
+        information: "excite information aero2 --excitation multisine",
+        identify: "excite identify record.csv --plant aero2 --plot fit.png",
+        policies: "excite policies",
+    },
+    "Design and train": {
+        design: "excite design aero2 --out signal.csv",
+        train: "excite train aero2 --out runs/first",
+        evaluate: "excite evaluate aero2 --episodes 100",
+        export: "excite export aero2 --onnx aero2.onnx",
+    },
+    "Experiment on a rig": {
+        run: "excite run --policy aero2 --fast --out experiment.csv",
+    },
+    "Compare": {
+        study: "excite study run baselines --out runs/baselines",
+        benchmark: "excite benchmark baselines --episodes 20",
+        report: "excite report runs/baselines --out report.html",
+    },
+    "Page and system": {
+        serve: "excite serve",
+        doctor: "excite doctor",
+    },
+}
+"""Every command with an example, in the order in which the help lists them."""
 
-@click.group(cls=RememberingGroup, context_settings={"help_option_names": ["-h", "--help"]})
+_STUDY_EXAMPLES = {
+    "list": "excite study list",
+    "run": "excite study run table1 --out runs/table1",
+    "table": "excite study table runs/table1",
+}
+
+
+class _MainGroup(RememberingGroup):
+    """The group of all commands: its help lists them by the kind of work."""
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """One section of the help for each kind of work."""
+        for title, commands in _SECTIONS.items():
+            with formatter.section(title):
+                formatter.write_dl(
+                    [(c.name or "", c.get_short_help_str(200)) for c in commands if not c.hidden]
+                )
+
+
+@click.group(cls=_MainGroup, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="excite")
 @click.option(_DEBUG, is_flag=True, help="Show the traceback of an error.")
 def cli(debug: bool) -> None:
@@ -40,11 +88,18 @@ def cli(debug: bool) -> None:
     del debug  # read from the arguments in `main`, where errors arrive
 
 
-for command in (
-    plants, policies, simulate, information, identify, design, train, evaluate, run, export,
-    benchmark, study, report, serve, doctor,
-):  # fmt: skip
-    cli.add_command(command)
+def _document(command: click.Command, example: str) -> None:
+    """An example at the end of a command's help, and completion of the names it takes."""
+    command.epilog = f"\b\nExample:\n  {example}"
+    complete_names(command)
+
+
+for commands in _SECTIONS.values():
+    for command, example in commands.items():
+        cli.add_command(command)
+        _document(command, example)
+for name, example in _STUDY_EXAMPLES.items():
+    _document(study.commands[name], example)
 
 
 def main() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from importlib import metadata
-from typing import Any
 
 import click
 
@@ -18,25 +17,35 @@ def doctor(as_json: bool) -> None:
     import platform
 
     core, extras = _requirements()
-    result = {
-        "excite": metadata.version("excite"),
-        "python": platform.python_version(),
-        "devices": _devices(),
-        "packages": {name: _version(name) for name in core},
-        "extras": {
-            extra: {
-                "installed": not (missing := [n for n in names if _version(n) is None]),
-                "missing": missing,
-                "install": f"pip install 'excite[{extra}]'",
-            }
-            for extra, names in extras.items()
-        },
-        "cache": str(cache_folder()),
-    }
+    packages = {name: _version(name) for name in core}
+    missing = {extra: [n for n in names if _version(n) is None] for extra, names in extras.items()}
+    install = {extra: f"pip install 'excite[{extra}]'" for extra in extras}
+    version, python, devices = metadata.version("excite"), platform.python_version(), _devices()
+    folder = cache_folder()
+    size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     if as_json:
-        show_json(result)
+        found = {
+            extra: {"installed": not names, "missing": names, "install": install[extra]}
+            for extra, names in missing.items()
+        }
+        show_json(
+            {"excite": version, "python": python, "devices": devices, "packages": packages,
+             "extras": found, "cache": str(folder), "cache_bytes": size}
+        )  # fmt: skip
         return
-    _show(result)
+    click.echo(f"excite {version}, Python {python}")
+    click.echo(f"devices: {', '.join(devices) or 'none, JAX is not installed'}")
+    click.echo(f"compiled programs: {folder}, {size / 1e6:.0f} MB\n")
+    show_table("core", ["package", "version"], [[n, v or "MISSING"] for n, v in packages.items()])
+    show_table(
+        "extras",
+        ["extra", "installed", "missing", "to install"],
+        [
+            [extra, "no" if names else "yes", ", ".join(names) or "–",
+             install[extra] if names else ""]
+            for extra, names in missing.items()
+        ],
+    )  # fmt: skip
 
 
 def _devices() -> list[str]:
@@ -66,25 +75,3 @@ def _version(package: str) -> str | None:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
         return None
-
-
-def _show(result: dict[str, Any]) -> None:
-    click.echo(f"excite {result['excite']}, Python {result['python']}")
-    click.echo(f"devices: {', '.join(result['devices']) or 'none, JAX is not installed'}")
-    click.echo(f"compiled programs: {result['cache']}")
-    show_table(
-        "core", ["package", "version"], [[n, v or "MISSING"] for n, v in result["packages"].items()]
-    )
-    show_table(
-        "extras",
-        ["extra", "there", "missing", "to install"],
-        [
-            [
-                name,
-                "yes" if e["installed"] else "no",
-                ", ".join(e["missing"]) or "–",
-                "" if e["installed"] else e["install"],
-            ]
-            for name, e in result["extras"].items()
-        ],
-    )

@@ -11,12 +11,19 @@ import shlex
 import shutil
 import signal
 import sys
+import threading
+import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Generic, ParamSpec, Self, TypeVar
 
 import click
+
+Callback = TypeVar("Callback", bound=Callable[..., object])
+P = ParamSpec("P")
+Result = TypeVar("Result")
+Value = TypeVar("Value")
 
 
 class RunFailedError(Exception):
@@ -40,20 +47,25 @@ def command_line() -> str:
     return shlex.join(["excite", *click.get_current_context().meta.get(_WORDS, [])])
 
 
-class Assignments(click.ParamType):
+class Assignments(click.ParamType, Generic[Value]):
     r"""NAME=VALUE,NAME=VALUE,... as a dictionary; a comma that belongs to a text is written \,."""
 
     name = "NAME=VALUE,..."
 
-    def __init__(self, convert: Callable[[str], Any]) -> None:
+    def __init__(self, convert: Callable[[str], Value]) -> None:
         """`convert` reads the text of one value; its ValueError becomes the user's sentence."""
         self.convert_value = convert
 
-    def convert(self, value: Any, param: Any, ctx: Any) -> dict[str, Any]:
+    def convert(
+        self,
+        value: str | dict[str, Value],
+        param: click.Parameter | None,
+        ctx: click.Context | None,
+    ) -> dict[str, Value]:
         """Pairs in the order given."""
         if isinstance(value, dict):
             return value
-        result = {}
+        result: dict[str, Value] = {}
         for pair in re.split(r"(?<!\\),(?![^\[]*\])", value):  # not at the commas of a list
             parts = pair.replace("\\,", ",").partition("=")
             name, equals, text = (part.strip() for part in parts)
@@ -72,7 +84,7 @@ class WholeNumber(click.IntRange):
     name = "whole number"
 
 
-def _option_value(text: str) -> Any:
+def _option_value(text: str) -> bool | float | list[object]:
     """A number, true, false or a list of numbers, as TOML and JSON write them."""
     value = json.loads(text)
     if not isinstance(value, bool | int | float | list):
@@ -86,30 +98,30 @@ VALUES = Assignments(_option_value)
 OUT_FILE = click.Path(path_type=Path)
 
 
-def merged(pairs: Iterable[dict[str, Any]]) -> dict[str, Any]:
+def merged(pairs: Iterable[dict[str, Value]]) -> dict[str, Value]:
     """One dictionary from an option that was given several times."""
     return {name: value for part in pairs for name, value in part.items()}
 
 
-def json_option(command: Callable[..., Any]) -> Callable[..., Any]:
+def json_option(command: Callback) -> Callback:
     """`--json`: one JSON object on stdout and nothing else."""
     return click.option(
         "--json", "as_json", is_flag=True, help="Print one JSON object and nothing else."
     )(command)
 
 
-def plot_option(command: Callable[..., Any]) -> Callable[..., Any]:
+def plot_option(command: Callback) -> Callback:
     """`--plot FILE`."""
     return click.option(
         "--plot", type=OUT_FILE, metavar="FILE", help="Write a figure (.png, .svg, .pdf)."
     )(command)
 
 
-def computing(command: Callable[..., Any]) -> Callable[..., Any]:
+def computing(command: Callable[P, Result]) -> Callable[P, Result]:
     """Prepares JAX before a command: double precision, and a cache of compiled programs."""
 
     @functools.wraps(command)
-    def wrapped(*args: Any, **kwargs: Any) -> Any:
+    def wrapped(*args: P.args, **kwargs: P.kwargs) -> Result:
         try:
             prepare_jax()
         except ImportError:
@@ -117,7 +129,7 @@ def computing(command: Callable[..., Any]) -> Callable[..., Any]:
                 "this command needs JAX, which is not installed: pip install excite"
             ) from None
         plot = kwargs.get("plot")
-        if plot is not None:
+        if isinstance(plot, Path):
             from ..report.figure import require_plot_path
 
             require_plot_path(plot)
@@ -133,10 +145,12 @@ def prepare_jax() -> None:
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    _keep_compiled_programs(jax)
+    _keep_compiled_programs()
 
 
-def _keep_compiled_programs(jax: Any) -> None:
+def _keep_compiled_programs() -> None:
+    import jax
+
     folder = cache_folder()
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -155,6 +169,61 @@ def cache_folder() -> Path:
     return Path(own) if own else Path(base) / "excite"
 
 
+class Lines:
+    """How far a command is: a line on stderr every ten seconds, where it is no terminal.
+
+    EXCITE_PROGRESS sets another time between two lines [s]; 0 means none.
+    """
+
+    def __init__(self, what: str) -> None:
+        """`what` the command does."""
+        self._what, self._text = what, ""
+        self._began = time.monotonic()
+        self._first: tuple[float, float] | None = None  # time and share of the first call
+        self._share = 0.0
+        self._end = threading.Event()
+        self._teller = threading.Thread(target=self._tell, daemon=True)
+
+    def __enter__(self) -> Self:
+        """Begins to tell."""
+        self._teller.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Says nothing more."""
+        self._end.set()
+        self._teller.join()
+
+    def update(self, text: str, done: float, total: float) -> None:
+        """Sets what is being done, how much is done, and of how much."""
+        self._text, self._share = text, done / total if total else 0.0
+        self._first = self._first or (time.monotonic(), self._share)
+
+    def line(self) -> str:
+        """What is done, how much of it, and how long it will take or has taken."""
+        now = time.monotonic()
+        began, before = self._first or (now, 0.0)  # what is resumed has been done at once
+        if (gained := self._share - before) > 0:
+            time_left = (now - began) * (1 - self._share) / gained
+            how_far = f"{100 * self._share:.0f} %, {_duration(time_left)} left"
+        else:
+            how_far = f"{_duration(now - self._began)} so far"
+        return f"{': '.join(filter(None, (self._what, self._text)))}, {how_far}"
+
+    def _tell(self) -> None:
+        seconds = float(os.environ.get("EXCITE_PROGRESS", "10"))
+        while seconds > 0 and not self._end.wait(seconds):
+            click.echo(self.line(), err=True)
+
+
+def _duration(seconds: float) -> str:
+    """In the units of a clock."""
+    hours, minutes = divmod(round(seconds / 60), 60)
+    if hours:
+        return f"{hours} h {minutes} min"
+    return f"{minutes} min" if seconds >= 90 else f"{seconds:.0f} s"
+
+
 @contextlib.contextmanager
 def warnings_shown() -> Iterator[None]:
     """Warnings as sentences on stderr."""
@@ -165,21 +234,31 @@ def warnings_shown() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def progress_bar(what: str) -> Iterator[Callable[[str, int, int], None]]:
-    """A bar on stderr, for a terminal only; calls set its text, what is done and the total."""
+def progress_bar(what: str) -> Iterator[Callable[[str, float, float], None]]:
+    """Shows how far a command is on stderr: a bar on a terminal, lines elsewhere.
+
+    Yields a function that sets what is being done, how much is done, and of how much.
+    """
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TimeRemainingColumn
 
     console = Console(stderr=True)
-    columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()
-    bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
-    with bar, _interrupts() as came:
-        task = bar.add_task(what, total=None)
+    with contextlib.ExitStack() as stack:
+        if console.is_terminal:
+            columns = "{task.description}", BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
+            bar = stack.enter_context(Progress(*columns, console=console, transient=True))
+            task = bar.add_task(what, total=None)
 
-        def report(text: str, done: int, total: int) -> None:
+            def show(text: str, done: float, total: float) -> None:
+                bar.update(task, description=f"{what}: {text}", completed=done, total=total)
+        else:
+            show = stack.enter_context(Lines(what)).update
+        came = stack.enter_context(_interrupts())
+
+        def report(text: str, done: float, total: float) -> None:
             if came:
                 raise KeyboardInterrupt
-            bar.update(task, description=f"{what}: {text}", completed=done, total=total)
+            show(text, done, total)
 
         yield report
 
@@ -189,7 +268,7 @@ def _interrupts() -> Iterator[list[int]]:
     """Every Ctrl-C, as it comes; one that is raised in a library's callback would be lost."""
     came, usual = list[int](), signal.getsignal(signal.SIGINT)
 
-    def remember(number: int, frame: Any) -> None:
+    def remember(number: int, frame: object) -> None:
         del frame
         came.append(number)
         raise KeyboardInterrupt
@@ -204,7 +283,7 @@ def _interrupts() -> Iterator[list[int]]:
         signal.signal(signal.SIGINT, usual)
 
 
-def show_json(value: Any) -> None:
+def show_json(value: object) -> None:
     """One JSON object on stdout."""
     from ..files import json_text
 

@@ -89,7 +89,7 @@ def train(plant: str, out: Path, as_json: bool, **options: Any) -> None:  # fmt:
     """Train a policy that excites PLANT, and compare it with a chirp.
 
     The run folder is that of a study with one agent: FOLDER/seeds/METHOD_OBJECTIVE/0 holds
-    policy.safetensors. Interrupted at any moment, the same command goes on where it was.
+    policy.safetensors. After an interruption, rerun the same command to resume.
     """
     from ..study.spec import study_from
 
