@@ -1,6 +1,7 @@
 """`import excite as ex`: instant, complete, every example runs, and every object fits a screen."""
 
 import doctest
+import inspect
 import json
 import subprocess
 import sys
@@ -15,8 +16,9 @@ NAMES = [name for name in ex.__all__ if name != "__version__"]
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_every_name_has_an_example_that_runs(name):
-    found = getattr(ex, name)
+def test_every_name_has_an_example_that_runs(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # some examples write a file
+    found = inspect.unwrap(getattr(ex, name))
     tests = doctest.DocTestFinder(recurse=False).find(found, name, globs={})
     examples = [test for test in tests if test.examples]
     assert examples, f"{name} has no example"
@@ -34,6 +36,16 @@ def test_importing_the_package_loads_nothing():
     code = "import sys, excite; print(*{'jax', 'numpy', 'equinox'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == []
+
+
+def test_a_verb_with_the_name_of_a_module_is_a_verb_whatever_was_imported(record, result):
+    import excite.information
+    import excite.report
+
+    assert excite.information.cramer_rao_bound
+    assert ex.information("aero2", steps=100).plant.name == "aero2"
+    with pytest.raises(ValueError, match="html"):
+        ex.report([], "page.txt")
 
 
 @pytest.fixture(scope="module")

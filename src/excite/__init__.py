@@ -11,7 +11,9 @@ when they are first used: `import excite` alone costs nothing, and loads neither
 The package computes in double precision, which it switches on when a plant is first used.
 """
 
+import sys
 from importlib import import_module
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 __version__ = "0.1.0"
@@ -22,8 +24,10 @@ _PLACES = {
     "information": "information",
     "identify": "estimation.identify",
     "design": "training.design",
+    "train": "study.train",
     "evaluate": "study.evaluate",
     "run_study": "study.run",
+    "report": "report.html",
     # nouns
     "Record": "record.record",
     "read_record": "record.read",
@@ -51,11 +55,35 @@ _PLACES = {
 __all__ = ["__version__", *_PLACES]  # pyright: ignore[reportUnsupportedDunderAll]
 
 
+class _Verb(ModuleType):
+    """A module with the name of a verb; called, it is the verb."""
+
+    @property
+    def __wrapped__(self) -> object:
+        name = self.__name__.rpartition(".")[2]
+        return getattr(import_module(f".{_PLACES[name]}", __name__), name)
+
+    def __call__(self, *args: object, **options: object) -> object:
+        return self.__wrapped__(*args, **options)  # pyright: ignore[reportCallIssue]
+
+
+class _Package(ModuleType):
+    """The package itself: importing `excite.information` sets that name to the module."""
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if name in _PLACES and isinstance(value, ModuleType):
+            value.__class__ = _Verb
+        super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package
+
+
 def __getattr__(name: str) -> object:
     if name not in _PLACES:
         raise AttributeError(f"module 'excite' has no attribute {name!r}")
-    found = globals()[name] = getattr(import_module(f".{_PLACES[name]}", __name__), name)
-    return found
+    found = getattr(import_module(f".{_PLACES[name]}", __name__), name)
+    return globals().setdefault(name, found)
 
 
 def __dir__() -> list[str]:
@@ -81,10 +109,12 @@ if TYPE_CHECKING:
     from .policy.file import read_policy as read_policy
     from .record.read import read_record as read_record
     from .record.record import Record as Record
+    from .report.html import report as report
     from .simulation import simulate as simulate
     from .study.catalogue import studies as studies
     from .study.evaluate import evaluate as evaluate
     from .study.run import run_study as run_study
     from .study.spec import Study as Study
     from .study.spec import read_study as read_study
+    from .study.train import train as train
     from .training.design import design as design

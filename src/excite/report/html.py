@@ -58,6 +58,12 @@ def report_html(
 def report(runs: str | Path | Sequence[str | Path], out: str | Path | None = None) -> str:
     """A report of run folders and records as one HTML page; needs nothing else to be read.
 
+        >>> import excite as ex
+        >>> ex.simulate("aero2", steps=60).save("report_of_this.csv")
+        >>> page = ex.report("report_of_this.csv")
+        >>> page[:15]
+        '<!DOCTYPE html>'
+
     Args:
         runs: one or several folders of `excite identify` and `excite study run`, and records
             with their sidecar.

@@ -38,7 +38,13 @@ def train(
 ) -> Policy:
     """Trains a policy that excites a plant, and compares it with a chirp.
 
-    Rerun with the same arguments to resume an interrupted training.
+    Rerun with the same arguments and the same `out` to resume an interrupted training.
+
+        >>> import excite as ex
+        >>> brief = {"num_updates": 1, "num_plants": 2, "hidden": [4]}
+        >>> policy = ex.train("aero2", steps=40, window=5, episodes=2, training=brief)
+        >>> policy.layout.num_steps
+        40
 
     Args:
         plant: its name, `path/to/file.py:ClassName`, the plant or its class.
