@@ -17,6 +17,7 @@ import scipy.stats
 from cluster import Cluster, wait_for
 
 from excite.policy import read_policy
+from excite.record.rows import SeedMetrics
 from excite.study import table
 from excite.study.engine import local_engine
 from excite.study.folder import seed_folder, study_of
@@ -264,7 +265,7 @@ def test_a_study_killed_in_the_middle_goes_on_and_gives_the_same_table(run, tmp_
         study_table(folder)
     shown = excite("study", "table", folder)
     assert shown.returncode == 2
-    assert "'excite study run' goes on with it" in shown.stderr
+    assert "rerun 'excite study run' to resume" in shown.stderr
     done = excite("study", "run", study, "--out", folder, "--workers", 2)
     assert done.returncode == 0, done.stderr
     assert {p: p.stat().st_mtime_ns for p in finished} == finished
@@ -566,10 +567,11 @@ def test_no_study_is_one_sentence(tmp_path):
 # Rows across seeds
 
 
-def metrics(viable: bool, error: float, violations: int) -> dict[str, Any]:
+def metrics(viable: bool, error: float, violations: int) -> SeedMetrics:
     row = {
         "method": "a", "estimator": "e", "evaluations": 10, "failed": 1, "failures": {"x": 1},
-        "violations": violations, "violation_rate": {}, "beyond_6_std_errors": 2,
+        "violations": violations, "violation_rate": {"estimate": 0.1, "ci95": (0.0, 0.2)},
+        "log_det_information": 40.0, "log_det_information_sd": 1.0, "beyond_6_std_errors": 2,
         "max_abs_output": {"output": "y", "mean": 2 * error, "sd": 1.0, "unit": "m"},
         "relative_error_percent": {
             "p": {"mean": error, "sd": 1.0, "median": error, "rms": 2 * error}
@@ -577,11 +579,15 @@ def metrics(viable: bool, error: float, violations: int) -> dict[str, Any]:
         "cramer_rao_percent": {"p": 0.5}, "rms_over_cramer_rao": {"p": 3.0},
         "coverage95_percent": {"p": 90.0},
     }  # fmt: skip
-    return {"viable": viable, "rows": [row], "train_seconds": 60.0}
+    return SeedMetrics.model_validate(
+        {"viable": viable, "rows": [row], "train_seconds": 60.0, "validation": {"return": 1.0}}
+    )
 
 
 def test_means_are_over_viable_seeds_and_counts_over_all():
-    row = across_seeds([metrics(True, 1.0, 0), metrics(False, 50.0, 4), metrics(True, 3.0, 1)], 0)
+    row = across_seeds(
+        [metrics(True, 1.0, 0), metrics(False, 50.0, 4), metrics(True, 3.0, 1)], 0
+    ).data()
     error = row["relative_error_percent"]["p"]
     assert (error["mean"], error["sd"]) == (2.0, pytest.approx(2**0.5))
     assert error["all_seeds"]["mean"] == 18.0
@@ -594,13 +600,13 @@ def test_means_are_over_viable_seeds_and_counts_over_all():
 
 
 def test_a_seed_without_estimates_does_not_hide_the_others():
-    row = across_seeds([metrics(True, 1.0, 0), metrics(True, math.nan, 0)], 0)
+    row = across_seeds([metrics(True, 1.0, 0), metrics(True, math.nan, 0)], 0).data()
     assert row["relative_error_percent"]["p"]["mean"] == 1.0
     assert row["viable_seeds"] == 2
 
 
 def test_no_viable_seed_leaves_counts_and_no_means():
-    row = across_seeds([metrics(False, 1.0, 2)], 0)
-    assert np.isnan(row["relative_error_percent"]["p"]["mean"])
+    row = across_seeds([metrics(False, 1.0, 2)], 0).data()
+    assert row["relative_error_percent"]["p"]["mean"] is None
     assert row["violations"] == 2
     assert row["viable_seeds"] == 0

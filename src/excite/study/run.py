@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import importlib.util
 import json
 import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
@@ -156,7 +156,11 @@ def _require_trainer(study: Study, folder: Path) -> None:
     folders = [seed_folder(folder, a, seed) for a in agents for seed in range(study.seeds)]
     if all((folder / "metrics.json").is_file() for folder in folders):
         return
-    missing = [n for n in ("stable_baselines3", "torch", "tensorboard") if find_spec(n) is None]
+    missing = [
+        n
+        for n in ("stable_baselines3", "torch", "tensorboard")
+        if importlib.util.find_spec(n) is None
+    ]
     if missing:
         raise ValueError(f"training needs {', '.join(missing)}: pip install 'excite[ppo]'")
 
