@@ -5,10 +5,15 @@ Compiled programs are kept on disk, in one folder for all processes of a test ru
 the runs that follow: what one test compiles, no other compiles again.
 """
 
+import ctypes
+import gc
 import os
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
+
+import pytest
 
 # One thread a process: with more, the tests' processes wait for each other's.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -17,13 +22,47 @@ os.environ["EXCITE_PROGRESS"] = "0"  # how long a command takes is no matter of 
 CACHE = os.environ.setdefault(
     "EXCITE_CACHE", str(Path(tempfile.gettempdir()) / f"excite-tests-{os.getuid()}")
 )
+# In the environment, so that every process that a test starts does the same.
+os.environ["JAX_COMPILATION_CACHE_DIR"] = CACHE
+os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "0"
 
 import jax  # noqa: E402
 from jaxtyping import install_import_hook  # noqa: E402
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
-jax.config.update("jax_compilation_cache_dir", CACHE)
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
 install_import_hook("excite", "strict.checked")
 assert "excite.plant" not in sys.modules
+
+
+class Memory:
+    """What this process uses; compiled programs are given up where it is too much.
+
+    They stay as long as the process, and there are thousands of them.
+    """
+
+    limit = 1.2e9
+    step = 0.3e9
+
+    def used(self) -> int:
+        """Bytes in memory; 0 where that is not told."""
+        try:
+            return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+        except OSError:
+            return 0
+
+    def bound(self) -> None:
+        if self.used() > self.limit:
+            jax.clear_caches()
+            gc.collect()
+            ctypes.CDLL(None).malloc_trim(0)
+            self.limit = max(self.limit, self.used() + self.step)
+
+
+MEMORY = Memory()
+
+
+@pytest.fixture(autouse=True)
+def bounded_memory() -> Iterator[None]:
+    yield
+    MEMORY.bound()

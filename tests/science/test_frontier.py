@@ -2,15 +2,13 @@
 
 import json
 import math
-import subprocess
-import sys
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from commands import excite
 
 from excite.environment import run_episodes
 from excite.excitation import Replay
@@ -54,13 +52,6 @@ kind = "arx-rls"
 [estimators.nls]
 kind = "nls"
 """
-
-
-def excite(*arguments: Any, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "excite", *map(str, arguments)]
-    return subprocess.run(
-        command, capture_output=True, text=True, timeout=580, check=False, cwd=cwd
-    )
 
 
 @pytest.fixture(scope="module")

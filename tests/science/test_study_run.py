@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import scipy.stats
 from cluster import Cluster, wait_for
+from commands import PATIENCE, excite
 
 from excite.policy import read_policy
 from excite.record.rows import SeedMetrics
@@ -70,11 +71,6 @@ def write_study(folder: Path, text: str = TINY) -> Path:
     path = folder / "tiny.toml"
     path.write_text(text)
     return path
-
-
-def excite(*arguments: Any) -> subprocess.CompletedProcess[str]:
-    command = [*EXCITE, *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
 
 
 @pytest.fixture(scope="module")
@@ -244,7 +240,7 @@ def killed_in_the_middle(study: Path, folder: Path) -> None:
     environment = {**os.environ, "EXCITE_CHECKPOINT_SECONDS": "0"}
     command = [*EXCITE, "study", "run", str(study), "--out", str(folder), "--workers", "1"]
     process = subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL)
-    deadline = time.monotonic() + 200
+    deadline = time.monotonic() + PATIENCE
     while time.monotonic() < deadline:
         finished = list(folder.glob("seeds/*/*/metrics.json"))
         if finished and any(steps_of(p) >= 960 for p in folder.glob("seeds/*/*/progress.json")):
@@ -392,9 +388,9 @@ def test_a_cluster_that_loses_a_worker_gives_the_same_table(run, tmp_path):
             "--engine", "dask", "--address", cluster.address,
         ]  # fmt: skip
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
-        assert wait_for(lambda: list(folder.glob("seeds/*/*/progress.json")), 120)
+        assert wait_for(lambda: list(folder.glob("seeds/*/*/progress.json")), PATIENCE)
         cluster.kill(1)
-        _, errors = process.communicate(timeout=300)
+        _, errors = process.communicate(timeout=PATIENCE)
     finally:
         cluster.close()
     assert process.returncode == 0, errors
@@ -429,8 +425,8 @@ def test_a_full_disk_is_a_sentence_and_loses_nothing(run, tmp_path):
     nearly_full = ["sh", "-c", 'ulimit -f 117; exec "$@"', "sh"]
     done = subprocess.run(
         [*nearly_full, *EXCITE, "study", "run", run.parent / "tiny.toml", "--out", folder],
-        env={**os.environ, "EXCITE_CHECKPOINT_SECONDS": "0", "EXCITE_CACHE": str(tmp_path)},
-        capture_output=True, text=True, timeout=300, check=False,
+        env={**os.environ, "EXCITE_CHECKPOINT_SECONDS": "0"},
+        capture_output=True, text=True, timeout=PATIENCE, check=False,
     )  # fmt: skip
     assert done.returncode == 2
     assert "checkpoint.safetensors: cannot be written (File too large)" in done.stderr
