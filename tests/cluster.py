@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from commands import PATIENCE
 
 
 def wait_for(condition: Callable[[], Any], seconds: float = 10.0) -> bool:
@@ -34,7 +35,7 @@ class Cluster:
         def address() -> str:
             return json.loads(file.read_text())["address"] if file.exists() else ""
 
-        if not wait_for(address, 30):
+        if not wait_for(address, PATIENCE):
             self.close()
             pytest.fail("the scheduler does not start")
         self.address = address()

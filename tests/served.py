@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import httpx2 as httpx
+from commands import PATIENCE
 
 EXPERIMENT = {
     "plant": "aero2",
@@ -32,16 +33,24 @@ MAX_GAP = 0.2
 
 @contextlib.contextmanager
 def served(
-    runs: Path, *options: str, ended_by: int = signal.SIGINT, code: int = 0, scratch: Path = TMP
+    runs: Path,
+    *options: str,
+    ended_by: int = signal.SIGINT,
+    code: int = 0,
+    scratch: Path = TMP,
+    cache: Path | None = None,
 ) -> Iterator[str]:
     """The address of a page; a signal ends it afterwards, cleanly.
 
     Args:
         code: its exit code then.
         scratch: the folder of temporary files.
+        cache: the folder of compiled programs; without, that of all tests.
     """
     words = [sys.executable, "-m", "excite", "serve", "--port", "0", "--json", *options]
     pipe, own = subprocess.PIPE, {**os.environ, "TMPDIR": str(scratch)}
+    if cache is not None:
+        own |= dict.fromkeys(("EXCITE_CACHE", "JAX_COMPILATION_CACHE_DIR"), str(cache))
     words += ["--runs", str(runs)]
     with subprocess.Popen(words, stdout=pipe, stderr=pipe, env=own) as process:
         try:
@@ -52,7 +61,7 @@ def served(
                 told += line
             yield json.loads(told)["address"].rstrip("/")
             process.send_signal(ended_by)
-            out, err = process.communicate(timeout=20)
+            out, err = process.communicate(timeout=PATIENCE)
             assert (process.returncode, out, err) == (code, b"", b""), err.decode()
         finally:
             process.kill()
@@ -61,7 +70,7 @@ def served(
 @contextlib.contextmanager
 def browser(address: str) -> Iterator[httpx.Client]:
     """A client that has opened the page, and tells where its requests come from."""
-    with httpx.Client(base_url=address, headers={"origin": address}, timeout=120) as client:
+    with httpx.Client(base_url=address, headers={"origin": address}, timeout=PATIENCE) as client:
         assert client.get("/").status_code == 200
         assert client.post("/api/session", json={}).json() == {"is_known": True}
         yield client

@@ -10,14 +10,14 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import click
-import jax
 import numpy as np
 import pytest
+from commands import PATIENCE
 from documented import documented, documented_words
 from experiments import NUM_STEPS
 
@@ -101,25 +101,10 @@ class Answer(NamedTuple):
 Run = Callable[..., Answer]
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Compiled programs go to a folder of this run, and JAX is left as it was."""
-    folder = tmp_path_factory.mktemp("cache")
-    options = [name for name in jax.config.values if "compilation_cache" in name]
-    options += [name for name in jax.config.values if name.startswith("jax_persistent_cache")]
-    before = {name: jax.config.values[name] for name in options}
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("EXCITE_CACHE", str(folder))
-        patch.delenv("FORCE_COLOR", raising=False)
-        yield folder
-    for name, value in before.items():
-        jax.config.update(name, value)
-
-
 @pytest.fixture
-def run(cache: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Run:
+def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Run:
     """The command line in this process: exit code, stdout, stderr."""
-    del cache
+    monkeypatch.delenv("FORCE_COLOR", raising=False)
 
     def call(*words: object) -> Answer:
         monkeypatch.setattr(sys, "argv", ["excite", *map(str, words)])
@@ -137,7 +122,7 @@ def excite(*words: object, folder: Path, **settings: str) -> Answer:
     done = subprocess.run(
         [sys.executable, "-m", "excite", *map(str, words)],
         cwd=folder, env={**os.environ, **settings}, capture_output=True, text=True,
-        check=False, timeout=300,
+        check=False, timeout=PATIENCE,
     )  # fmt: skip
     return Answer(done.returncode, done.stdout, done.stderr)
 
@@ -157,7 +142,7 @@ def scaled(good: str, **factors: float) -> str:
 
 
 @pytest.fixture(scope="module")
-def files(cache: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with good and bad files; no test writes to it."""
     folder = tmp_path_factory.mktemp("files")
     with pytest.MonkeyPatch.context() as patch:
@@ -858,14 +843,14 @@ def test_a_name_with_a_letter_missing_is_recognised(run):
 # As a program of its own
 
 
-def test_as_a_program_stdout_is_json_and_stderr_silent(cache, here):
+def test_as_a_program_stdout_is_json_and_stderr_silent(here):
     answer = excite("identify", "good.csv", "--plant", "aero2", "--json", folder=here)
     assert answer.err == ""
     assert answer.code == 0
     assert answer.json["status"] == "successful"
 
 
-def test_as_a_program_a_mistake_is_one_line_and_code_2(cache, here):
+def test_as_a_program_a_mistake_is_one_line_and_code_2(here):
     before = contents(here)
     answer = excite(*IDENTIFY.format("nan.csv").split(), folder=here)
     assert answer.code == 2
@@ -905,12 +890,12 @@ def test_an_interrupted_benchmark_ends_with_130_and_leaves_nothing(here, tmp_pat
     )  # fmt: skip
     try:
         # The first compiled program on disk tells that the run has begun.
-        deadline = time.monotonic() + 120
+        deadline = time.monotonic() + PATIENCE
         while not (cache.is_dir() and any(cache.iterdir())) and time.monotonic() < deadline:
             assert program.poll() is None
             time.sleep(0.05)
         program.send_signal(signal.SIGINT)
-        out, err = program.communicate(timeout=60)
+        out, err = program.communicate(timeout=PATIENCE)
     finally:
         program.kill()
     assert program.returncode == 130

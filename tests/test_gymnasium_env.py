@@ -10,6 +10,7 @@ import gymnasium
 import jax
 import numpy as np
 import pytest
+from commands import PATIENCE
 from gymnasium.envs.registration import registry
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
@@ -287,7 +288,7 @@ def test_a_program_in_single_precision_sees_the_same_and_stays_in_it(tmp_path):
     files = [tmp_path / "single.npz", tmp_path / "double.npz"]
     for path in files:
         command = [sys.executable, "-W", "error", "-c", PROGRAM, path, path.stem]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
         assert done.returncode == 0, done.stderr
     single, double = (np.load(path) for path in files)
     assert len(single.files) == len(double.files) == 14
@@ -321,7 +322,7 @@ def test_a_process_for_each_environment_is_spawned_or_refused(context, tmp_path)
     program = tmp_path / "program.py"  # spawned processes import it
     program.write_text(FORKED)
     done = subprocess.run(
-        [sys.executable, program, context], capture_output=True, text=True, timeout=300
+        [sys.executable, program, context], capture_output=True, text=True, timeout=PATIENCE
     )
     if context == "spawn":
         assert done.stdout == "(1, 161)\n", done.stderr

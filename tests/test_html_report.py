@@ -25,7 +25,6 @@ from excite.report.tables import parameter_cells, residual_cells, residual_in_wo
 from excite.study.table import finished_table
 
 RESULTS = Path(__file__).parent.parent / "results"
-STUDIES = sorted(path.parent.name for path in RESULTS.glob("*/run.json"))
 LIMIT = 3_000_000
 VOID = {"meta", "img", "br", "link", "input", "hr"}
 STUDY = """
@@ -174,8 +173,12 @@ def assert_is_self_contained(page: Page) -> None:
     assert page.text.startswith("<!DOCTYPE html>\n<html lang=")
 
 
-@pytest.mark.parametrize("name", STUDIES)
+@pytest.mark.parametrize("name", ["table1", "frontier", "nls"])  # the others: tests/results
 def test_a_study_makes_one_small_page_with_the_table_of_the_command_line(name, capsys):
+    assert_is_the_page_of_a_study(name, capsys)
+
+
+def assert_is_the_page_of_a_study(name: str, capsys) -> None:
     page = page_of(RESULTS / name)
     assert_is_self_contained(page)
     assert_has_the_table_of_the_command_line(page, RESULTS / name, capsys)

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from catalogue import TwoMasses
+from commands import PATIENCE
 from standin.quanser import hardware as standin
 
 from excite.plant import Aero2Detailed
@@ -457,7 +458,7 @@ def process(tmp_path):
 
 def test_a_killed_process_leaves_a_watchdog_that_runs_and_a_record(process, tmp_path):
     running, path = process(300), tmp_path / "a.csv"
-    until = time.monotonic() + 60
+    until = time.monotonic() + PATIENCE
     while not (path.exists() and path.read_text().count("\n") > 5):
         assert running.poll() is None, running.communicate()[0]
         assert time.monotonic() < until
@@ -480,7 +481,7 @@ def test_a_killed_process_leaves_a_watchdog_that_runs_and_a_record(process, tmp_
 def test_an_experiment_in_real_time_needs_numpy_alone(process):
     text = "deadlines"
     for _ in range(5):  # a computer that runs tests may lose a deadline
-        text, _ = process(4).communicate(timeout=60)
+        text, _ = process(4).communicate(timeout=PATIENCE)
         if not text.startswith("deadlines"):
             break
     assert text.split("\n")[0] == "complete []", text

@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from commands import PATIENCE
 
 import excite
 from excite.environment import run_episodes
@@ -812,11 +813,11 @@ def experiment_under_way(folder: Path, num_needed: int) -> Iterator[subprocess.P
     source = str(Path(excite.__file__).parent.parent)
     with subprocess.Popen(
         [sys.executable, "-m", "excite", *words], cwd=folder, text=True,
-        env={**os.environ, "PYTHONPATH": source, "EXCITE_CACHE": str(folder / "cache")},
+        env={**os.environ, "PYTHONPATH": source},
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
     ) as process:  # fmt: skip
         try:
-            until, path = time.monotonic() + 120, folder / "r.csv"
+            until, path = time.monotonic() + PATIENCE, folder / "r.csv"
             while not path.exists() or path.read_text().count("\n") <= num_needed:
                 assert process.poll() is None, process.communicate()[0]
                 assert time.monotonic() < until
@@ -846,7 +847,7 @@ def test_a_killed_process_leaves_a_record_that_identifies(tmp_path):
 def test_a_signal_ends_it_with_its_own_code_and_a_whole_record(number, code, tmp_path):
     with experiment_under_way(tmp_path, 5) as process:
         process.send_signal(number)
-        out, _ = process.communicate(timeout=60)
+        out, _ = process.communicate(timeout=PATIENCE)
     assert process.returncode == code
     assert "Traceback" not in out
     assert signal.Signals(number).name in out

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import PATIENCE
 
 import excite
 from excite.cli import main
@@ -71,7 +72,6 @@ def call(tmp_path, capsys, monkeypatch):
     """`excite run` in this process, in an empty folder: exit code, stdout, stderr."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(command, "_tracker", lambda job, has_jax: None)  # it compiles for long
-    monkeypatch.setenv("EXCITE_CACHE", str(tmp_path.parent / "cache"))
     (tmp_path / "own.py").write_text(OWN_RIG)
     inputs = 3 * np.sin(0.25 * np.arange(30))
     (tmp_path / "u.csv").write_text(csv_text({"time": 0.1 * np.arange(30), "voltage": inputs}))
@@ -265,7 +265,7 @@ def bare(folder, *words):
     return subprocess.run(
         [sys.executable, "-m", "excite", "run", *map(str, words)], cwd=folder, check=False,
         env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, places))},
-        capture_output=True, text=True, timeout=120,
+        capture_output=True, text=True, timeout=PATIENCE,
     )  # fmt: skip
 
 

@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 import tasks as functions
 from cluster import Cluster, wait_for
+from commands import PATIENCE
 
 from excite import __version__
 from excite.study import cluster as dask
@@ -334,6 +335,6 @@ def test_a_scheduler_that_does_not_answer_is_one_sentence(is_silent):
         if not is_silent:
             server.close()
         command = [sys.executable, "-c", code, address]
-        done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=15)
+        done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=PATIENCE)
     assert done.stdout == f"no Dask scheduler answers at {address}\n"
     assert done.stderr == ""

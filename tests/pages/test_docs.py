@@ -1,6 +1,7 @@
 """Commands, options, files and examples that the documentation shows exist and run."""
 
 import importlib.util
+import json
 import math
 import os
 import re
@@ -9,17 +10,18 @@ import socket
 import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
 
 import click
 import pytest
+from commands import PATIENCE
 from experiments import ROOT
 
 import excite
 from excite.estimation.catalogue import ESTIMATORS
 from excite.excitation.catalogue import EXCITATIONS
-from excite.plant.catalogue import PLANTS
+from excite.plant.catalogue import PLANTS, plant_named
+from excite.record import read_record
 from excite.study.spec import read_study
 
 
@@ -28,7 +30,7 @@ def shell(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     return subprocess.run(
         ["sh", "-ec", command], cwd=folder, env={**os.environ, "PATH": path},
-        capture_output=True, text=True, timeout=1200, check=False,
+        capture_output=True, text=True, timeout=PATIENCE, check=False,
     )  # fmt: skip
 
 
@@ -81,27 +83,34 @@ def test_a_policy_runs_on_a_rig_as_documented(tmp_path: Path):
     assert run.returncode == 0, run.stderr
 
 
-def controller(server: socket.socket) -> None:
-    """Answers every line, as the rig in run-on-a-rig.md expects; its pitch is a slow swing."""
-    start, (line, _) = time.monotonic(), server.accept()
+def controller(server: socket.socket, answers: list[float]) -> None:
+    """Answers every line, as the rig on the page expects; its pitch is a slow swing."""
+    line, _ = server.accept()
     with line:
-        while line.recv(64):
-            line.sendall(b"%.6f\n" % (0.2 * math.sin(time.monotonic() - start)))
+        while asked := line.recv(64):
+            if asked == b"pitch?\n":
+                answers.append(round(0.2 * math.sin(len(answers) / 100), 6))
+            line.sendall(b"%.6f\n" % (answers[-1] if answers else 0.0))
 
 
 def test_a_rig_of_ones_own_is_short_and_runs_as_documented(tmp_path: Path):
     page = (ROOT / "docs" / "how-to" / "run-on-a-rig.md").read_text()
     rig, _ = re.findall(r"```python\n(.*?)```", page, re.S)
     assert len(rig[rig.index("class ") :].splitlines()) <= 40
+    words = "run --rig seesaw.py:Seesaw --plant aero2 --steps 10 --out r.csv --json"
+    answers: list[float] = []
     with socket.create_server(("localhost", 0)) as server:
         (tmp_path / "seesaw.py").write_text(rig.replace("5000", str(server.getsockname()[1])))
-        threading.Thread(target=controller, args=(server,), daemon=True).start()
-        run = shell(
-            "excite run --rig seesaw.py:Seesaw --plant aero2 --steps 10 --out r.csv", tmp_path
-        )
-    # On a busy machine its deadlines may be lost; it is a rig all the same.
-    assert run.returncode == 0 or "deadlines" in run.stdout, run.stderr
-    assert (tmp_path / "r.csv").read_text().startswith("time,voltage,pitch,clock\n")
+        threading.Thread(target=controller, args=(server, answers), daemon=True).start()
+        run = shell(f"excite {words}", tmp_path)
+    told = json.loads(run.stdout)
+    if told["trip"] == "deadlines":  # on a busy computer they are lost
+        assert run.returncode == 1
+        assert told["missed_deadlines"] > 0
+    else:
+        assert (run.returncode, told["reason"], told["num_samples"]) == (0, "complete", 10)
+    record = read_record(tmp_path / "r.csv", plant_named("aero2").description)
+    assert set(record.outputs[:, 0]) <= {0.0, *answers}
 
 
 def test_a_rigs_computer_needs_little_and_in_the_tested_versions():

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from commands import PATIENCE
 from served import MAX_GAP, served
 
 from excite.files import write_json
@@ -24,7 +25,7 @@ ARGUMENTS = [
     "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
     "--disable-background-networking", "--disable-component-update", "--disable-sync",
 ]  # fmt: skip
-WAIT = 60_000  # milliseconds; what is compiled first takes long on a busy computer
+WAIT = 1000 * PATIENCE  # milliseconds
 WIDTHS = (360, 1440)
 WATCH = """
 addEventListener("DOMContentLoaded", () => {

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import click
 import pytest
+from commands import PATIENCE
 from documentation import PAGES, ROOT, Block, anchors, blocks, links, mentions, name, parsed
 from experiments import recording
 
@@ -58,7 +59,7 @@ def test_the_commands_of_a_page_run(page: Path, tmp_path: Path):
     run = subprocess.run(
         [sys.executable, "-c", PLAYER], input="\n".join(play(page)), cwd=tmp_path,
         env={**os.environ, "PATH": f"{HERE}{os.pathsep}{os.environ['PATH']}"},
-        capture_output=True, text=True, timeout=1200, check=False,
+        capture_output=True, text=True, timeout=PATIENCE, check=False,
     )  # fmt: skip
     assert run.returncode == 0, run.stdout[-2000:] + run.stderr[-2000:]
     for file in MADE.findall("\n".join(play(page))):
@@ -73,7 +74,7 @@ def test_the_commands_of_a_page_run(page: Path, tmp_path: Path):
         [python] = re.findall(r"```python\n(.*?)```", page.read_text(), re.S)
         run = subprocess.run(
             [sys.executable, "-c", python], cwd=tmp_path,
-            capture_output=True, text=True, timeout=1200, check=False,
+            capture_output=True, text=True, timeout=PATIENCE, check=False,
         )  # fmt: skip
         assert run.returncode == 0, run.stderr
         assert "J_p" in run.stdout
@@ -87,7 +88,7 @@ def test_the_figures_of_the_pages_are_made_by_their_scripts(script: Path, tmp_pa
     copy = tmp_path / script.relative_to(ROOT)
     copy.parent.mkdir(parents=True)
     shutil.copy(script, copy)
-    subprocess.run([sys.executable, str(copy)], cwd=tmp_path, check=True, timeout=600)
+    subprocess.run([sys.executable, str(copy)], cwd=tmp_path, check=True, timeout=PATIENCE)
     made = [path for path in copy.parent.rglob("*.*") if path != copy]
     assert made
     for figure in made:
@@ -153,7 +154,7 @@ def test_the_site_builds_strictly_and_asks_nothing_of_the_network(tmp_path: Path
     run = subprocess.run(
         [sys.executable, "-m", "mkdocs", "build", "--strict", "-d", str(tmp_path)],
         cwd=ROOT, env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
-        capture_output=True, text=True, timeout=1200, check=False,
+        capture_output=True, text=True, timeout=PATIENCE, check=False,
     )  # fmt: skip
     assert run.returncode == 0, run.stderr
     for page in tmp_path.rglob("*.html"):

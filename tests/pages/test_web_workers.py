@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from commands import PATIENCE
 
 from excite.study import workers as processes
 from excite.web import workers as module
@@ -58,7 +59,7 @@ def answers(*targets: str) -> list[list[Any]]:
         workers = Workers(1, None)
         await workers.open()
         try:
-            async with asyncio.timeout(30):
+            async with asyncio.timeout(PATIENCE):
                 return [await told(workers, target) for target in targets]
         finally:
             await workers.close()
@@ -82,7 +83,7 @@ def test_what_comes_after_the_end_is_refused(program: Path):
         workers = Workers(1, None)
         await workers.open()
         await workers.close()
-        async with asyncio.timeout(5):
+        async with asyncio.timeout(PATIENCE):
             await told(workers, "good")
 
     with pytest.raises(RefusedError, match="the server has ended"):
@@ -108,7 +109,7 @@ def test_what_was_given_up_takes_no_place_in_the_queue(program: Path):
             last = asyncio.create_task(told(workers, "good"))
             await asyncio.sleep(0)
             await busy.aclose()
-            async with asyncio.timeout(30):
+            async with asyncio.timeout(PATIENCE):
                 return [event["kind"] for event in await last]
         finally:
             await workers.close()
