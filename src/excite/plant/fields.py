@@ -18,21 +18,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
-from numpy.typing import ArrayLike
 
 from ..description import unknown
 
 _Module = TypeVar("_Module", bound=eqx.Module)
 
 
-def floats(value: ArrayLike) -> Array:
+def floats(value: object) -> Array:
     """An array in double precision, also from whole numbers; what is traced stays traced."""
     if isinstance(value, jax.core.Tracer):
         return jnp.asarray(value, float)
     return jax.device_put(np.asarray(value, float))  # compiles nothing, as jnp.asarray would
 
 
-def optional_floats(value: ArrayLike | None) -> Array | None:
+def optional_floats(value: object) -> Array | None:
     """As `floats`, and None as it is; converts fields."""
     return None if value is None else floats(value)
 
