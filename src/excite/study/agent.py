@@ -5,8 +5,9 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
+from jaxtyping import PyTree
 from pydantic import Field
 
 from ..description import names_of, unknown
@@ -99,8 +100,8 @@ class AgentSettings(Settings):
 
     targets: list[str] | None = None
     method: Literal["ppo", "gradient"] = "ppo"
-    decision: dict[str, Any] = {}
-    training: dict[str, Any] = {}
+    decision: dict[str, object] = {}
+    training: dict[str, object] = {}
 
 
 @dataclass(frozen=True)
@@ -125,8 +126,8 @@ class Agent:
     def of(
         cls,
         own: AgentSettings,
-        decision: Mapping[str, Any],
-        training: Mapping[str, Any],
+        decision: Mapping[str, object],
+        training: Mapping[str, object],
         estimators: Mapping[str, EstimatorSettings],
     ) -> Agent:
         """An agent from its own settings and those it shares with others.
@@ -235,12 +236,12 @@ class Agent:
             return self.training.total_steps
         return self.training.num_updates * self.training.num_plants * num_steps
 
-    def settings(self, plant: AbstractPlant) -> dict[str, Any]:
+    def settings(self, plant: AbstractPlant) -> dict[str, object]:
         """All that decides what it becomes, defaults included, JSON-ready."""
         names = names_of(plant.definition.parameters)
         mask = target_mask(plant.definition, self.targets)
-        # What settings did not have from the first stands here only where it is used, so
-        # that seeds trained before it are still known.
+        # Settings that were added later enter only where they are used, so that the
+        # fingerprints of seeds that were trained before stay valid.
         later = {"clocks", "criterion", "max_sensitivity", "input_amplitude", "spread", "dense"}
         later |= {"constants", "terms"}
         return {
@@ -251,7 +252,9 @@ class Agent:
         }
 
 
-def _ends(plant: AbstractPlant, ranges: Mapping[str, tuple[float, float]]) -> Any:
+def _ends(
+    plant: AbstractPlant, ranges: Mapping[str, tuple[float, float]]
+) -> tuple[PyTree, PyTree] | None:
     """Lowest and highest constants of a plant; ValueError for a range that is not allowed."""
     if not ranges:
         return None
@@ -261,8 +264,8 @@ def _ends(plant: AbstractPlant, ranges: Mapping[str, tuple[float, float]]) -> An
             raise unknown("constant in constants", name, names)
         if not low <= high:
             raise ValueError(f"the range of the constant {name!r} must grow: got {low:g}, {high:g}")
-    ends = ({name: ends[i] for name, ends in ranges.items()} for i in (0, 1))
-    return tuple(plant.changed(**own).constants for own in ends)
+    low, high = ({name: ends[i] for name, ends in ranges.items()} for i in (0, 1))
+    return plant.changed(**low).constants, plant.changed(**high).constants
 
 
 def _require_one_reward(process: DecisionSettings) -> None:

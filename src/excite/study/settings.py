@@ -8,7 +8,7 @@ import math
 import re
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, TypeVar
 
 import pydantic
 from pydantic import BaseModel, ConfigDict, Field
@@ -30,7 +30,7 @@ class Choice(Settings):
     model_config = ConfigDict(extra="allow", frozen=True)
 
     @property
-    def options(self) -> dict[str, Any]:
+    def options(self) -> dict[str, object]:
         """All but the kind."""
         return dict(self.model_extra or {})
 
@@ -48,7 +48,7 @@ class EstimatorSettings(Choice):
 
 def checked(
     kind: type[_T],
-    values: Mapping[str, Any],
+    values: Mapping[str, object],
     where: str,
     tables: Mapping[str, type[BaseModel]] = MappingProxyType({}),
 ) -> _T:

@@ -6,7 +6,7 @@ import inspect
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import jax
 import pydantic
@@ -128,9 +128,9 @@ class Study(Settings):
     estimators: dict[str, EstimatorSettings]
     agents: dict[str, AgentSettings] = {}
     seeds: Count = 10
-    decision: dict[str, Any] = {}
-    training: dict[str, Any] = {}
-    gradient: dict[str, Any] = {}
+    decision: dict[str, object] = {}
+    training: dict[str, object] = {}
+    gradient: dict[str, object] = {}
     clairvoyant: ClairvoyantSettings | None = None
     lengths: list[Count] = []
     rig: RigSettings | None = None
@@ -323,7 +323,7 @@ def _beside(study: Study, folder: Path) -> Study:
     return study.changed(plant=plant, methods=methods)
 
 
-def study_from(content: Mapping[str, Any], where: str) -> Study:
+def study_from(content: Mapping[str, object], where: str) -> Study:
     """A study from its settings; ValueError, naming `where`, for what is not allowed."""
     try:
         study = Study.model_validate(content)
