@@ -1,6 +1,7 @@
 """Designed signals: better than classical ones, safe, reproducible, at least a known optimum."""
 
 import dataclasses
+import re
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,8 @@ from excite.environment import prior_sd_of, run_episodes
 from excite.excitation import Chirp, Replay
 from excite.excitation.catalogue import EXCITATIONS, LOOP
 from excite.plant import AbstractPlant, Aero2
+from excite.record import read_record
+from excite.training.design import design
 from excite.training.signals import (
     CLAIRVOYANT,
     ROBUST,
@@ -148,3 +151,44 @@ def test_every_plant_can_be_designed_for(name):
     env = signal_env(PLANTS[name], 30, 0.3)
     design = clairvoyant_signals(env, KEYS[:1], 1, dataclasses.replace(QUICK, num_updates=3))
     assert design.inputs.shape == (1, 30, len(PLANTS[name].definition.inputs))
+
+
+def test_a_design_is_saved_shown_and_played(tmp_path):
+    plant, told = Amplifier(), []
+    made = design(
+        plant, steps=12, starts=1, updates=2, noise={"y": 0.2}, seed=3,
+        progress=lambda *seen: told.append(seen),
+    )  # fmt: skip
+    assert told == [("updating 1 of 2", 1, 2), ("updating 2 of 2", 2, 2)]
+    assert made.plant.outputs[0].noise_sd == 0.2
+    assert repr(made).startswith("robust input for amplifier, 12 samples\nlog det ")
+    assert max(map(len, repr(made).splitlines())) < 80
+    made.save(tmp_path / "signal.csv")
+    with pytest.raises(ValueError, match="exists"):
+        made.save(tmp_path / "signal.csv")
+    record = read_record(tmp_path / "signal.csv", made.plant)
+    np.testing.assert_array_equal(record.inputs[:-1], made.inputs)
+    assert record.metadata["provenance"]["worth_by_start"] == list(made.worth_by_start)
+    episodes = run_episodes(plant, made.excitation, 12, 0.3, KEYS)
+    np.testing.assert_array_equal(episodes.trajectory.inputs[0], made.inputs)
+    assert made.plot().axes
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ({"kind": "chrip"}, "unknown kind of design 'chrip'; did you mean 'chirp'"),
+        ({"kind": "chirp", "updates": 3}, "a tuning has trials (--trials)"),
+        ({"kind": "chirp", "starts": 3}, "a tuning has trials (--trials)"),
+        ({"trials": 3}, "a robust design has updates (--updates)"),
+        ({"steps": 1}, "steps must be a whole number, at least 2: got 1"),
+        ({"steps": "many"}, "steps must be a whole number, at least 2: got 'many'"),
+        ({"spread": 1.0}, "spread must lie in [0, 1): got 1.0"),
+        ({"criterion": "F"}, "criterion must be D, A or E: got 'F'"),
+        ({"noise": {"yaw": 1.0}}, "unknown aero2 output 'yaw'"),
+        ({"out": "signal.txt"}, "experiment files end in .csv or .mat"),
+    ],
+)
+def test_an_argument_of_a_design_that_is_not_allowed_is_a_sentence(arguments, sentence):
+    with pytest.raises(ValueError, match=re.escape(sentence)):
+        design("aero2", **arguments)

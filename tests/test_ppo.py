@@ -266,3 +266,14 @@ def test_watching_plays_the_deterministic_policy(run):
 def test_settings_that_cannot_be_are_refused(wrong, word):
     with pytest.raises(ValueError, match=word):
         dataclasses.replace(TINY, **wrong)
+
+
+def test_torch_trains_in_one_thread_and_gets_its_threads_back():
+    before, seen = torch.get_num_threads(), []
+    torch.set_num_threads(2)
+    try:
+        train(aero2(), TINY, 0, on_boundary=lambda *_: seen.append(torch.get_num_threads()))
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+    assert set(seen) == {1}

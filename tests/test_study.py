@@ -16,7 +16,8 @@ from excite.plant import AbstractPlant, Aero2, CartPole, DCMotor
 from excite.plant.catalogue import PLANTS, plant_named, with_sensor
 from excite.policy import Layout, Policy
 from excite.study.catalogue import studies, study_path
-from excite.study.spec import Study, read_study
+from excite.study.objectives import rewards_of
+from excite.study.spec import Study, plant_tables, read_study
 
 STUDIES = Path(__file__).parent.parent / "studies"
 
@@ -761,3 +762,40 @@ def test_the_files_of_a_shipped_study_are_found_from_any_folder(tmp_path, monkey
     monkeypatch.chdir(tmp_path)
     named = read_study(study_path("frontier")).methods["robust"].excitation
     assert Path(named) == studies()["frontier"].with_name("frontier_robust.csv")
+
+
+# --------------------------------------------------- studies composed from names and objects
+
+
+def test_objectives_are_rewards_by_name_with_weights():
+    assert rewards_of("D", {}) == {"D": {"reward": "information", "criterion": "D"}}
+    both = rewards_of(["D", "log=2"], {"J_p": 0.01})
+    assert both["log"] == {"reward": "log", "goals": {"J_p": 0.01}, "weight": 2.0}
+    assert "goals" not in both["D"]
+    assert rewards_of({"D": 1, "nls": 0.5}, {})["nls"]["estimator"] == "nls"
+    for wrong, sentence in (
+        ("X", "unknown objective 'X'"),
+        (["D", "D=2"], "must differ from each other"),
+        ("log=x", "the weight of 'log' must be a number"),
+    ):
+        with pytest.raises(ValueError, match=sentence):
+            rewards_of(wrong, {})
+
+
+class Local(Aero2):
+    """A plant class of this file."""
+
+
+def test_a_study_names_a_plant_that_is_given_as_an_object():
+    noisy = with_sensor(Aero2(), {"pitch": 0.02}, {"pitch": 0.001})
+    tables, built = plant_tables(noisy)
+    assert tables == {
+        "plant": "aero2", "sensor": {"pitch": {"noise_sd": 0.02, "resolution": 0.001}}
+    }  # fmt: skip
+    assert built.description == noisy.description
+    assert plant_tables(Aero2, {"pitch": 0.5})[0]["sensor"] == {"pitch": {"noise_sd": 0.5}}
+    assert plant_tables(Local)[0]["plant"] == f"{__file__}:Local"
+    with pytest.raises(ValueError, match="differs from its class"):
+        plant_tables(Aero2(dt=0.05))
+    with pytest.raises(ValueError, match=r"save it in a file .*'plant.py:Typed'"):
+        plant_tables(type("Typed", (Aero2,), {"__module__": "nowhere"}))

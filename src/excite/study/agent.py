@@ -26,8 +26,7 @@ from ..estimation import ARX, NLS
 from ..estimation.catalogue import estimator_named
 from ..plant import AbstractARXPlant, AbstractPlant
 from ..policy import Layout
-from ..training.gradient import GradientSettings
-from ..training.settings import PPOSettings
+from ..training.settings import GradientSettings, PPOSettings
 from .settings import Count, EstimatorSettings, Positive, Settings, checked
 
 METHODS = {"ppo": PPOSettings, "gradient": GradientSettings}

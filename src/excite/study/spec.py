@@ -26,8 +26,7 @@ from ..plant import AbstractARXPlant, AbstractPlant
 from ..plant.catalogue import PLANTS, plant_named, with_sensor
 from ..policy import POLICY_ENDING
 from ..record.read import SIGNAL_ENDINGS
-from ..training.gradient import GradientSettings
-from ..training.settings import PPOSettings
+from ..training.settings import GradientSettings, PPOSettings
 from .agent import REWARD_TABLES, Agent, AgentSettings, DecisionSettings
 from .catalogue import study_path
 from .settings import Choice, Count, EstimatorSettings, Magnitude, Settings, checked, sentence
