@@ -28,7 +28,6 @@ from served import EXPERIMENT, MAX_GAP, Told, browser, served, streamed
 from starlette.requests import Request
 from starlette.testclient import TestClient
 
-from excite.cli.train import Objective
 from excite.files import write_json
 from excite.report.html import report_html
 from excite.study.objectives import OBJECTIVES
@@ -723,8 +722,6 @@ def test_a_training_never_goes_where_something_is(page: TestClient, runs: Path):
 def test_the_page_offers_what_can_be_trained_for(page: TestClient):
     select = re.findall(r'<select id="objective">(.*?)</select>', page.get("/").text)[0]
     assert tuple(re.findall(r'value="(\w+)"', select)) == tuple(OBJECTIVES)
-    for name in OBJECTIVES:
-        assert Objective().convert(name, None, None) == (name, None)
 
 
 def test_a_long_learning_curve_is_thinned(tmp_path: Path):

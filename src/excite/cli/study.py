@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -76,33 +77,46 @@ def run(study: str, out: Path | None, plot: Path | None, as_json: bool, **option
 def run_study_here(
     chosen: Study, out: Path | None, as_json: bool, plot: Path | None = None, **options: Any
 ) -> None:
-    """Runs a study and shows its table; shared with `benchmark` and `train`."""
-    from ..study.run import StudyFailedError, run_study
-
-    def finished(name: str) -> None:
-        click.echo(f"finished: {name}", err=True)
+    """Runs a study and shows its table; shared with `benchmark`."""
+    from ..study.run import run_study
 
     def waiting() -> None:
         text = f"waiting for workers of the scheduler at {options['address']}"
         click.echo(text, err=True)
 
-    told = {"on_done": finished, "on_wait": waiting, "command": command_line()}
-    try:
-        with progress_bar(chosen.name) as progress:
-            found = run_study(chosen, out, progress=progress, **told, **options)
-    except StudyFailedError as error:
-        raise RunFailedError(str(error)) from None
-    except KeyboardInterrupt:
-        if not (chosen.agents or chosen.clairvoyant):
-            raise
-        kept = f"what is finished is kept in {out}; rerun the same command to resume"
-        click.echo(f"excite: interrupted; {kept}", err=True)
-        sys.exit(130)
+    keeps = out if chosen.agents or chosen.clairvoyant else None
+    with running(chosen.name, keeps) as told:
+        found = run_study(chosen, out, on_wait=waiting, **told, **options)
     if plot is not None:
         from ..report.figure import save
 
         save(found.plot(), plot)
     show_comparison(found, out, as_json)
+
+
+@contextlib.contextmanager
+def running(name: str, keeps: Path | None) -> Iterator[dict[str, Any]]:
+    """What a running study says, as arguments of a verb; how it ends; shared with `train`.
+
+    Args:
+        keeps: folder that keeps what is finished when it is interrupted.
+    """
+    from ..study.run import StudyFailedError
+
+    def finished(task: str) -> None:
+        click.echo(f"finished: {task}", err=True)
+
+    try:
+        with progress_bar(name) as progress:
+            yield {"progress": progress, "on_done": finished, "command": command_line()}
+    except StudyFailedError as error:
+        raise RunFailedError(str(error)) from None
+    except KeyboardInterrupt:
+        if keeps is None:
+            raise
+        kept = f"what is finished is kept in {keeps}; rerun the same command to resume"
+        click.echo(f"excite: interrupted; {kept}", err=True)
+        sys.exit(130)
 
 
 def study_in(name: str) -> Study:

@@ -235,6 +235,13 @@ class Agent:
             return self.training.total_steps
         return self.training.num_updates * self.training.num_plants * num_steps
 
+    def stage(self, steps: float, num_steps: int) -> str:
+        """How far a training is after so many sampling times, in its unit."""
+        if isinstance(self.training, PPOSettings):
+            return f"step {steps:,.0f} of {self.training.total_steps:,}"
+        done = steps / (self.training.num_plants * num_steps)
+        return f"updating {done:,.0f} of {self.training.num_updates:,}"
+
     def settings(self, plant: AbstractPlant) -> dict[str, object]:
         """All that decides what it becomes, defaults included, JSON-ready."""
         names = names_of(plant.definition.parameters)

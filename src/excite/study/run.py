@@ -450,11 +450,12 @@ def _live(study: Study, target: _Target, folder: Path) -> tuple[float, str]:
     row = read_progress(place)
     if row is None:
         return 0.0, ""
-    total = study.agent(agent).total_steps(study.num_steps)
-    return (row["steps"] or 0.0) / total, _looks(agent, seed, row)
+    own, steps = study.agent(agent), row["steps"] or 0.0
+    stage = f"{agent} seed {seed}: {own.stage(steps, study.num_steps)}"
+    return steps / own.total_steps(study.num_steps), f"{stage}; {_looks(row)}"
 
 
-def _looks(agent: str, seed: int, row: Mapping[str, float | None]) -> str:
+def _looks(row: Mapping[str, float | None]) -> str:
     """What is known of the newest look; a number that is not finite is left out."""
     known = {name: value for name, value in row.items() if value is not None}
     parts = [f"return {known['return']:.3g}"] if "return" in known else []
@@ -465,4 +466,4 @@ def _looks(agent: str, seed: int, row: Mapping[str, float | None]) -> str:
     ]
     if "violation_rate" in known:
         parts.append(f"violations {100 * known['violation_rate']:.0f} %")
-    return f"{agent} seed {seed}: {', '.join(parts)}"
+    return ", ".join(parts)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from ..plant import AbstractARXPlant, AbstractPlant
@@ -33,8 +33,10 @@ def train(
     noise: Mapping[str, float] | None = None,
     episodes: int = 100,
     output_scale: Mapping[str, float] | None = None,
-    workers: int = 1,
+    workers: int | None = 1,
     progress: Progress = lambda *_: None,
+    on_done: Callable[[str], None] = lambda _: None,
+    command: str = "",
 ) -> Policy:
     """Trains a policy that excites a plant, and compares it with a chirp.
 
@@ -64,11 +66,14 @@ def train(
         noise: standard deviation by output, in its unit, where it differs from the plant's.
         episodes: experiments on which the policies are evaluated.
         output_scale: what an output is divided by before it is observed, in its unit.
-        workers: processes that train side by side.
+        workers: processes that train side by side, None for one a core.
         progress: called with a text, how much is done, and how much there is.
+        on_done: called with the name of every task that was finished.
+        command: kept in the run folder for those who want to do it again.
 
     Raises:
-        ValueError: for an argument that is not allowed, or a training that fails.
+        ValueError: for an argument that is not allowed, or a training that cannot succeed.
+        StudyFailedError: where tasks failed; what is finished is kept in `out`.
     """
     rewards = rewards_of(objective, goal or {})
     decision = {
@@ -88,7 +93,9 @@ def train(
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary if out is None else out)
         study = _compared_with_a_chirp(plant, noise, folder.absolute().name, settings, agents)
-        run_study(study, folder, workers=workers, progress=progress)
+        run_study(
+            study, folder, workers=workers, progress=progress, on_done=on_done, command=command
+        )
         ((name, seed),) = best_seeds(study, folder).items()
         return read_policy(seed_folder(folder, name, seed) / "policy.safetensors")
 
