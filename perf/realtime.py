@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from excite.policy import Policy, read_policy, shipped_policies
-from excite.rig import AbstractRig, Outcome, Pacer, PolicyPlayer, Reading, Recorder, run
+from excite.rig import AbstractRig, Outcome, Pacer, PolicyPlayer, Reading, Recorder, run_loop
 from excite.safety import Supervision, Watch, check_reading
 
 POLICY, NUM_READINGS, STEPS = "aero2", 50, 100
@@ -80,7 +80,7 @@ def loop(policy: Policy) -> Outcome:
     with tempfile.TemporaryDirectory() as folder:
         recorder = Recorder(Path(folder) / "record.csv", policy.plant, {})
         with IdleRig(policy) as rig, recorder as record:
-            return run(rig, player, rules, record)
+            return run_loop(rig, player, rules, record)
 
 
 def main() -> None:

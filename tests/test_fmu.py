@@ -22,7 +22,7 @@ from pythonfmu import FmuBuilder
 from excite.description import Input, Output, Parameter, PlantDescription, State
 from excite.plant import Aero2
 from excite.record import read_record
-from excite.rig import Recorder, RigError, SignalPlayer, run
+from excite.rig import Recorder, RigError, SignalPlayer, run_loop
 from excite.rig import fmu as fmu_module
 from excite.rig.fmu import FMURig, simulate_fmu
 from excite.safety import Supervision, Trip
@@ -82,7 +82,7 @@ def recorder(tmp_path: Path) -> Recorder:
 def played(rig: FMURig, inputs: np.ndarray, tmp_path: Path) -> Any:
     rules = Supervision.of(rig.description)
     with rig, recorder(tmp_path) as record:
-        return run(rig, SignalPlayer(inputs), rules, record)
+        return run_loop(rig, SignalPlayer(inputs), rules, record)
 
 
 # ------------------------------------------------------------ a unit is a rig like others
@@ -176,7 +176,7 @@ def test_a_trip_ends_with_the_safe_input_in_the_unit(unit: Path, tmp_path: Path)
     rig = Seen(unit, DESCRIPTION)
     rules = Supervision.of(DESCRIPTION)
     with rig, recorder(tmp_path) as record:
-        outcome = run(rig, SignalPlayer(np.full((100, 1), 24.0)), rules, record)
+        outcome = run_loop(rig, SignalPlayer(np.full((100, 1), 24.0)), rules, record)
         [reference] = [v.valueReference for v in rig._inputs]
         assert rig._unit.getReal([reference]) == [0.0]
     assert outcome.trip in (Trip.LEVEL, Trip.PREDICTED_LEVEL)

@@ -20,7 +20,7 @@ from standin.quanser import hardware as standin
 
 from excite.plant import Aero2Detailed
 from excite.record import read_record
-from excite.rig import AbstractPlayer, Recorder, RigError, SignalPlayer, quanser, run
+from excite.rig import AbstractPlayer, Recorder, RigError, SignalPlayer, quanser, run_loop
 from excite.rig.quanser import QuanserAero2
 from excite.safety import Supervision, Trip
 
@@ -79,7 +79,7 @@ def experiment(path, player, address="0") -> tuple[Any, RigError | None]:
     outcome = None
     try:
         with rig_of(address) as rig, Recorder(path, AERO, {}) as recorder:
-            outcome = run(rig, player, RULES, recorder)
+            outcome = run_loop(rig, player, RULES, recorder)
     except RigError as error:
         return outcome, error
     return outcome, None
@@ -411,14 +411,14 @@ import json, sys
 from pathlib import Path
 import numpy as np
 from excite.description import PlantDescription
-from excite.rig import Recorder, SignalPlayer, run
+from excite.rig import Recorder, SignalPlayer, run_loop
 from excite.rig.quanser import QuanserAero2
 from excite.safety import Supervision
 
 aero = PlantDescription.from_dict(json.loads(Path(sys.argv[1]).read_text()))
 with QuanserAero2(aero) as rig, Recorder(Path(sys.argv[2]), aero, {}) as recorder:
     signal = SignalPlayer(np.full((int(sys.argv[3]), 1), 2.0))
-    outcome = run(rig, signal, Supervision.of(aero), recorder)
+    outcome = run_loop(rig, signal, Supervision.of(aero), recorder)
 print(outcome.reason, sorted({"jax", "equinox"} & set(sys.modules)))
 """
 

@@ -25,9 +25,10 @@ import excite
 from excite.environment import run_episodes
 from excite.estimation import NLS, Experiments
 from excite.estimation.identify import identify
-from excite.excitation import Chirp, PolicyExcitation, Square
+from excite.excitation import Chirp, Multisine, PolicyExcitation, PositionLoop, Square
 from excite.files import csv_text
 from excite.plant import Aero2, Aero2Detailed
+from excite.plant.catalogue import with_sensor
 from excite.policy import read_policy, shipped_policies
 from excite.record import read_record
 from excite.rig import (
@@ -41,11 +42,12 @@ from excite.rig import (
     RigError,
     SignalPlayer,
     interruptible,
-    run,
+    run_loop,
 )
 from excite.rig import contract as base
+from excite.rig.excitation import ExcitationPlayer
 from excite.rig.filter import FilteredPlayer, SafetyFilter
-from excite.rig.live_estimate import Tracker
+from excite.rig.live_estimate import LiveEstimate
 from excite.rig.simulated import (
     Body,
     SimulatedRig,
@@ -56,7 +58,7 @@ from excite.rig.simulated import (
     run_batch,
 )
 from excite.safety import Supervision, Trip
-from excite.simulation import response
+from excite.simulation import response, run_episode
 
 PLANT = Aero2Detailed()
 AERO = PLANT.description
@@ -143,7 +145,7 @@ def experiment(path, rig, player=None, recorder=None, **choices) -> tuple[Any, R
     try:
         with interruptible() as stop, rig, recorder or Recorder(path, rig.description, {}) as r:
             rules = Supervision.of(rig.description)
-            outcome = run(rig, player or ScriptedPlayer(), rules, r, stop=stop, **choices)
+            outcome = run_loop(rig, player or ScriptedPlayer(), rules, r, stop=stop, **choices)
     except RigError as error:
         return outcome, error
     return outcome, None
@@ -402,7 +404,7 @@ def test_a_sidecar_that_cannot_be_written_at_the_end_is_told(tmp_path, monkeypat
     rig = ScriptedRig()
     outcome, _ = experiment(tmp_path / "a.csv", rig)
     assert outcome.reason == (
-        "complete; the record was not told: ValueError: a.json: cannot be written"
+        "complete; the end was not recorded: ValueError: a.json: cannot be written"
     )
     assert rig.log[-1] == "close"
 
@@ -498,7 +500,7 @@ def test_the_loop_and_the_batch_are_one_experiment(many, tmp_path):
         ("policy", PolicyExcitation.of(policy), lambda: PolicyPlayer(policy), 120),
         ("chirp", gentle, lambda: SignalPlayer(sequence), 80),
     ):
-        runs = run_batch(many, excitation, RULES, (num_steps, NUM_READINGS))
+        runs = run_batch(many, excitation, RULES, num_steps, NUM_READINGS)
         for i in range(20):
             path = tmp_path / f"{name}{i}.csv"
             body = jax.tree.map(lambda leaf, i=i: leaf[i], many)
@@ -561,6 +563,34 @@ def test_a_level_counts_between_samples_too():
     assert (np.asarray(runs.trip) != Trip.NONE).any()
 
 
+def test_a_position_loop_on_a_rig_is_that_of_an_episode(tmp_path):
+    """Without latency and noise, and read at sampling instants only, trajectories are equal."""
+    plant = with_sensor(IDEAL, {"pitch": 0.0}, {"pitch": 0.0})
+    loop = PositionLoop(Multisine(), amplitude=0.3, gain=9.0, damping=2.0)
+    body = Body.draw(plant, 1, 0.2, jax.random.key(4), latency=0.0, jitter=0.0)
+    key = jax.random.key(1)
+    episode = run_episode(plant, body.params, loop, 100, key)
+    player = ExcitationPlayer(loop, plant, 100, key)
+    rig = SimulatedRig(plant, body, 1, is_real_time=False)
+    outcome, _ = experiment(tmp_path / "a.csv", rig, player)
+    assert outcome.is_complete, outcome.reason
+    record = read_record(tmp_path / "a.csv", plant.description)
+    np.testing.assert_allclose(record.inputs[:-1], episode.inputs, atol=1e-10)
+    np.testing.assert_allclose(record.outputs, episode.measured, atol=1e-12)
+
+
+def test_a_played_excitation_hears_what_was_applied():
+    policy = read_policy(shipped_policies()["aero2"])
+    by_jax = ExcitationPlayer(PolicyExcitation.of(policy), IDEAL, 40, jax.random.key(0))
+    by_numpy = PolicyPlayer(policy, 40)
+    for k in range(40):
+        measured = np.array([0.3 * math.sin(0.4 * k)])
+        proposed = by_jax(k, measured)
+        np.testing.assert_allclose(proposed, by_numpy(k, measured), atol=1e-4)
+        for player in (by_jax, by_numpy):
+            player.applied(0.5 * proposed)
+
+
 def test_without_latency_the_physics_is_that_of_the_plant(tmp_path):
     body, (_, sequence) = body_of(latency=0.0, jitter=0.0), chirp(60, 6.0)
     outcome, rig = simulated(tmp_path / "a.csv", body, SignalPlayer(sequence), 60)
@@ -592,7 +622,7 @@ def test_a_record_with_latency_identifies_without_bias(tmp_path):
 
 def _check_tracker(seen, record, result):
     """Its last estimate is that of the estimator on all samples it has seen."""
-    tracker = Tracker(IDEAL, len(seen), starts_at_rest=True)
+    tracker = LiveEstimate(IDEAL, len(seen), starts_at_rest=True)
     assert tracker.latest == {}
     for sample in seen:
         tracker(sample)
@@ -652,14 +682,14 @@ def safety():
 
 
 def test_the_filter_prevents_every_violation_and_only_these(many, safety):
-    shape = (200, NUM_READINGS)
+    shape = 200, NUM_READINGS
     strong, gentle = Chirp(amplitude=12.0), Chirp(amplitude=4.0)
-    bare = run_batch(many, strong, RULES, shape)
+    bare = run_batch(many, strong, RULES, *shape)
     assert int(bare.is_violation.sum()) > 0
-    filtered = run_batch(many, strong, RULES, shape, safety, safety.start())
+    filtered = run_batch(many, strong, RULES, *shape, safety)
     assert int(filtered.is_violation.sum()) == 0
     assert int((filtered.num_interventions > 0).sum()) > 10
-    harmless = run_batch(many, gentle, RULES, shape, safety, safety.start())
+    harmless = run_batch(many, gentle, RULES, *shape, safety)
     assert int(harmless.num_interventions.sum()) == 0
     _, sequence = chirp(200, 4.0)
     np.testing.assert_allclose(harmless.inputs[3], sequence, atol=1e-9)
@@ -717,7 +747,7 @@ def test_no_plant_of_the_set_is_driven_over_the_level(slew):
     for frequency in (0.08, 0.12, 0.15, 0.2):
         bang = Square(amplitude=24.0, frequency=frequency)
         shape = 200, NUM_READINGS
-        runs = run_batch(corners, bang, rules, shape, safety, safety.start())
+        runs = run_batch(corners, bang, rules, *shape, safety)
         assert float(runs.max_abs_output.max()) < CRITICAL
         assert (np.asarray(runs.num_interventions) > 10).all()
         assert (np.asarray(runs.trip) == int(Trip.NONE)).all()
@@ -788,7 +818,7 @@ def test_a_full_disk_does_not_lose_the_reason(tmp_path, monkeypatch):
     with ScriptedRig() as rig, Recorder(path, AERO, {}) as recorder:
         monkeypatch.setattr(base, "write_bytes", full)
         before = path.with_suffix(".json").stat().st_size
-        run(rig, ScriptedPlayer(), Supervision.of(AERO), recorder)
+        run_loop(rig, ScriptedPlayer(), Supervision.of(AERO), recorder)
     assert ended(path)["reason"] == "complete"
     assert path.with_suffix(".json").stat().st_size <= before
 

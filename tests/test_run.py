@@ -1,6 +1,5 @@
 """`excite run`: exit codes, what is written and what is not, refusals, and life without JAX."""
 
-import importlib
 import json
 import os
 import subprocess
@@ -14,11 +13,14 @@ from commands import PATIENCE
 import excite
 from excite.cli import main
 from excite.estimation.identify import identify
+from excite.excitation import Chirp
 from excite.files import csv_text
 from excite.plant import Aero2, Aero2Detailed
+from excite.policy import read_policy
 from excite.record import read_record
+from excite.rig import session
+from excite.rig.live_estimate import LiveEstimate
 
-command = importlib.import_module("excite.cli.run")  # its name is the command's, too
 AERO = Aero2Detailed.definition
 TESTS = Path(__file__).parent
 
@@ -57,6 +59,12 @@ class Clinging(Still):
         raise RigError("the card does not answer")
 
 
+class Foreign(Still):
+    def __init__(self):
+        from excite.plant import DCMotor
+        self.description = DCMotor().description
+
+
 class Half(AbstractRig):
     def open(self):
         pass
@@ -67,11 +75,26 @@ class Other:
 """
 
 
+class NoEstimate(LiveEstimate):
+    """In place of the live estimate, which compiles for long."""
+
+    latest = {}
+
+    def __init__(self, *_):
+        pass
+
+    def __call__(self, sample):
+        pass
+
+    def close(self):
+        pass
+
+
 @pytest.fixture
 def call(tmp_path, capsys, monkeypatch):
     """`excite run` in this process, in an empty folder: exit code, stdout, stderr."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(command, "_tracker", lambda job, has_jax: None)  # it compiles for long
+    monkeypatch.setattr(session, "LiveEstimate", NoEstimate)
     (tmp_path / "own.py").write_text(OWN_RIG)
     inputs = 3 * np.sin(0.25 * np.arange(30))
     (tmp_path / "u.csv").write_text(csv_text({"time": 0.1 * np.arange(30), "voltage": inputs}))
@@ -167,6 +190,18 @@ REFUSALS = {
     "plant": ((*SIGNAL, *FAST, "--plant", "aero3"), "aero3"),
     "policy of another plant": ((*FAST, "--policy", "emps"), "emps"),
     "two players": ((*SIGNAL, *FAST, "--policy", "aero2-ppo-all"), "exclude each other"),
+    "policy and excitation": (
+        (*FAST, "--policy", "aero2-ppo-all", "--excitation", "chirp"), "exclude each other",
+    ),
+    "excitation": ((*FAST, "--excitation", "chrip"), "did you mean 'chirp'"),
+    "options of nothing": ((*FAST, "--set", "amplitude=1"), "--set has the options of an"),
+    "option of an excitation": (
+        (*FAST, "--excitation", "loop-multisine", "--set", "gain=-1"), "must not be negative",
+    ),
+    "excitation on another rig": (
+        ("--out", "r.csv", "--excitation", "chirp", "--rig", "own.py:Foreign"),
+        "the rig is of 'dc_motor'",
+    ),
     "fault": ((*SIGNAL, *FAST, "--fault", "wind=0.1"), "--fault wind=0.1 is not allowed"),
     "fault of no number": ((*SIGNAL, *FAST, "--fault", "latency=nan"), "is not allowed"),
     "negative fault": ((*SIGNAL, *FAST, "--fault", "dropout=-0.1"), "is not allowed"),
@@ -236,6 +271,52 @@ def test_a_filter_says_how_often_it_intervened(call):
     assert json.loads(out)["player"] == quiet
 
 
+def test_a_position_loop_is_played_recorded_and_identified(call):
+    words = ("--excitation", "loop-multisine", "--set", "amplitude=0.25,gain=12", "--seed", 5)
+    code, out, err = call(*words, *FAST, "--json")
+    assert (code, err) == (0, "")
+    told = json.loads(out)
+    assert (told["reason"], told["num_samples"]) == ("complete", 500)
+    record = read_record("r.csv", AERO)
+    provenance = record.metadata["provenance"]
+    assert provenance["played"] == "loop-multisine"
+    assert provenance["options"] == {"amplitude": 0.25, "gain": 12}
+    found = identify(Aero2Detailed(), [record])
+    for name, true in told["rig"]["true_params"].items():
+        assert abs(found.params[name] / true - 1) < 0.01
+
+
+def test_an_excitation_may_be_a_policy_or_a_file(call):
+    told = {}
+    for words in (("--excitation", "aero2-ppo-all"), ("--policy", "aero2-ppo-all")):
+        code, out, err = call(*words, *FAST, "--steps", 20, "--json", "--overwrite")
+        assert code == 0
+        assert err.startswith("warning: aero2-ppo-all: the policy was trained on 'aero2'")
+        told[words[0]] = json.loads(out)
+    assert told["--excitation"] == told["--policy"]
+    code, out, _ = call("--excitation", "u.csv", "--dry-run", "--json")
+    assert (code, json.loads(out)["num_steps"]) == (0, 29)
+
+
+def test_run_is_a_function_of_the_library(call, tmp_path):
+    seen = []
+    result = session.run(
+        excitation=Chirp(amplitude=5.0), out="r.csv", fast=True, steps=20, on_sample=seen.append
+    )
+    assert result.outcome.is_complete
+    assert [s.k for s in seen] == list(range(20))
+    np.testing.assert_array_equal(result.record.inputs[:-1, 0], [s.input[0] for s in seen])
+    shown = repr(result)
+    assert shown.startswith("aero2_detailed, ")
+    assert "ended" in shown
+    assert max(map(len, shown.splitlines())) <= 80
+    dry = session.run(dry_run=True, steps=20, policy=read_policy("aero2_detailed"))
+    assert dry.inputs.shape == (20, 1)
+    assert "nothing is sent" in repr(dry)
+    with pytest.raises(ValueError, match="always recorded"):
+        session.run(fast=True)
+
+
 # ------------------------------------------------------------------------- without JAX
 
 NOTHING_ELSE = """
@@ -291,6 +372,7 @@ def test_a_laboratory_computer_runs_without_jax(call, tmp_path, words):
 @pytest.mark.parametrize(("words", "sentence"), [
     ((*SIGNAL, "--rig", "simulated"), "need JAX, which is not installed"),
     ((*SIGNAL, "--rig", "quanser", "--filter"), "--filter needs JAX, which is not installed"),
+    (("--excitation", "chirp", "--rig", "quanser"), "--excitation needs JAX, which is not"),
 ])  # fmt: skip
 def test_what_needs_jax_says_so(call, tmp_path, words, sentence):
     done = bare(tmp_path, *words, "--out", "r.csv")

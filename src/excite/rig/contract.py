@@ -1,13 +1,9 @@
-"""What a rig is, what plays on it, and the record that grows with it; NumPy alone.
+"""The contract of a rig, and what is seen of an experiment on it; NumPy alone.
 
 A rig is opened, read, written and closed. `read` returns when the next reading is due, so
-that a rig with a clock of its own paces the loop; one without has a `Pacer`. A rig is a
-context manager that ends with the safe input and released hardware, whatever happens in
+that a rig with its own clock sets the pace of the loop; one without has a `Pacer`. A rig is
+a context manager that ends with the safe input and released hardware, whatever happens in
 between; a new rig is one class with those four methods.
-
-Every sample is on disk before the next. The sidecar of a record is written before its
-first sample, without an end, and again at the end; a process that is killed leaves a
-record of all samples so far that can be read like any other.
 """
 
 from __future__ import annotations
@@ -15,8 +11,9 @@ from __future__ import annotations
 import abc
 import contextlib
 import time
-from dataclasses import dataclass
-from typing import Any, NamedTuple, Self
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -40,21 +37,34 @@ class Reading(NamedTuple):
     outputs: np.ndarray
 
 
+class Interval(NamedTuple):
+    """An estimate and half the width of its 95 % confidence interval."""
+
+    estimate: float
+    ci95_half: float
+
+
 @dataclass(frozen=True)
 class Sample:
-    """What a live view and a live estimate see of one sampling instant.
+    """What is shown of one sampling instant while the experiment runs.
 
     Attributes:
-        k: its index.
+        description: of the plant.
+        num_steps: sampling instants of the whole experiment.
+        k: index of this one.
         time: since the first [s].
         measured: outputs.
         input: held until the next.
+        live_estimate: of the parameters by name, from the samples so far; empty at first.
     """
 
+    description: PlantDescription
+    num_steps: int
     k: int
     time: float
     measured: np.ndarray
     input: np.ndarray
+    live_estimate: Mapping[str, Interval] = field(default_factory=dict)
 
 
 class AbstractRig(abc.ABC):
@@ -62,11 +72,11 @@ class AbstractRig(abc.ABC):
 
     Attributes:
         description: of the plant: units, limits, levels, sampling time.
-        num_readings: readings in one sampling time, at least 1; the supervisor looks at each.
-        num_latency: readings from a write to its action, less than `num_readings`. A record
-            holds the reading at the action, so that its inputs change when it says.
-        is_real_time: whether its time is that of the wall.
-        starts_at_rest: whether the plant is at its initial state when the rig is open.
+        num_readings: readings in one sampling time, at least 1; the supervisor checks each.
+        num_latency: readings between writing an input and its effect, less than
+            `num_readings`. The record holds the reading at which the input takes effect.
+        is_real_time: whether readings come in real time.
+        starts_at_rest: whether the plant is at its initial state when the rig is opened.
     """
 
     description: PlantDescription
@@ -77,10 +87,10 @@ class AbstractRig(abc.ABC):
 
     @abc.abstractmethod
     def open(self) -> None:
-        """Takes the hardware and makes it ready, its input zero.
+        """Connects to the hardware and prepares it, with zero input.
 
         Raises:
-            RigError: where that is not possible.
+            RigError: if that is not possible.
         """
 
     @abc.abstractmethod
@@ -89,23 +99,23 @@ class AbstractRig(abc.ABC):
 
     @abc.abstractmethod
     def write(self, input: np.ndarray) -> None:
-        """Applies an input, in the plant's units, until the next."""
+        """Applies an input, in the plant's units, until the next one."""
 
     @abc.abstractmethod
     def close(self) -> None:
-        """Releases the hardware; called once after `open`, also one that failed half way."""
+        """Releases the hardware; called once after `open`, even if that failed."""
 
     @property
     def safe_input(self) -> np.ndarray:
-        """What is applied when an experiment ends: zero, or the limit nearest to it."""
+        """Input applied when an experiment ends: zero, or the nearest limit."""
         return safe_input(self.description)
 
-    def facts(self) -> dict[str, Any]:
-        """What a record should say of the rig, JSON-ready; after the end of an experiment."""
+    def facts(self) -> Mapping[str, object]:
+        """What the record says about the rig, JSON-ready; asked after the experiment."""
         return {}
 
     def __enter__(self) -> Self:
-        """Opens the rig; one that fails to open is closed."""
+        """Opens the rig; closes it if that fails."""
         try:
             self.open()
         except BaseException:
@@ -115,7 +125,7 @@ class AbstractRig(abc.ABC):
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Ends with the safe input and releases the hardware, the second even without the first."""
+        """Applies the safe input, and releases the hardware even if that fails."""
         try:
             self.write(self.safe_input)
         finally:
@@ -123,7 +133,7 @@ class AbstractRig(abc.ABC):
 
 
 class Pacer:
-    """Waits for instants that lie one interval apart, by the monotonic clock."""
+    """Waits for instants one interval apart, by the monotonic clock."""
 
     def __init__(self, interval: float) -> None:
         """`interval` in seconds."""
@@ -132,12 +142,12 @@ class Pacer:
         self._count = -1
 
     def wait(self) -> float:
-        """Returns at the next instant, or at once where it is over; the time since the first."""
+        """Returns at the next instant, or at once if it has passed: time since the first [s]."""
         self._count += 1
         if self._count == 0:
             self._start = time.perf_counter()
         due = self._count * self.interval
         while (left := self._start + due - time.perf_counter()) > 0:
-            # A sleep ends late by up to a tenth of a millisecond: the last part is waited awake.
+            # A sleep ends up to 0.1 ms late: the last part is waited without sleeping.
             time.sleep(left - 2e-4 if left > 4e-4 else 0)
         return time.perf_counter() - self._start

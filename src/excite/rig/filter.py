@@ -1,21 +1,22 @@
 """A predictive safety filter: the smallest change of an input that keeps every plant safe.
 
-An input may pass if, after it, one known feedback brings every plant of a set, the corners
-of the prior and its middle, to rest without reaching the limit (K. Wabersich, M. Zeilinger,
-A predictive safety filter for learning-based control, Automatica 2021, with a fixed backup
-law). Otherwise it is moved towards what that feedback would do, as little as is enough.
-Every plant of the set follows the experiment with an observer of its own; the feedback,
-which cannot know which of them is the true one, takes the mean of what they ask for.
+An input passes if a known feedback law can afterwards bring every plant of a set (the
+corners of the prior and its centre) to rest without reaching a critical level
+(K. Wabersich, M. Zeilinger, A predictive safety filter for learning-based control,
+Automatica 2021, with a fixed backup law). Otherwise it is moved towards the input of that
+feedback law, as little as necessary. Each plant of the set has an observer that follows
+the experiment. The feedback uses the mean of the observed states, as the true plant is not
+known.
 
-Feedback and observers are linear-quadratic, from a linearisation over the typical size of
-each state: a derivative at rest would see nothing but a dead zone.
+Feedback and observers are linear-quadratic, from secants over the typical size of each
+state: a derivative at rest would be zero in a dead zone.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from typing import Any
+from collections.abc import Callable, Mapping
 
 import equinox as eqx
 import jax
@@ -30,16 +31,16 @@ from ..simulation import step
 from .player import AbstractPlayer
 
 MAX_CORNERS = 16
-"""Of the prior's box; beyond, as many are drawn at random."""
+"""Largest number of corners of the prior; with more, this number is drawn at random."""
 
 
 class Memory(eqx.Module):
-    """What a filter remembers of an experiment.
+    """State of a filter during an experiment.
 
     Attributes:
-        states: of the plants of its set, as their observers see them.
-        input: that it let through last.
-        num_unsafe: samples at which no input was safe for all plants.
+        states: estimated state of each plant of the set.
+        input: last input that was let through.
+        num_unsafe: number of samples at which no input was safe for all plants.
     """
 
     states: Float[Array, "plant state"]
@@ -73,34 +74,34 @@ class SafetyFilter(eqx.Module):
     num_candidates: int = eqx.field(static=True, default=3)
 
     @classmethod
-    def of(
-        cls, plant: AbstractPlant, spread: float, slew: float = math.inf, **choices: Any
-    ) -> SafetyFilter:
+    def of(cls, plant: AbstractPlant, spread: float, slew: float = math.inf) -> SafetyFilter:
         """A filter for parameters within ± `spread` times their scale.
 
         Args:
+            plant: as identification knows it.
+            spread: of the prior.
             slew: largest change of every input in one second, in its unit.
 
         Raises:
-            ValueError: for a plant that the backup law cannot hold.
+            ValueError: for a plant that linear feedback cannot bring to rest.
         """
         feedback, observer = _linear_quadratic(plant)
         rest = jnp.asarray(safe_input(plant.definition))
         change = jnp.full(len(rest), slew * float(plant.dt))
-        return cls(plant, _corners(plant, spread), feedback, observer, rest, change, **choices)
+        return cls(plant, _corners(plant, spread), feedback, observer, rest, change)
 
     def start(self) -> Memory:
-        """Before the experiment: all at rest."""
+        """Memory before the experiment: all plants at rest."""
         states = jnp.tile(self.plant.initial_state, (len(self.params[0]), 1))
         return Memory(states, self.rest, jnp.asarray(0))
 
     def __call__(
         self, memory: Memory, measured: Float[Array, " output"], proposed: Float[Array, " input"]
     ) -> tuple[Memory, Float[Array, " input"], Bool[Array, ""]]:
-        """Memory before the next sample, the input to apply, and whether it is another.
+        """Memory before the next sample, the input to apply, and whether it was changed.
 
-        An input that is not finite passes as it is: it is the supervisor's, who then ends the
-        experiment and says why. So does one that no observer can tell any more.
+        An input that is NaN or infinite passes unchanged: the supervisor then ends the
+        experiment and records why.
         """
         states = jax.vmap(self._corrected, (0, 0, None))(memory.states, self.params, measured)
         wanted = self._within(proposed, memory.input)
@@ -127,7 +128,7 @@ class SafetyFilter(eqx.Module):
         return state + self.observer @ jnp.where(jnp.isfinite(error), error, 0.0)
 
     def _backup(self, states: Array) -> Array:
-        """What the feedback asks for, in the mean over the plants."""
+        """Input of the feedback law, for the mean of the plants' states."""
         away = jnp.mean(states, axis=0) - self.plant.initial_state
         return self.rest - self.feedback @ away
 
@@ -150,7 +151,7 @@ class SafetyFilter(eqx.Module):
 
 
 def _corners(plant: AbstractPlant, spread: float) -> Params:
-    """The prior's middle and corners, leading axis the plant."""
+    """Centre and corners of the prior; the leading axis is the plant."""
     middle = np.array([float(value) for value in plant.nominal])
     reach = spread * np.array([p.scale for p in plant.definition.parameters])
     if 2 ** len(reach) > MAX_CORNERS:
@@ -170,7 +171,7 @@ def _linear_quadratic(plant: AbstractPlant) -> tuple[Array, Array]:
         np.array([i.amplitude for i in d.inputs]),
     )
 
-    def secant(response: Any, sizes: np.ndarray) -> np.ndarray:
+    def secant(response: Callable[[np.ndarray], Array], sizes: np.ndarray) -> np.ndarray:
         moves = [np.eye(len(sizes))[i] * size for i, size in enumerate(sizes)]
         columns = [
             (response(m) - response(-m)) / (2 * s) for m, s in zip(moves, sizes, strict=True)
@@ -193,9 +194,7 @@ def _linear_quadratic(plant: AbstractPlant) -> tuple[Array, Array]:
         )
         S = scipy.linalg.solve_discrete_are(A.T, C.T, Q, R)
     except (np.linalg.LinAlgError, ValueError) as error:
-        raise ValueError(
-            f"plant {d.name!r} has no linear feedback that could bring it to rest ({error})"
-        ) from None
+        raise ValueError(f"no linear feedback brings plant {d.name!r} to rest ({error})") from None
     feedback = np.linalg.solve(np.diag(inputs**-2.0) + B.T @ P @ B, B.T @ P @ A)
     observer = S @ C.T @ np.linalg.inv(C @ S @ C.T + R)
     return jnp.asarray(feedback), jnp.asarray(observer)
@@ -205,7 +204,7 @@ _filtered = eqx.filter_jit(SafetyFilter.__call__)
 
 
 class FilteredPlayer(AbstractPlayer):
-    """A player whose inputs pass through a safety filter."""
+    """A player behind a safety filter."""
 
     def __init__(self, player: AbstractPlayer, filter: SafetyFilter) -> None:
         """Compiles the filter."""
@@ -225,15 +224,17 @@ class FilteredPlayer(AbstractPlayer):
         return np.array(input)
 
     def applied(self, input: np.ndarray) -> None:
-        """Tells the player."""
+        """Passes it on to the player."""
         self._player.applied(input)
 
-    def origin(self) -> dict[str, Any]:
-        """The player's."""
+    def origin(self) -> Mapping[str, object]:
+        """As of the player without filter."""
         return self._player.origin()
 
-    def facts(self) -> dict[str, Any]:
-        """The player's, how often the filter intervened, and how often nothing was safe."""
-        own = {"filter_interventions": self.num_interventions}
-        own["filter_without_safe_input"] = int(self._memory.num_unsafe)
-        return {**self._player.facts(), **own}
+    def facts(self) -> Mapping[str, object]:
+        """Also how often the filter intervened, and at how many samples no input was safe."""
+        return {
+            **self._player.facts(),
+            "filter_interventions": self.num_interventions,
+            "filter_without_safe_input": int(self._memory.num_unsafe),
+        }

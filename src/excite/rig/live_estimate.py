@@ -1,8 +1,8 @@
-"""The estimate while an experiment runs: least squares on all samples so far, again and again.
+"""Parameter estimates while an experiment runs: least squares on all samples so far.
 
-A fit takes a part of a second, so it runs in a thread beside the loop, on the samples there
-were when it began; the next begins when it is done. It is the estimator that `identify`
-uses, not a recursive approximation of it.
+A fit takes a fraction of a second. It runs in a thread beside the loop, on the samples
+available when it starts; the next one starts when it is done. The estimator is the one that
+`identify` uses, not a recursive approximation.
 """
 
 from __future__ import annotations
@@ -17,29 +17,32 @@ import numpy as np
 from ..description import HALF_95, names_of
 from ..estimation import NLS, Estimate, Experiments, Status
 from ..plant import AbstractPlant
-from .contract import Sample
+from .contract import Interval, Sample
 
 _FIRST = 40  # samples before the first fit, the shortest horizon of the estimator
 
 
-class Tracker:
-    """Estimates of one experiment under way."""
+class LiveEstimate:
+    """Estimates during one experiment."""
 
     def __init__(self, plant: AbstractPlant, num_steps: int, starts_at_rest: bool) -> None:
-        """Compiles the estimator, which takes seconds, before the experiment begins.
+        """Compiles the estimator, which takes seconds: before the experiment.
 
         Args:
-            starts_at_rest: whether the initial state is the plant's, or to be estimated.
+            plant: whose parameters are estimated.
+            num_steps: length of the experiment.
+            starts_at_rest: whether the initial state is the plant's; otherwise it is
+                estimated too.
         """
         self._plant, self._starts_at_rest, self._count = plant, starts_at_rest, 0
         self._inputs = np.zeros((num_steps, len(plant.definition.inputs)))
         self._measured = np.zeros((num_steps + 1, len(plant.definition.outputs)))
         self._pool, self._fit = ThreadPoolExecutor(1), Future[Estimate]()
         self._fit.set_result(self._estimate(0))
-        self._latest: dict[str, tuple[float, float]] = {}
+        self._latest: dict[str, Interval] = {}
 
     def __call__(self, sample: Sample) -> None:
-        """One more sample."""
+        """Takes one more sample, and starts the next fit if none is running."""
         self._inputs[sample.k], self._measured[sample.k] = sample.input, sample.measured
         self._count = sample.k + 1
         if self._fit.done():
@@ -48,12 +51,12 @@ class Tracker:
                 self._fit = self._pool.submit(self._estimate, self._count)
 
     @property
-    def latest(self) -> Mapping[str, tuple[float, float]]:
-        """Estimate and half of its 95 % interval by parameter; empty before there is one."""
+    def latest(self) -> Mapping[str, Interval]:
+        """Estimate and 95 % interval by parameter; empty before the first fit."""
         return self._latest
 
     def close(self) -> None:
-        """Waits for the fit under way; the last estimate is that from all samples."""
+        """Waits for the running fit, then estimates from all samples."""
         self._pool.shutdown()
         self._keep(self._fit.result())
         if self._count >= _FIRST:
@@ -64,7 +67,7 @@ class Tracker:
             half = HALF_95 * np.sqrt(np.diag(np.asarray(estimate.covariance)))
             names = names_of(self._plant.definition.parameters)
             values = zip(map(float, estimate.params), map(float, half), strict=True)
-            self._latest = dict(zip(names, values, strict=True))
+            self._latest = {n: Interval(*v) for n, v in zip(names, values, strict=True)}
 
     def _estimate(self, count: int) -> Estimate:
         """The estimate from the first `count` samples."""
@@ -76,5 +79,5 @@ class Tracker:
             initial_state=self._plant.initial_state[None],
             initial_state_known=self._starts_at_rest,
         )
-        # Otherwise whoever looks at it waits for it, and that is the loop.
+        # Without this the loop would wait for the result when it looks at it.
         return jax.block_until_ready(NLS()(self._plant, experiments))

@@ -1,10 +1,10 @@
 """The real-time loop: one experiment on a rig, supervised and recorded; NumPy alone.
 
-At every sampling instant: read, look at the reading, ask the player, limit what it wants,
-apply it, record the sample. In between, every further reading of the rig is looked at. An
-experiment ends by itself, by a trip of the supervisor, by a signal, or by an error of the
-player, the rig or the disk. Each of these ends in the safe input, released hardware (the
-rig is a context manager), a readable record, and a reason in it.
+At every sampling instant: read, check the reading, ask the player for an input, limit it,
+apply it, record the sample. Every reading in between is checked too. An experiment ends
+when it is complete, by a trip of the supervisor, by a signal (Ctrl-C), or by an error of
+the player, the rig or the disk. In each case the safe input is applied, the hardware is
+released (the rig is a context manager), and the record is readable and says the reason.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from __future__ import annotations
 import contextlib
 import json
 import signal
+import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -27,24 +27,25 @@ from .player import AbstractPlayer
 from .recorder import Recorder
 
 COMPLETE = "complete"
+_PERCENTILES = (50, 90, 99, 100)
 
-# Measurements that a record must not hold as if the plant had shown them.
+# After these trips the last reading is not a measurement of the plant, and is not recorded.
 _FALSE_MEASUREMENTS = (Trip.NOT_FINITE, Trip.JUMP)
 
 
 @dataclass
 class Outcome:
-    """How an experiment went.
+    """How an experiment ended.
 
     Attributes:
-        reason: why it ended: "complete", a trip's sentence, a signal, or an error's sentence.
-        trip: the supervisor's reason, by name in lower case; none where it did not trip.
-        num_samples: sampling instants that were played.
-        max_abs_output: largest magnitude of every reading, by output.
-        late: how late each reading came [s]; empty where time is not the wall's.
-        num_missed: readings that came later than one whole interval.
-        error: what went wrong, for a traceback.
-        rig, player: what they say of themselves.
+        reason: "complete", or one sentence: a trip, a signal or an error.
+        trip: why the supervisor ended it; `Trip.NONE` if it did not.
+        num_samples: sampling instants played.
+        max_abs_output: largest magnitude of each output over all readings, in its unit.
+        late: delay of each reading [s]; empty if the rig does not run in real time.
+        num_missed: readings that were late by more than one interval.
+        error: the exception behind `reason`, if any.
+        rig, player: facts about the rig and the player, JSON-ready.
     """
 
     reason: str = COMPLETE
@@ -54,53 +55,61 @@ class Outcome:
     late: list[float] = field(default_factory=list)
     num_missed: int = 0
     error: BaseException | None = None
-    rig: dict[str, Any] = field(default_factory=dict)
-    player: dict[str, Any] = field(default_factory=dict)
+    rig: Mapping[str, object] = field(default_factory=dict)
+    player: Mapping[str, object] = field(default_factory=dict)
 
     @property
     def is_complete(self) -> bool:
         """Whether the whole experiment was played."""
         return self.reason == COMPLETE
 
-    def to_dict(self) -> dict[str, Any]:
-        """The outcome as JSON-ready data."""
-        late = np.array(self.late) * 1000
-        points = (50, 90, 99, 100)
-        spread = (
-            dict(zip(map(str, points), np.percentile(late, points), strict=True))
-            if self.late
-            else None
-        )
+    @property
+    def late_ms_percentiles(self) -> dict[str, float] | None:
+        """Delay of the readings [ms], by percentile; None if the rig is not in real time."""
+        if not self.late:
+            return None
+        late = np.percentile(np.array(self.late) * 1000, _PERCENTILES)
+        return dict(zip(map(str, _PERCENTILES), late, strict=True))
+
+    def to_dict(self) -> dict[str, object]:
+        """The outcome as JSON-ready data, as in a record's sidecar under `ended`."""
         return {
             "reason": self.reason,
             "trip": self.trip.name.lower(),
             "num_samples": self.num_samples,
             "max_abs_output": self.max_abs_output.tolist(),
-            "late_ms_percentiles": spread,
+            "late_ms_percentiles": self.late_ms_percentiles,
             "missed_deadlines": self.num_missed,
             "rig": self.rig,
             "player": self.player,
         }
 
     def failed(self, what: str, error: BaseException) -> None:
-        """Adds what went wrong after the experiment's end."""
+        """Adds an error that came after the experiment's end."""
         self.reason += f"; {what}: {_sentence(error)}"
         self.error = self.error or error
 
 
 class Stop:
-    """Asked to end: by a signal, of which it holds the name."""
+    """A request to end the experiment.
+
+    Attributes:
+        reason: one sentence; empty without a request.
+    """
 
     reason = ""
 
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[Stop]:
-    """Signals end an experiment at its next reading; a second one at once.
+    """Signals (Ctrl-C, a closed terminal) end the experiment at its next reading.
 
-    Also the one that a terminal sends when it is closed.
+    A second signal interrupts at once. Outside the main thread signals are left as they are.
     """
     stop, before = Stop(), {}
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
 
     def ask(number: int, _: object) -> None:
         if stop.reason:
@@ -119,7 +128,7 @@ def interruptible() -> Iterator[Stop]:
 
 @dataclass
 class _Run:
-    """An experiment under way, from its first reading on."""
+    """An experiment from its first reading on."""
 
     rig: AbstractRig
     rules: Supervision
@@ -137,7 +146,7 @@ class _Run:
     def begin(
         cls, rig: AbstractRig, rules: Supervision, outcome: Outcome, stop: Stop, num_steps: int
     ) -> _Run:
-        """At the first reading."""
+        """Takes the first reading."""
         if not 0 <= rig.num_latency < rig.num_readings:
             raise RigError(
                 f"the rig's latency of {rig.num_latency} readings must be less than the "
@@ -151,7 +160,7 @@ class _Run:
 
     @property
     def is_over(self) -> bool:
-        """Whether a trip or a signal ended it."""
+        """Whether a trip or a signal has ended it."""
         return bool(self.watch.trip != Trip.NONE or self.stop.reason)
 
     @property
@@ -160,7 +169,7 @@ class _Run:
         return self.last.time - self.first.time
 
     def look(self, reading: Reading) -> None:
-        """What the supervisor sees in a reading, and in when it came."""
+        """Checks a reading, and the time at which it came."""
         expected = self.rules.critical.shape
         if np.shape(reading.outputs) != expected:
             raise RigError(
@@ -170,7 +179,7 @@ class _Run:
         elapsed = reading.time - self.last.time
         self.watch = check_reading(np, self.rules, self.watch, reading.outputs, elapsed)
         self.last = reading
-        if self.num_readings and not elapsed > 0:  # the same reading once more
+        if self.num_readings and not elapsed > 0:  # the same reading again
             self.trip(Trip.STALE)
         size = np.nan_to_num(np.abs(reading.outputs), posinf=0.0)
         self.outcome.max_abs_output = np.maximum(self.outcome.max_abs_output, size)
@@ -179,7 +188,7 @@ class _Run:
         self.num_readings += 1
 
     def lateness(self) -> float:
-        """How long the next reading has been due [s]."""
+        """Time since the next reading was due [s]."""
         interval = self.rules.dt / self.rig.num_readings
         return time.perf_counter() - self.start - self.num_readings * interval
 
@@ -192,12 +201,12 @@ class _Run:
         self.outcome.late.append(late)
         self.num_late = self.num_late + 1 if late > interval else 0
         self.outcome.num_missed += late > interval
-        # A whole sample late, or late in a row for as long as one: the plan no longer holds.
+        # A whole sample late, or late for a whole sample's readings in a row.
         if late > self.rules.dt or self.num_late > max(self.rig.num_readings, 2):
             self.trip(Trip.DEADLINES)
 
     def look_at_player(self) -> None:
-        """Whether an input comes so late that it was meant for another state."""
+        """Trips where the player took so long that its input is outdated."""
         if self.rig.is_real_time and self.lateness() > self.rules.dt:
             self.trip(Trip.DEADLINES)
 
@@ -208,18 +217,22 @@ class _Run:
         k: int,
         input: np.ndarray,
     ) -> None:
-        """The sample whose input begins to act now; not what the plant has not shown."""
+        """Records the sample whose input takes effect now, unless its reading is false."""
         if recorder.num_samples == k and self.watch.trip not in _FALSE_MEASUREMENTS:
             recorder.append(input, self.last.outputs, self.last.time)
             if k < self.num_steps:
-                on_sample(Sample(k, self.time, self.last.outputs, input))
+                on_sample(self._sample(k, input))
+
+    def _sample(self, k: int, input: np.ndarray) -> Sample:
+        description = self.rig.description
+        return Sample(description, self.num_steps, k, self.time, self.last.outputs, input)
 
     def trip(self, trip: Trip) -> None:
-        """Ends the experiment for a reason that is not in the outputs."""
+        """Ends the experiment for a reason other than the outputs."""
         self.watch = tripped(np, self.watch, np.True_, trip)
 
     def ended(self) -> None:
-        """Writes the reason of an early end into the outcome."""
+        """Writes the reason for an early end into the outcome."""
         self.outcome.trip = Trip(int(self.watch.trip))
         if self.outcome.trip != Trip.NONE:
             shown = ", ".join(map(_shown, self.rig.description.outputs, self.last.outputs))
@@ -233,7 +246,7 @@ def _shown(output: Output, value: float) -> str:
     return f"{output.name} {factor * value:.4g} {unit}"
 
 
-def run(
+def run_loop(
     rig: AbstractRig,
     player: AbstractPlayer,
     rules: Supervision,
@@ -244,12 +257,15 @@ def run(
 ) -> Outcome:
     """One experiment on an open rig, from its first reading to the safe input.
 
-    Args:
-        recorder: open, too; its sidecar is told how the experiment ended.
-        stop: asks it to end.
-        on_sample: called after the input of every sampling instant was applied.
+    Nothing is raised when an experiment ends early: the outcome says why.
 
-    Nothing is raised for what ends an experiment early: the outcome says it.
+    Args:
+        rig: open.
+        player: proposes the inputs.
+        rules: of the supervisor.
+        recorder: open; its sidecar says how the experiment ended.
+        stop: a request to end.
+        on_sample: called at every sampling instant, after the input was applied.
     """
     outcome = Outcome(max_abs_output=np.zeros(len(rules.critical)))
     try:
@@ -265,13 +281,13 @@ def run(
     outcome.rig, outcome.player = _facts(rig), _facts(player)
     try:
         recorder.end(outcome.to_dict())
-    except (Exception, KeyboardInterrupt) as error:  # so does a full disk
-        outcome.failed("the record was not told", error)
+    except (Exception, KeyboardInterrupt) as error:  # a full disk, for example
+        outcome.failed("the end was not recorded", error)
     return outcome
 
 
-def _facts(part: AbstractRig | AbstractPlayer) -> dict[str, Any]:
-    """What it says of itself, or why it cannot: not even that may lose a record's end."""
+def _facts(part: AbstractRig | AbstractPlayer) -> Mapping[str, object]:
+    """Its facts, or the error in asking for them, which must not lose the record's end."""
     try:
         return json.loads(json_text(part.facts()))
     except (Exception, KeyboardInterrupt) as error:
@@ -284,7 +300,7 @@ def _play(
     recorder: Recorder,
     on_sample: Callable[[Sample], None],
 ) -> None:
-    """Sampling instants until the experiment is over, and the measurement at its end."""
+    """Plays the sampling instants, and takes the measurement at the end."""
     rig, latency = run.rig, run.rig.num_latency
     for k in range(player.num_steps + 1):
         run.watch = check_sample(np, run.rules, run.watch)
@@ -309,7 +325,7 @@ def _play(
 
 
 def _sentence(error: BaseException) -> str:
-    """An error in words; the type where it has none of its own, or is no sentence of ours."""
+    """An error as a sentence; with its type, unless the message is meant for users."""
     if isinstance(error, RigError | OSError):
         return str(error)
     if isinstance(error, KeyboardInterrupt):

@@ -1,12 +1,15 @@
-"""What plays on a rig, sample by sample: a signal or a policy, with NumPy alone."""
+"""What proposes the inputs of an experiment on a rig, sample by sample; NumPy alone.
+
+A signal or a policy is played with NumPy. Any other excitation (`excite.excitation`) is
+played by `rig.excitation`, which needs JAX.
+"""
 
 from __future__ import annotations
 
 import abc
 import math
 import time
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -14,28 +17,28 @@ from ..policy import Policy, empty_window, respond, with_input
 
 
 class AbstractPlayer(abc.ABC):
-    """What proposes the inputs of an experiment.
+    """What proposes the inputs of one experiment: an excitation before its first sample.
 
     Attributes:
-        num_steps: for how many sampling instants.
+        num_steps: number of sampling instants.
     """
 
     num_steps: int
 
     @abc.abstractmethod
     def __call__(self, k: int, measured: np.ndarray) -> np.ndarray:
-        """The input proposed at sampling instant k."""
+        """Proposed input at sampling instant k, in the plant's units."""
 
     def applied(self, input: np.ndarray) -> None:
-        """Called with the input that was applied in its place."""
+        """Told the input that was applied, after limits and supervision."""
         del input
 
-    def origin(self) -> dict[str, Any]:
-        """Where its inputs come from, JSON-ready; before the experiment."""
+    def origin(self) -> Mapping[str, object]:
+        """Where the inputs come from, JSON-ready; asked before the experiment."""
         return {}
 
-    def facts(self) -> dict[str, Any]:
-        """What a record should say of it, JSON-ready; after the end of an experiment."""
+    def facts(self) -> Mapping[str, object]:
+        """What the record says about the player, JSON-ready; asked after the experiment."""
         return {}
 
 
@@ -43,7 +46,7 @@ class SignalPlayer(AbstractPlayer):
     """A signal known beforehand."""
 
     def __init__(self, inputs: np.ndarray) -> None:
-        """`inputs` by time and input, in the plant's units."""
+        """`inputs` has shape [time, input], in the plant's units."""
         self._inputs, self.num_steps = np.asarray(inputs, float), len(inputs)
 
     def __call__(self, k: int, measured: np.ndarray) -> np.ndarray:
@@ -53,13 +56,13 @@ class SignalPlayer(AbstractPlayer):
 
 
 class PolicyPlayer(AbstractPlayer):
-    """A learned policy, as in training but for the inputs in its window: those applied."""
+    """A learned policy; the inputs in its window are those that were applied."""
 
-    def __init__(self, policy: Policy) -> None:
-        """A policy before its experiment."""
+    def __init__(self, policy: Policy, num_steps: int | None = None) -> None:
+        """A policy before its first sample; by default for all steps that it was made for."""
         self._policy, self._layout = policy, policy.layout
         self._window = empty_window(np, policy.layout)
-        self.num_steps = policy.layout.num_steps
+        self.num_steps = num_steps or policy.layout.num_steps
 
     def __call__(self, k: int, measured: np.ndarray) -> np.ndarray:
         """The network's input for the window that ends with this measurement."""
@@ -75,13 +78,13 @@ class PolicyPlayer(AbstractPlayer):
         """The window remembers what was applied."""
         self._window = with_input(np, self._layout, self._window, input)
 
-    def origin(self) -> dict[str, Any]:
+    def origin(self) -> Mapping[str, object]:
         """The policy's hash."""
         return {"policy_hash": self._policy.hash}
 
 
 def step_seconds(make: Callable[[], AbstractPlayer], num_outputs: int) -> float:
-    """99th percentile of the time that one step of a player takes, of 200 dry ones [s]."""
+    """99th percentile of the time of one step of a player [s], from 200 steps without a rig."""
     player, took = make(), []
     for k in range(min(200, player.num_steps)):
         start = time.perf_counter()

@@ -1,15 +1,14 @@
 """A simulated rig that behaves like a real one: detailed plant, latency, jitter, dropouts.
 
 `Body` is the physics between two readings, a pure function. `SimulatedRig` steps it in
-real time, or as fast as it can, behind the contract of a rig; `run_batch` steps thousands
-side by side, with the same supervisor's rules, and goes on after a trip to see whether the
-safe input was enough. The true parameters are told only at the end.
+real time, or as fast as it can, behind the contract of a rig. `run_batch` steps thousands
+in parallel with the same rules of the supervisor, and continues after a trip, to see
+whether the safe input was enough. The true parameters are shown only at the end.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Mapping
 
 import equinox as eqx
 import jax
@@ -33,6 +32,7 @@ from ..safety import (
 )
 from ..simulation import Trajectory, measure, step
 from .contract import AbstractRig, Pacer, Reading
+from .filter import SafetyFilter
 
 
 class BodyState(eqx.Module):
@@ -40,11 +40,11 @@ class BodyState(eqx.Module):
 
     Attributes:
         plant_state: true state.
-        acting: input that acts.
+        acting: input that acts now.
         written: input that was written last.
-        delay: time until it acts [s].
+        delay: time until that one acts [s].
         shown: last reading.
-        n: readings so far.
+        n: number of readings so far.
         largest: largest magnitude of each true output.
     """
 
@@ -58,7 +58,7 @@ class BodyState(eqx.Module):
 
 
 class Body(eqx.Module):
-    """What a simulated rig is made of.
+    """Plant, parameters and faults of a simulated rig.
 
     Attributes:
         plant: with the interval between two readings as its dt.
@@ -90,15 +90,18 @@ class Body(eqx.Module):
         Args:
             plant: sampled as experiments are.
             num_readings: in one sampling time.
-            numbers: `latency`, `jitter`, `dropout`, where they are not the usual ones.
+            spread: of the parameters, as a fraction of their scales.
+            key: of the parameters, and of noise, jitter and dropouts.
+            numbers: `latency`, `jitter`, `dropout`; by default a tenth of dt, a thousandth
+                of dt, and zero.
         """
-        params_key, own = jax.random.split(key)
+        params_key, rig_key = jax.random.split(key)
         dt = float(plant.dt)
         usual = {"latency": dt / 10, "jitter": dt / 1000, "dropout": 0.0} | numbers
         return cls(
             plant=at_interval(plant, num_readings),
             params=draw_params(plant, params_key, spread),
-            key=own,
+            key=rig_key,
             **{name: jnp.asarray(value, float) for name, value in usual.items()},
         )
 
@@ -112,13 +115,13 @@ class Body(eqx.Module):
         return BodyState(plant.initial_state, rest, rest, now, shown, first, jnp.abs(output))
 
     def write(self, state: BodyState, input: Float[Array, " input"]) -> BodyState:
-        """An input on its way: it acts after latency and jitter."""
+        """State after an input was written; it acts after latency and jitter."""
         late = jax.random.uniform(jax.random.fold_in(self.key, -1 - state.n), (), float, -1, 1)
         delay = jnp.maximum(self.latency + self.jitter * late, 0.0)
         return eqx.tree_at(lambda s: (s.written, s.delay), state, (input, delay))
 
     def advance(self, state: BodyState) -> BodyState:
-        """One interval on, to the next reading."""
+        """State one interval later, at the next reading."""
         interval = self.plant.dt
         before = jnp.clip(state.delay, 0.0, interval)  # how long the earlier input still acts
         middle = self._moved(state.plant_state, state.acting, before)
@@ -160,10 +163,16 @@ class SimulatedRig(AbstractRig):
     def __init__(
         self, plant: AbstractPlant, body: Body, num_readings: int, is_real_time: bool
     ) -> None:
-        """A rig of a plant; `body` is its physics between readings.
+        """A rig of a plant.
+
+        Args:
+            plant: sampled as experiments are.
+            body: the physics between readings.
+            num_readings: in one sampling time.
+            is_real_time: whether readings come in real time.
 
         Raises:
-            ValueError: for an input that would not act before the next one.
+            ValueError: if an input would not act before the next one is written.
         """
         self.description = plant.description
         self.num_readings, self.is_real_time = num_readings, is_real_time
@@ -176,7 +185,7 @@ class SimulatedRig(AbstractRig):
         self._body, self._interval = body, float(plant.dt) / num_readings
 
     def open(self) -> None:
-        """At rest; compiles what a reading needs, so that the first is not late."""
+        """Starts at rest; compiles what a reading needs, so that the first is not late."""
         self._state = self._body.start()
         state, safe = self._state, jnp.asarray(self.safe_input)
         for _ in range(2):  # a state that has moved is of another type to the compiler
@@ -199,7 +208,7 @@ class SimulatedRig(AbstractRig):
     def close(self) -> None:
         """Nothing to release."""
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> Mapping[str, object]:
         """What was hidden: true parameters, largest true outputs."""
         names = names_of(self.description.parameters)
         return {
@@ -229,14 +238,21 @@ class Runs(eqx.Module):
     measured: Float[Array, "*run sample output"]
 
 
-Filter = Callable[[Any, Array, Array], tuple[Any, Array, Array]]
-"""From memory, measurement and proposed input to memory, input, and whether it changed it."""
+class NoFilter(eqx.Module):
+    """Lets every input pass, in place of a safety filter."""
+
+    def start(self) -> None:
+        """Nothing to remember."""
+
+    def __call__(
+        self, memory: None, measured: Float[Array, " output"], proposed: Float[Array, " input"]
+    ) -> tuple[None, Float[Array, " input"], Bool[Array, ""]]:
+        """The input as it is."""
+        del measured
+        return memory, proposed, jnp.asarray(False)
 
 
-def no_filter(memory: Any, measured: Array, proposed: Array) -> tuple[Any, Array, Array]:
-    """Lets every input pass."""
-    del measured
-    return memory, proposed, jnp.asarray(False)
+NO_FILTER = NoFilter()
 
 
 @eqx.filter_jit
@@ -244,31 +260,35 @@ def run_batch(
     bodies: Body,
     excitation: AbstractExcitation,
     rules: Supervision,
-    shape: tuple[int, int],
-    filter: Filter = no_filter,
-    memory: Any = None,
+    num_steps: int,
+    num_readings: int,
+    safety_filter: SafetyFilter | NoFilter = NO_FILTER,
 ) -> Runs:
     """One experiment on every body, as the real-time loop would run it.
 
     Args:
         bodies: their leading axis is the run.
-        excitation: the player.
-        shape: number of sampling instants, and of readings between two.
-        filter: a safety filter.
-        memory: what the filter remembers at the beginning.
+        excitation: proposes the inputs.
+        rules: of the supervisor.
+        num_steps: number of sampling instants.
+        num_readings: in one sampling time.
+        safety_filter: between excitation and supervisor.
     """
-    return jax.vmap(lambda body: _one_run(body, excitation, rules, shape, (filter, memory)))(bodies)
+
+    def one(body: Body) -> Runs:
+        return _one_run(body, excitation, rules, num_steps, num_readings, safety_filter)
+
+    return jax.vmap(one)(bodies)
 
 
 def _one_run(
     body: Body,
     excitation: AbstractExcitation,
     rules: Supervision,
-    shape: tuple[int, int],
-    filtering: tuple[Filter, Any],
+    num_steps: int,
+    num_readings: int,
+    safety_filter: SafetyFilter | NoFilter,
 ) -> Runs:
-    num_steps, num_readings = shape
-    filter, memory = filtering
     interval = rules.dt / num_readings
     latency = jnp.round(body.latency / interval).astype(int)
 
@@ -294,7 +314,7 @@ def _one_run(
         measured = watch.reading
         watch = check_sample(jnp, rules, watch)
         player, proposed = excitation(player, measured)
-        memory, proposed, is_changed = filter(memory, measured, proposed)
+        memory, proposed, is_changed = safety_filter(memory, measured, proposed)
         watch, input = allowed(jnp, rules, watch, proposed)
         player = excitation.applied(player, input)
         (state, watch), acted_on = hold(state, watch, input)
@@ -305,7 +325,7 @@ def _one_run(
     plant = eqx.tree_at(lambda p: p.dt, body.plant, jnp.asarray(rules.dt))
     player = excitation.init(plant, num_steps, body.key)
     watch = Watch.start(jnp, rules, state.shown)
-    carry = state, watch, player, memory, jnp.asarray(0)
+    carry = state, watch, player, safety_filter.start(), jnp.asarray(0)
     (state, watch, *_, count), (inputs, measured) = jax.lax.scan(
         sample, carry, None, length=num_steps
     )
@@ -323,39 +343,44 @@ def bodies(
     keys: Key[Array, " run"],
     **numbers: float,
 ) -> Body:
-    """One body a key, with the same plant as in `excite.evaluation`; see `Body.draw`."""
+    """One body for each key, with the same plant as in `run_episodes`; see `Body.draw`."""
     return eqx.filter_vmap(lambda key: Body.draw(plant, num_readings, spread, key, **numbers))(keys)
 
 
 def readings_per_sample(plant: AbstractPlant) -> int:
-    """How often a simulated rig is read in one sampling time: 500 times a second."""
+    """Readings of a simulated rig in one sampling time, at 500 Hz."""
     return max(1, round(500 * float(plant.dt)))
 
 
 def evaluate_on_rig(
     plant: AbstractPlant,
     excitation: AbstractExcitation,
-    many: Body,
+    bodies: Body,
     rules: Supervision,
     num_steps: int,
-    *filtering: Any,
+    safety_filter: SafetyFilter | NoFilter = NO_FILTER,
 ) -> tuple[Episodes, Runs]:
-    """One experiment on every body, scored as `excite.evaluation` scores those on plants.
+    """One experiment on every body, scored as `run_episodes` scores those on plants.
 
-    What follows from the record (information, estimates) is that of a whole experiment, also
-    where a trip ended it; a level counts as reached at any reading.
+    Information and estimates are those of the whole experiment, also after a trip. A
+    critical level counts as reached at any reading.
 
     Args:
-        many: made by `bodies`.
-        filtering: a safety filter and its memory, where there is one; see `run_batch`.
+        plant: as identification knows it.
+        excitation: proposes the inputs.
+        bodies: their leading axis is the run, see `bodies`.
+        rules: of the supervisor.
+        num_steps: number of sampling instants.
+        safety_filter: between excitation and supervisor.
     """
-    runs = run_batch(many, excitation, rules, (num_steps, readings_per_sample(plant)), *filtering)
-    return _scored(plant, many.params, runs), runs
+    num_readings = readings_per_sample(plant)
+    runs = run_batch(bodies, excitation, rules, num_steps, num_readings, safety_filter)
+    return _scored(plant, bodies.params, runs), runs
 
 
 @eqx.filter_jit
 def _scored(plant: AbstractPlant, params: Params, runs: Runs) -> Episodes:
-    """Every run as an experiment; its safety is that of all readings, not of samples alone."""
+    """Every run as an experiment; its safety is that of all readings, not only of samples."""
 
     def score(params: Params, run: Runs) -> Episodes:
         time = jnp.arange(len(run.measured)) * plant.dt

@@ -83,7 +83,7 @@ def player_of(study: Study, plant: AbstractPlant) -> Play:
         episodes, runs = evaluate_on_rig(*on_rig)
         seen = {"trips": runs.trip != int(Trip.NONE)}
         if safety is not None:
-            _, runs = evaluate_on_rig(*on_rig, safety, safety.start())
+            _, runs = evaluate_on_rig(*on_rig, safety)
             seen["filtered_violations"] = runs.is_violation
             seen["filtered_trips"] = runs.trip != int(Trip.NONE)
             seen["interventions"] = runs.num_interventions

@@ -1,0 +1,488 @@
+"""`run`: one experiment on a rig, from names or objects to its record.
+
+Where JAX is installed, any excitation can be played, an estimate runs beside the experiment,
+and a safety filter can be added. A laboratory computer without JAX plays policies and signals
+with NumPy alone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+
+from .. import __version__
+from ..description import PlantDescription, display_unit
+from ..policy import Policy, mismatch, policy_path, read_policy, shipped_policies
+from ..record import Record, read_record, read_signal, require_record_path
+from ..record.read import SIGNAL_ENDINGS
+from ..report.tables import text_table
+from ..safety import Supervision, Watch, allowed
+from .catalogue import HAS_JAX, RigOptions, rig_named
+from .contract import AbstractRig, Interval, Sample
+from .loop import Outcome, interruptible, run_loop
+from .player import AbstractPlayer, PolicyPlayer, SignalPlayer, step_seconds
+from .recorder import Recorder
+
+if TYPE_CHECKING or HAS_JAX:
+    import jax
+    from jaxtyping import PRNGKeyArray
+
+    from ..excitation import AbstractExcitation
+    from ..excitation.catalogue import excitation_and_origin
+    from ..plant import AbstractPlant
+    from ..plant.catalogue import plant_named
+    from .excitation import ExcitationPlayer
+    from .filter import FilteredPlayer, SafetyFilter
+    from .live_estimate import LiveEstimate
+
+DEFAULT_POLICY = "aero2_detailed"
+"""Of the simulated and the Quanser rig; also the name of their plant."""
+
+DEFAULT_STEPS = 500
+"""Length of an experiment with an excitation that has no length."""
+
+_BUDGET = 0.25  # fraction of a sampling time that one step of a player may take
+
+OnSample: TypeAlias = Callable[[Sample], None]
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """One experiment on a rig.
+
+    Attributes:
+        description: of the plant.
+        played: name of the policy, signal or excitation.
+        outcome: how the experiment ended.
+        path: of the record.
+        live_estimate: of the parameters by name, from all samples; empty without JAX, for a
+            plant that is not the rig's, or where no fit succeeded.
+        warnings: sentences about what was played.
+    """
+
+    description: PlantDescription
+    played: str
+    outcome: Outcome
+    path: Path
+    live_estimate: Mapping[str, Interval] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def record(self) -> Record:
+        """The record, read from its file."""
+        return read_record(self.path, self.description)
+
+    def to_dict(self) -> dict[str, object]:
+        """The result as JSON-ready data, as `excite run --json` prints it."""
+        live = {name: interval._asdict() for name, interval in self.live_estimate.items()}
+        return {"file": str(self.path), "live_estimate": live, **self.outcome.to_dict()}
+
+    @property
+    def title(self) -> str:
+        """Plant and what was played on it."""
+        return f"{self.description.name}, {self.played}"
+
+    def rows(self) -> list[list[str]]:
+        """Rows of the table that `excite run` prints: name and value."""
+        outcome = self.outcome
+        rows = [["ended", outcome.reason], ["samples", str(outcome.num_samples)]]
+        for output, largest in zip(self.description.outputs, outcome.max_abs_output, strict=True):
+            unit, factor = display_unit(output.unit)
+            level = output.critical_level
+            limit = "" if level is None else f" (critical level {factor * level:g})"
+            rows.append([f"largest |{output.name}|", f"{factor * largest:.4g} {unit}{limit}"])
+        if late := outcome.late_ms_percentiles:
+            shown = ", ".join(f"{p} %: {v:.3g}" for p, v in late.items())
+            rows.append(["readings late, ms", f"{shown}; {outcome.num_missed} deadlines missed"])
+        if (changed := outcome.player.get("filter_interventions")) is not None:
+            unsafe = outcome.player["filter_without_safe_input"]
+            told = f"; at {unsafe} samples no input was safe for every plant" if unsafe else ""
+            rows.append(["filter interventions", f"{changed}{told}"])
+        true = outcome.rig.get("true_params")
+        for name, (value, half) in self.live_estimate.items():
+            told = f"; true {true[name]:.5g}" if isinstance(true, Mapping) and name in true else ""
+            rows.append([f"{name}, live estimate", f"{value:.5g} ± {half:.2g}{told}"])
+        return rows
+
+    def __repr__(self) -> str:
+        """The table that `excite run` prints."""
+        return text_table(self.title, ["", ""], self.rows()) + f"\nrecord: {self.path}"
+
+
+@dataclass(frozen=True)
+class DryRun:
+    """The inputs that would be sent to a plant that stays at rest.
+
+    Attributes:
+        description: of the plant.
+        played: name of the policy, signal or excitation.
+        inputs: shape [time, input], in the plant's units.
+        warnings: sentences about what was played.
+    """
+
+    description: PlantDescription
+    played: str
+    inputs: np.ndarray
+    warnings: tuple[str, ...] = ()
+
+    def to_dict(self) -> dict[str, object]:
+        """The result as JSON-ready data, as `excite run --dry-run --json` prints it."""
+        inputs = {
+            i.name: {
+                "first": u[:5].tolist(),
+                "smallest": float(u.min()),
+                "largest": float(u.max()),
+                "rms": float(np.sqrt(np.mean(u**2))),
+            }
+            for i, u in zip(self.description.inputs, self.inputs.T, strict=True)
+        }
+        dt, num_steps = self.description.dt, len(self.inputs)
+        return {"played": self.played, "num_steps": num_steps, "dt": dt, "inputs": inputs}
+
+    @property
+    def title(self) -> str:
+        """What this is."""
+        return (
+            f"{self.played}: {len(self.inputs)} samples of {self.description.dt:g} s; nothing is "
+            "sent.\nA policy or a loop answers to measurements; these are its inputs for a plant "
+            "at rest."
+        )
+
+    header = ("input", "smallest", "largest", "rms", "first")
+
+    def rows(self) -> list[list[str]]:
+        """Rows of the table that `excite run --dry-run` prints: one an input."""
+        return [
+            [i.name, *(f"{x:.4g}" for x in (u.min(), u.max(), np.sqrt(np.mean(u**2)))),
+             ", ".join(f"{x:.3g}" for x in u[:5])]
+            for i, u in zip(self.description.inputs, self.inputs.T, strict=True)
+        ]  # fmt: skip
+
+    def __repr__(self) -> str:
+        """The table that `excite run --dry-run` prints."""
+        return text_table(self.title, self.header, self.rows())
+
+
+def run(
+    rig: str | AbstractRig = "simulated",
+    policy: str | Path | Policy | None = None,
+    *,
+    plant: str | AbstractPlant | None = None,
+    signal: str | Path | None = None,
+    excitation: str | AbstractExcitation | None = None,
+    options: Mapping[str, object] | None = None,
+    out: str | Path | None = None,
+    overwrite: bool = False,
+    steps: int | None = None,
+    slew: float = math.inf,
+    filter: bool = False,
+    address: str = "0",
+    fast: bool = False,
+    dry_run: bool = False,
+    seed: int = 0,
+    spread: float = 0.3,
+    fault: Mapping[str, float] | None = None,
+    on_sample: OnSample = lambda _: None,
+    on_warning: Callable[[str], None] = lambda _: None,
+) -> RunResult | DryRun:
+    """One experiment on a rig: supervised, recorded as it happens, ended by the safe input.
+
+    Of `policy`, `signal` and `excitation` one can be given. Without any, the policy with the
+    plant's name is played.
+
+    Args:
+        rig: "simulated", "quanser", "FILE.fmu", "path/to/file.py:ClassName", or a rig.
+        policy: a shipped policy's name, a file, or a policy.
+        plant: name or object, where JAX is installed; by default `aero2_detailed`.
+        signal: file of a designed input (.csv, .mat).
+        excitation: name ("chirp", "loop-multisine", ...) or object; needs JAX.
+        options: of an excitation given by name: amplitude, frequencies and so on.
+        out: file of the record (.csv); only a dry run does without.
+        overwrite: replaces an existing record.
+        steps: number of samples; by default all of a policy or signal, else 500.
+        slew: largest change of an input in one second, in its unit.
+        filter: adds a predictive safety filter for parameters within ± `spread`.
+        address: board identifier of the Quanser rig.
+        fast: runs a simulated rig or an FMU as fast as it can, not in real time.
+        dry_run: computes the inputs for a plant at rest; nothing is sent or written.
+        seed: of a simulated rig's hidden parameters, noise and jitter, and of random signals.
+        spread: of these parameters and of the filter's prior, as a fraction of their scales.
+        fault: latency [s], jitter [s] and dropout (probability) of a simulated rig.
+        on_sample: called with every sample, after its input was applied.
+        on_warning: called with a sentence, before the experiment, where the policy was trained
+            on another plant.
+
+    Returns:
+        How it ended, with the path of the record; for a dry run, its inputs. An experiment
+        that ends early is no error: see `RunResult.outcome`.
+
+    Raises:
+        ValueError: one sentence for what does not exist, does not fit together, needs JAX, or
+            is too slow for the sampling time.
+        RigError: for a rig that cannot be opened.
+
+    Example:
+        >>> from excite.rig.session import run
+        >>> run(excitation="loop-multisine", fast=True, dry_run=True, steps=100)  # doctest: +SKIP
+    """
+    path = None if out is None else Path(out)
+    if path is not None:
+        require_record_path(path, overwrite)
+    elif not dry_run:
+        raise ValueError("--out FILE.csv is missing: an experiment is always recorded")
+    source = _source(policy, signal, excitation, options or {}, plant)
+    known = _plant(plant, rig)
+    rig_options = RigOptions(address, fast, seed, spread, fault or {})
+    if isinstance(rig, str):
+        description = known.description if known is not None else _described(source.policy)
+        opened = rig_named(rig, known, description, rig_options)
+    else:
+        opened = rig
+    description = opened.description
+    if known is not None and not _fits(known.description, description):
+        if plant is not None or filter or source.excitation is not None:
+            raise ValueError(
+                f"the rig is of {description.name!r}, with other inputs, outputs, levels or "
+                f"another sampling time than the plant {known.description.name!r}: --plant, "
+                "--excitation and --filter need the rig's plant"
+            )
+        known = None
+    warnings = tuple(source.warnings(description))
+    for warning in warnings:
+        on_warning(warning)
+    make = source.maker(description, known, steps, seed)
+    safety_filter = SafetyFilter.of(_required(known, "--filter"), spread, slew) if filter else None
+
+    def make_player() -> AbstractPlayer:
+        bare = make()
+        return bare if safety_filter is None else FilteredPlayer(bare, safety_filter)
+
+    rules = Supervision.of(description, slew)
+    session = _Session(opened, known, source.name, make_player, rules)
+    if path is None or dry_run:
+        return DryRun(description, source.name, session.dry_run(), warnings)
+    asked = {
+        "rig": rig if isinstance(rig, str) else type(rig).__name__,
+        "address": address,
+        "slew": slew,
+        "filtered": filter,
+        "spread": spread,
+        "seed": seed,
+        "fault": [dict(fault)] if fault else [],
+        **({"options": dict(options)} if options else {}),
+    }
+    outcome, live = session.run(path, overwrite, asked, on_sample)
+    return RunResult(description, source.name, outcome, path, live, warnings)
+
+
+@dataclass(frozen=True)
+class _Source:
+    """What is played: one of a policy, a file of inputs, and an excitation."""
+
+    name: str
+    policy: Policy | None = None
+    signal: Path | None = None
+    excitation: str | AbstractExcitation | None = None
+    options: Mapping[str, object] = field(default_factory=dict)
+
+    def warnings(self, plant: PlantDescription) -> list[str]:
+        """Sentences about a policy of another plant; ValueError where it cannot be played."""
+        if self.policy is None:
+            return []
+        try:
+            warning = mismatch(self.policy, plant)
+        except ValueError as error:
+            raise ValueError(f"{self.name}: {error}") from None
+        return [] if warning is None else [f"{self.name}: {warning}"]
+
+    def maker(
+        self,
+        description: PlantDescription,
+        plant: AbstractPlant | None,
+        steps: int | None,
+        seed: int,
+    ) -> Callable[[], AbstractPlayer]:
+        """A function that makes a player before its first sample."""
+        if self.policy is not None:
+            longest = self.policy.layout.num_steps
+            make = functools.partial(PolicyPlayer, self.policy, steps)
+        elif self.signal is not None:
+            inputs = read_signal(self.signal, description).inputs[:-1]
+            longest, make = len(inputs), functools.partial(SignalPlayer, inputs[:steps])
+        else:
+            plant, steps = _required(plant, "--excitation"), steps or DEFAULT_STEPS
+            return functools.partial(ExcitationPlayer, self._built(plant), plant, steps, _key(seed))
+        if steps is not None and steps > longest:
+            raise ValueError(f"{self.name} was made for {longest} steps; --steps asks for {steps}")
+        return make
+
+    def _built(self, plant: AbstractPlant) -> AbstractExcitation:
+        if isinstance(self.excitation, AbstractExcitation):
+            return self.excitation
+        return excitation_and_origin(str(self.excitation), self.options, plant)[0]
+
+
+def _key(seed: int) -> PRNGKeyArray:
+    """Not the key of a simulated rig, whose parameters are drawn from the seed itself."""
+    return jax.random.fold_in(jax.random.key(seed), 1)
+
+
+def _required(plant: AbstractPlant | None, option: str) -> AbstractPlant:
+    if plant is None:
+        raise ValueError(f"{option} needs JAX, which is not installed")
+    return plant
+
+
+def _source(
+    policy: str | Path | Policy | None,
+    signal: str | Path | None,
+    excitation: str | AbstractExcitation | None,
+    options: Mapping[str, object],
+    plant: str | AbstractPlant | None,
+) -> _Source:
+    """What is to be played; by default the policy with the plant's name."""
+    if sum(given is not None for given in (policy, signal, excitation)) > 1:
+        raise ValueError("--policy, --input and --excitation exclude each other: give one of them")
+    if isinstance(excitation, str):
+        if policy_path(excitation) is not None:
+            policy = excitation
+        elif excitation.endswith(SIGNAL_ENDINGS):
+            signal = excitation
+    if options and (policy or signal or not isinstance(excitation, str)):
+        raise ValueError("--set has the options of an --excitation such as chirp or loop-multisine")
+    if signal is not None:
+        return _Source(str(signal), signal=Path(signal))
+    if excitation is not None and policy is None:
+        name = excitation if isinstance(excitation, str) else type(excitation).__name__
+        return _Source(name, excitation=excitation, options=options)
+    if isinstance(policy, Policy):
+        return _Source(f"policy {policy.hash[:8]}", policy)
+    name = policy or plant or DEFAULT_POLICY
+    if not isinstance(name, str | Path):
+        name = name.definition.name
+    path = policy_path(str(name))
+    if path is None:
+        known = ", ".join(shipped_policies())
+        raise ValueError(f"no policy {str(name)!r} (there is {known}, path/to/policy.safetensors)")
+    return _Source(str(name), read_policy(path))
+
+
+def _plant(plant: str | AbstractPlant | None, rig: str | AbstractRig) -> AbstractPlant | None:
+    """The plant; None without JAX."""
+    if HAS_JAX:
+        return (
+            plant_named(plant or DEFAULT_POLICY) if not isinstance(plant, AbstractPlant) else plant
+        )
+    if plant is not None or rig == "simulated":
+        raise ValueError("--plant and a simulated rig need JAX, which is not installed")
+    return None
+
+
+def _described(policy: Policy | None) -> PlantDescription:
+    """Without JAX a plant is known from a policy: the one to be played, or a shipped one."""
+    return (policy or read_policy(shipped_policies()[DEFAULT_POLICY])).plant
+
+
+def _fits(plant: PlantDescription, rig: PlantDescription) -> bool:
+    """Whether excitation, filter and live estimate for the plant can be used on the rig."""
+
+    def seen(d: PlantDescription) -> tuple[object, ...]:
+        inputs = [(i.name, i.lower, i.upper) for i in d.inputs]
+        return d.dt, inputs, [(o.name, o.critical_level) for o in d.outputs]
+
+    return seen(plant) == seen(rig)
+
+
+class _Session:
+    """A rig, and a player before its first sample."""
+
+    def __init__(
+        self,
+        rig: AbstractRig,
+        plant: AbstractPlant | None,
+        played: str,
+        make_player: Callable[[], AbstractPlayer],
+        rules: Supervision,
+    ) -> None:
+        self._rig, self._plant, self._played = rig, plant, played
+        self._make_player, self._player, self._rules = make_player, make_player(), rules
+
+    def dry_run(self) -> np.ndarray:
+        """Inputs [time, input] for a plant that stays at rest."""
+        rest = np.zeros(len(self._rig.description.outputs))
+        inputs, watch = [], Watch.start(np, self._rules, rest)
+        for k in range(self._player.num_steps):
+            watch, input = allowed(np, self._rules, watch, self._player(k, rest))
+            self._player.applied(input)
+            inputs.append(input)
+        return np.array(inputs)
+
+    def run(
+        self, path: Path, overwrite: bool, asked: Mapping[str, object], on_sample: OnSample
+    ) -> tuple[Outcome, Mapping[str, Interval]]:
+        """The experiment: how it ended, and the estimate from all its samples."""
+        self._check_latency()
+        live = self._live_estimate()
+
+        def show(sample: Sample) -> None:
+            if live is not None:
+                live(sample)
+                sample = replace(sample, live_estimate=live.latest)
+            on_sample(sample)
+
+        rig, outcome = self._rig, None
+        recorder = Recorder(path, rig.description, self._metadata(asked), overwrite)
+        try:
+            with interruptible() as stop, rig, recorder as record:
+                outcome = run_loop(
+                    rig, self._player, self._rules, record, stop=stop, on_sample=show
+                )
+        except (Exception, KeyboardInterrupt) as error:
+            if outcome is None:
+                raise
+            outcome.failed("the rig was not released", error)
+            with contextlib.suppress(OSError, ValueError):
+                recorder.end(outcome.to_dict())
+        finally:
+            # The record is complete: an error of the live estimate does not change the outcome.
+            with contextlib.suppress(Exception, KeyboardInterrupt):
+                if live is not None:
+                    live.close()
+        return outcome, {} if live is None else live.latest
+
+    def _live_estimate(self) -> LiveEstimate | None:
+        if self._plant is None:
+            return None
+        return LiveEstimate(self._plant, self._player.num_steps, self._rig.starts_at_rest)
+
+    def _metadata(self, asked: Mapping[str, object]) -> dict[str, object]:
+        """What the sidecar says before the experiment."""
+        return {
+            "starts_at_initial_state": self._rig.starts_at_rest,
+            "provenance": {
+                "excite": __version__,
+                "numpy": np.__version__,
+                "played": self._played,
+                **self._player.origin(),
+                **asked,
+                "num_readings": self._rig.num_readings,
+                "num_latency": self._rig.num_latency,
+            },
+        }
+
+    def _check_latency(self) -> None:
+        """Raises ValueError where a step of the player is too slow for the sampling time."""
+        d = self._rig.description
+        took, budget = step_seconds(self._make_player, len(d.outputs)), _BUDGET * d.dt
+        if self._rig.is_real_time and took > budget:
+            raise ValueError(
+                f"a step of {self._played} takes {1000 * took:.2g} ms; at a sampling time of "
+                f"{1000 * d.dt:g} ms it may take {1000 * budget:.2g} ms"
+            )
