@@ -78,7 +78,7 @@ class Other:
 class NoEstimate(LiveEstimate):
     """In place of the live estimate, which compiles for long."""
 
-    latest = {}
+    latest = property(lambda _: {})
 
     def __init__(self, *_):
         pass
@@ -186,7 +186,7 @@ REFUSALS = {
     "record of another kind": ((*SIGNAL, "--out", "r.mat"), "line by line"),
     "record in no folder": ((*SIGNAL, "--out", "no/r.csv"), "does not exist"),
     "rig": ((*SIGNAL, *FAST, "--rig", "lego"), "unknown rig 'lego'"),
-    "policy": ((*FAST, "--policy", "best"), "no policy 'best' (there is aero2"),
+    "policy": ((*FAST, "--policy", "best"), "unknown policy 'best'"),
     "plant": ((*SIGNAL, *FAST, "--plant", "aero3"), "aero3"),
     "policy of another plant": ((*FAST, "--policy", "emps"), "emps"),
     "two players": ((*SIGNAL, *FAST, "--policy", "aero2-ppo-all"), "exclude each other"),

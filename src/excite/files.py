@@ -256,7 +256,7 @@ def tensors_to_bytes(
 
 
 def _split(content: bytes) -> tuple[bytes, bytes]:
-    """Header and tensors of a sound safetensors file."""
+    """Header and tensors of a valid safetensors file."""
     end = _NUM_HEADER_BYTES + int.from_bytes(content[:_NUM_HEADER_BYTES], "little")
     return content[_NUM_HEADER_BYTES:end], content[end:]
 

@@ -1,13 +1,13 @@
 """Warning and critical level of an output, and a supervisor's rules, over arrays.
 
 The functions are pure and use only what NumPy and JAX arrays share (`xp` is the module of
-array functions), so that a batch of thousands of simulated runs and a loop in real time
-are judged by the same lines. A level of infinity is a level not watched. Axis 0 of one
-episode is time, axis 1 output; JAX maps over episodes with `vmap`, NumPy by broadcasting.
+array functions): a batch of thousands of simulated runs and a loop in real time are judged
+by the same code. A level of infinity means no level. Axis 0 of one episode is time, axis 1
+output; JAX maps over episodes with `vmap`, NumPy by broadcasting.
 
-The supervisor is independent of the excitation. `check_reading` looks at every reading,
-`check_sample` at those of sampling instants, `allowed` at every input. The first reason to
-trip is latched, and from then on the safe input is all that is allowed.
+The supervisor is independent of the excitation. `check_reading` checks every reading,
+`check_sample` those at sampling instants, `allowed` every input. After the first reason to
+trip only the safe input is allowed.
 """
 
 from __future__ import annotations
@@ -15,14 +15,13 @@ from __future__ import annotations
 import enum
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeAlias
+from types import ModuleType
+from typing import NamedTuple
 
 import numpy as np
 
 from .description import PlantDescription
-
-AnyArray: TypeAlias = Any
-"""A NumPy or a JAX array."""
+from .policy import AnyArray
 
 
 def critical_levels(description: PlantDescription) -> np.ndarray:
@@ -88,13 +87,13 @@ def is_violation(outputs: AnyArray, levels: AnyArray) -> AnyArray:
         outputs: true (noise-free) outputs, time and output the last two axes.
         levels: critical level of each output.
 
-    A value that is not a number counts: a run that cannot be computed is not a safe run.
+    NaN counts as a violation: a run that cannot be computed is not a safe run.
     """
     return ~(max_abs_output(outputs) < levels).all(axis=-1)
 
 
 class Trip(enum.IntEnum):
-    """Why an experiment was ended; none while it runs."""
+    """Why the supervisor ended an experiment."""
 
     NONE = 0
     LEVEL = 1
@@ -108,7 +107,7 @@ class Trip(enum.IntEnum):
 
     @property
     def sentence(self) -> str:
-        """What happened, in words."""
+        """What happened, as a sentence."""
         return _TRIPS[self]
 
 
@@ -125,9 +124,9 @@ _TRIPS = {
 }
 
 
-@dataclass(frozen=True, eq=False)  # a compiled batch knows it by identity
+@dataclass(frozen=True, eq=False)  # hashable: a static argument of compiled functions
 class Supervision:
-    """What a supervisor allows; arrays are by input or output, in their units.
+    """Rules of a supervisor; arrays are by input or output, in their units.
 
     Attributes:
         dt: sampling time [s].
@@ -135,11 +134,11 @@ class Supervision:
         slew: largest change of an input in one dt; infinite for any.
         safe_input: what is applied after a trip.
         critical: critical levels.
-        resolution: smallest change of a reading that is more than the sensor's.
-        fastest: plausible change of an output in one second.
-        driven: distance of an input from the safe one that must move the plant.
-        num_still: samples for which a reading may stand still when the plant just moved.
-        num_dead: and when it was driven all the time.
+        resolution: smallest change of a reading that is not the sensor's noise or step.
+        fastest: largest plausible change of an output in one second.
+        driven: an input further than this from the safe one must move the plant.
+        num_still: samples for which a reading may be constant after the plant moved.
+        num_dead: samples for which a reading may be constant while the plant is driven.
     """
 
     dt: float
@@ -184,16 +183,16 @@ class Supervision:
 
 
 class Watch(NamedTuple):
-    """What a supervisor remembers.
+    """State of a supervisor.
 
     Attributes:
         input: applied last.
         reading: last outputs.
         samples: outputs at the last three sampling instants, newest last.
-        num_samples: sampling instants so far.
-        num_still: by output, samples for which it has stood still.
-        last_move: by output, size of the last change from sample to sample.
-        num_driven: samples since an output moved in which inputs were large.
+        num_samples: number of sampling instants so far.
+        num_still: by output, number of samples for which it has been constant.
+        last_move: by output, size of the last change between samples.
+        num_driven: by output, samples with large inputs since it last changed.
         trip: a `Trip`.
     """
 
@@ -207,8 +206,8 @@ class Watch(NamedTuple):
     trip: AnyArray
 
     @classmethod
-    def start(cls, xp: Any, rules: Supervision, measured: AnyArray) -> Watch:
-        """Before the first sample, at the first reading."""
+    def start(cls, xp: ModuleType, rules: Supervision, measured: AnyArray) -> Watch:
+        """State before the first sample, at the first reading."""
         count = len(rules.critical)
         return cls(
             input=xp.asarray(rules.safe_input, float),
@@ -222,16 +221,16 @@ class Watch(NamedTuple):
         )
 
 
-def tripped(xp: Any, watch: Watch, condition: AnyArray, trip: Trip) -> Watch:
-    """The watch after a condition to trip was looked at; the first reason stays."""
+def tripped(xp: ModuleType, watch: Watch, condition: AnyArray, trip: Trip) -> Watch:
+    """The watch after a condition for a trip was checked; the first reason stays."""
     is_first = condition & (watch.trip == int(Trip.NONE))
     return watch._replace(trip=xp.where(is_first, int(trip), watch.trip))
 
 
 def check_reading(
-    xp: Any, rules: Supervision, watch: Watch, measured: AnyArray, elapsed: AnyArray
+    xp: ModuleType, rules: Supervision, watch: Watch, measured: AnyArray, elapsed: AnyArray
 ) -> Watch:
-    """After one reading.
+    """The watch after one reading.
 
     Args:
         measured: outputs.
@@ -246,11 +245,11 @@ def check_reading(
     return watch._replace(reading=xp.where(is_finite, measured, watch.reading))
 
 
-def check_sample(xp: Any, rules: Supervision, watch: Watch) -> Watch:
-    """At a sampling instant, after its reading: prediction one step ahead, and staleness."""
+def check_sample(xp: ModuleType, rules: Supervision, watch: Watch) -> Watch:
+    """The watch at a sampling instant: prediction one step ahead, and constant readings."""
     newest, last = watch.reading, watch.samples[2]
     samples = xp.concatenate([watch.samples[1:], newest[None]])
-    # A parabola through three samples knows that a swing slows down before it turns.
+    # A parabola through three samples takes into account that a swing slows down before it turns.
     predicted = 3 * samples[2] - 3 * samples[1] + samples[0]
     is_over = (abs(predicted) >= rules.critical) & (abs(newest) >= 0.9 * rules.critical)
     watch = tripped(xp, watch, is_over.any() & (watch.num_samples >= 2), Trip.PREDICTED_LEVEL)
@@ -263,16 +262,16 @@ def check_sample(xp: Any, rules: Supervision, watch: Watch) -> Watch:
         last_move=xp.where(is_still, watch.last_move, abs(newest - last)),
         num_driven=xp.where(is_still, watch.num_driven + is_driven, 0),
     )
-    # A swing that turns slows down first: what stops at once is the sensor, not the plant.
+    # A swing slows down before it turns: what stops at once is the sensor, not the plant.
     is_stuck = (watch.num_still >= rules.num_still) & (watch.last_move > 4 * rules.resolution)
     is_dead = watch.num_driven >= rules.num_dead
     return tripped(xp, watch, (is_stuck | is_dead).any(), Trip.STALE)
 
 
 def allowed(
-    xp: Any, rules: Supervision, watch: Watch, proposed: AnyArray
+    xp: ModuleType, rules: Supervision, watch: Watch, proposed: AnyArray
 ) -> tuple[Watch, AnyArray]:
-    """The watch and the input after an input was proposed: within limits and slew, or safe."""
+    """The watch, and the proposed input within limits and slew; the safe one after a trip."""
     watch = tripped(xp, watch, ~xp.isfinite(proposed).all(), Trip.INPUT_NOT_FINITE)
     near = xp.clip(proposed, watch.input - rules.slew, watch.input + rules.slew)
     near = xp.clip(near, rules.lower, rules.upper)

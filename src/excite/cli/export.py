@@ -16,16 +16,11 @@ from .options import OUT_FILE, json_option, show_json
 @json_option
 def export(policy: str, onnx: Path, overwrite: bool, as_json: bool) -> None:
     """Write POLICY, a file or a shipped name, as an ONNX model."""
-    from ..policy import policy_path, read_policy, shipped_policies
+    from ..policy import read_policy
     from ..policy.onnx import require_onnx_path, write_onnx
 
-    path = policy_path(policy)
-    if path is None:
-        from ..description import unknown
-
-        raise unknown("policy", policy, [*shipped_policies(), "path/to/policy.safetensors"])
     require_onnx_path(onnx, overwrite)
-    read = read_policy(path)
+    read = read_policy(policy)
     write_onnx(read, onnx, overwrite)
     result = {
         "policy": policy,

@@ -1,9 +1,10 @@
 """Excitations: what turns the measurements so far into the next input.
 
-An excitation is `init` (before the experiment) and `__call__` (at every sample). Signals
-ignore the measurement: they lay down their whole sequence in `init`. With several inputs
-every input gets a sequence of its own that is not a multiple of another's, because inputs
-that move together cannot be told apart.
+An excitation is `init` (before the experiment), `__call__` (at every sample) and, where an
+input may be changed by a supervisor, `applied`. Signals ignore the measurement: `init`
+computes their whole sequence. With several inputs, no input is a multiple of another,
+because their effects could not be separated. On a rig an excitation is played by
+`excite.rig.excitation.ExcitationPlayer`.
 
 All values are bounded by the plant's input limits, and reproducible from a key.
 """
@@ -11,34 +12,34 @@ All values are bounded by the plant's input limits, and reproducible from a key.
 from __future__ import annotations
 
 import abc
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from ..plant import AbstractPlant
 from ..plant.fields import optional_floats
 
 Sequence: TypeAlias = Float[Array, "time input"]
-SignalState: TypeAlias = Any
+SignalState: TypeAlias = tuple[Sequence, Int[Array, ""]]
 
 
 class AbstractExcitation(eqx.Module):
     """Base of all excitations."""
 
     @abc.abstractmethod
-    def init(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> Any:
+    def init(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> PyTree:
         """State before the first sample of an experiment of `num_steps` steps."""
 
     @abc.abstractmethod
     def __call__(
-        self, state: Any, measurement: Float[Array, " output"]
-    ) -> tuple[Any, Float[Array, " input"]]:
+        self, state: PyTree, measurement: Float[Array, " output"]
+    ) -> tuple[PyTree, Float[Array, " input"]]:
         """Next state, and the input held until the next sample."""
 
-    def applied(self, state: Any, input: Float[Array, " input"]) -> Any:
-        """The state after another input than the one asked for was applied."""
+    def applied(self, state: PyTree, input: Float[Array, " input"]) -> PyTree:
+        """The state after an input was applied that may not be the proposed one."""
         del input
         return state
 

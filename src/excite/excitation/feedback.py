@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from ..plant import AbstractPlant
 from ..plant.fields import floats, optional_floats
@@ -15,11 +15,33 @@ from ..safety import watched_output
 from .contract import AbstractExcitation, AbstractShape
 
 
+class LoopState(NamedTuple):
+    """State of a position loop.
+
+    Attributes:
+        reference: of all samples [output unit].
+        which: index of the output.
+        gain: of the loop [input unit / output unit].
+        dt: sampling time [s].
+        middle: of the input limits.
+        output: measured at the last sample.
+        k: index of the next sample.
+    """
+
+    reference: Float[Array, " time"]
+    which: Int[Array, ""]
+    gain: Float[Array, ""] | float
+    dt: Float[Array, ""]
+    middle: Float[Array, " input"]
+    output: Float[Array, ""]
+    k: Int[Array, ""]
+
+
 class PositionLoop(AbstractExcitation):
     """A signal as the reference of a proportional-derivative loop around one output.
 
-    The honest classical excitation of a plant with an integrator, which drifts away under
-    an open-loop signal. The loop closes around the first output with a critical level:
+    The classical excitation of a plant with an integrator, whose output drifts under an
+    open-loop signal. The loop closes around the first output with a critical level:
     u = gain (r - y) - damping dy/dt, the derivative a difference of two measurements.
 
     Attributes:
@@ -35,8 +57,8 @@ class PositionLoop(AbstractExcitation):
     gain: Float[Array, ""] | None = eqx.field(converter=optional_floats, default=None)
     damping: Float[Array, ""] = eqx.field(converter=floats, default=0.0)
 
-    def init(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> Any:
-        """The reference, and what a step needs of the plant.
+    def init(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> LoopState:
+        """The reference, and the numbers of the plant that a step needs.
 
         Raises:
             ValueError: for a plant with more than one input.
@@ -52,17 +74,17 @@ class PositionLoop(AbstractExcitation):
         lower, upper = plant.input_limits
         output = plant.output(plant.initial_state, plant.nominal)[watched]
         which = jnp.asarray(watched)
-        return reference, which, gain, plant.dt, (lower + upper) / 2, output, jnp.asarray(0)
+        middle = (lower + upper) / 2
+        return LoopState(reference, which, gain, plant.dt, middle, output, jnp.asarray(0))
 
     def __call__(
-        self, state: Any, measurement: Float[Array, " output"]
-    ) -> tuple[Any, Float[Array, " input"]]:
+        self, state: LoopState, measurement: Float[Array, " output"]
+    ) -> tuple[LoopState, Float[Array, " input"]]:
         """The loop's input, before it is clipped to the limits."""
-        reference, which, gain, dt, middle, before, k = state
-        y = measurement[which]
-        rate = jnp.where(k > 0, (y - before) / dt, 0.0)
-        input = middle + gain * (reference[k] - y) - self.damping * rate
-        return (reference, which, gain, dt, middle, y, k + 1), input
+        y, k = measurement[state.which], state.k
+        rate = jnp.where(k > 0, (y - state.output) / state.dt, 0.0)
+        input = state.middle + state.gain * (state.reference[k] - y) - self.damping * rate
+        return state._replace(output=y, k=k + 1), input
 
 
 class PolicyExcitation(AbstractExcitation):
@@ -107,7 +129,7 @@ class PolicyExcitation(AbstractExcitation):
     def applied(
         self, state: tuple[Window, Array], input: Float[Array, " input"]
     ) -> tuple[Window, Array]:
-        """The window remembers what was applied."""
+        """The window with the applied input in place of the proposed one."""
         window, k = state
         newest = with_input(jnp, self.layout, window, input).inputs[-1]
         return window._replace(inputs=window.inputs.at[-1].set(newest)), k

@@ -2,9 +2,9 @@
 
 A policy is a feed-forward network and the layout of what it observes, in one safetensors
 file: the weights as tensors, the contract (plant, layout, provenance) as JSON in the
-header. It is read and run with NumPy alone; the same `observe` and `forward` serve the
-training environment and the simulation with JAX (`xp` is the module of array functions),
-so that a policy sees on a rig exactly what it saw in training. Nothing is ever unpickled.
+header. It is read and run with NumPy alone. One step of a policy, from window and
+measurement to the input, is written once, in `respond`: `xp` is NumPy on a rig, and
+`jax.numpy` in training and simulation. Nothing is ever unpickled.
 """
 
 from __future__ import annotations
@@ -14,13 +14,14 @@ import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
 from ..description import Input, Output, PlantDescription
-from ..files import tensors_from_bytes, tensors_to_bytes
+from ..files import require_new_file, tensors_from_bytes, tensors_to_bytes, write_bytes
 
 FORMAT = "excite policy 1"
 _MAX_COUNT = 2**31  # of samples, in a file of unknown origin
@@ -84,7 +85,7 @@ class Layout:
 
 
 class Window(NamedTuple):
-    """The last measurements and inputs, normalised, oldest first; time is axis 0."""
+    """The last measurements and inputs, scaled, oldest first; axis 0 is time."""
 
     outputs: AnyArray
     inputs: AnyArray
@@ -201,7 +202,7 @@ class Policy:
     plant: PlantDescription
     layout: Layout
     weights: Weights
-    provenance: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    provenance: Mapping[str, object] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
         layers = tuple(
@@ -231,10 +232,35 @@ class Policy:
             )
         return forward(np, self.weights, observation)
 
+    def __repr__(self) -> str:
+        """Plant, what is observed, how it was trained, and the hash."""
+        layout, made = self.layout, self.provenance
+        widths = [layout.size, *(len(bias) for _, bias in self.weights)]
+        words = [f"{word} {made[word]}" for word in ("method", "agent", "study") if word in made]
+        return (
+            f"Policy for the plant {self.plant.name}\n"
+            f"  observes {layout.window} samples, for {layout.num_steps} steps of "
+            f"{self.plant.dt:g} s; network {'-'.join(map(str, widths))}\n"
+            f"  trained by {', '.join(words) or 'unknown'}\n"
+            f"  hash {self.hash}"
+        )
+
     @property
     def hash(self) -> str:
         """SHA-256 of the policy's file content."""
         return hashlib.sha256(self.to_bytes()).hexdigest()
+
+    def save(self, path: str | Path, overwrite: bool = False) -> None:
+        """Writes the policy's file (.safetensors); `read_policy` reads it back.
+
+        Raises:
+            ValueError: one sentence where it may not or cannot be written.
+        """
+        path = Path(path)
+        if path.suffix != ".safetensors":
+            raise ValueError(f"{path}: policy files end in .safetensors")
+        require_new_file(path, overwrite)
+        write_bytes(path, self.to_bytes())
 
     def to_bytes(self) -> bytes:
         """Content of the policy's file; `from_bytes` reads it back."""
@@ -257,7 +283,7 @@ class Policy:
 
         Raises:
             ValueError: one sentence for content that is truncated, of another version,
-                inconsistent, or not finite.
+                inconsistent, or with numbers that are not finite.
         """
         tensors, contract = tensors_from_bytes(content, FORMAT, where)
         try:
@@ -267,7 +293,9 @@ class Policy:
             layout = Layout(**numbers)
             plant = PlantDescription.from_dict(contract["plant"])
             if contract["plant_hash"] != plant.hash:
-                raise ValueError("the plant in the contract is not the one that was written")
+                raise ValueError(
+                    "the plant in the contract does not have the hash that was written"
+                )
             num_layers = (len(tensors) + 1) // 2
             weights = tuple(
                 (tensors[f"{i}.weight"], tensors[f"{i}.bias"]) for i in range(num_layers)
@@ -287,13 +315,11 @@ def _check_layout(layout: Layout, plant: PlantDescription) -> None:
     if not all(type(n) is int and n < _MAX_COUNT for n in (layout.window, layout.num_steps)):
         raise ValueError("window and num_steps of a layout are whole numbers")
     usual = Layout.of(plant, layout.window, layout.num_steps)
-    own = ("output_scale", "input_half", "clocks")  # may differ from policy to policy
-    if layout != dataclasses.replace(usual, **{n: getattr(layout, n) for n in own}) or not all(
-        math.isfinite(n) for n in numbers
-    ):
+    free = {n: getattr(layout, n) for n in ("output_scale", "input_half", "clocks")}
+    if layout != dataclasses.replace(usual, **free) or not all(math.isfinite(n) for n in numbers):
         raise ValueError("the observation layout does not belong to the policy's plant")
     if len(layout.input_half) != len(plant.inputs) or not all(
-        0 < own <= whole for own, whole in zip(layout.input_half, usual.input_half, strict=True)
+        0 < half <= whole for half, whole in zip(layout.input_half, usual.input_half, strict=True)
     ):
         raise ValueError("the layout's inputs go beyond the limits of the policy's plant")
     if not all(0 < n <= 0.5 for n in layout.clocks):
@@ -321,28 +347,28 @@ def _check_layers(weights: Weights, num_inputs: int, num_outputs: int) -> None:
 
 
 def mismatch(policy: Policy, plant: PlantDescription) -> str | None:
-    """A warning where the plant is not the one of training, but may be excited all the same.
+    """A warning if the plant is not that of training, but may be excited; else None.
 
     Raises:
-        ValueError: one sentence where it may not: other names, units, input limits,
-            levels or sampling time.
+        ValueError: one sentence if it may not be excited: other names, units, input
+            limits, levels or sampling time.
     """
-    own = policy.plant
-    _require_same("inputs", own.inputs, plant.inputs, ("unit", "lower", "upper"))
+    trained = policy.plant
+    _require_same("inputs", trained.inputs, plant.inputs, ("unit", "lower", "upper"))
     levels = ("unit", "warning_level", "critical_level")
-    _require_same("outputs", own.outputs, plant.outputs, levels)
-    if not math.isclose(own.dt, plant.dt, rel_tol=1e-9):
+    _require_same("outputs", trained.outputs, plant.outputs, levels)
+    if not math.isclose(trained.dt, plant.dt, rel_tol=1e-9):
         raise ValueError(
-            f"the policy was trained for a sampling time of {own.dt:g} s; "
+            f"the policy was trained for a sampling time of {trained.dt:g} s; "
             f"{plant.name!r} has {plant.dt:g} s"
         )
-    if own.hash == plant.hash:
+    if trained.hash == plant.hash:
         return None
-    if own.name != plant.name:
-        return f"the policy was trained on {own.name!r}, not on {plant.name!r}"
+    if trained.name != plant.name:
+        return f"the policy was trained on {trained.name!r}, not on {plant.name!r}"
     return (
-        f"the policy was trained on another {own.name!r} (hash {own.hash[:8]}) than this one, "
-        "with other constants, nominal values or noise"
+        f"the policy was trained on another {trained.name!r} (hash {trained.hash[:8]}) than this "
+        "one, with other constants, nominal values or noise"
     )
 
 

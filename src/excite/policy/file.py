@@ -4,24 +4,30 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..description import Listing
+from ..description import Listing, unknown
 from .contract import Policy
 
 POLICY_ENDING = ".safetensors"
 SHIPPED = Path(__file__).parent / "shipped"
 
 
-def read_policy(path: str | Path) -> Policy:
-    """The policy in a file, or a shipped policy by its name.
+def read_policy(policy: str | Path) -> Policy:
+    """A shipped policy by name, or the policy in a file.
 
         >>> import excite as ex
         >>> ex.read_policy("aero2").layout.num_steps
         500
 
     Raises:
-        ValueError: one sentence for a file that cannot be read or is no sound policy.
+        ValueError: one sentence for an unknown name, a file that cannot be read, or one that
+            is not a valid policy.
     """
-    path = policy_path(str(path)) or Path(path)
+    path = policy if isinstance(policy, Path) else policy_path(policy)
+    if path is None:
+        if Path(policy).exists():
+            raise ValueError(f"{policy}: policy files end in {POLICY_ENDING}")
+        known = [*shipped_policies(), f"path/to/policy{POLICY_ENDING}"]
+        raise unknown("policy", str(policy), known)
     try:
         content = path.read_bytes()
     except OSError as error:

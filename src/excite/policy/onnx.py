@@ -1,14 +1,13 @@
 """A policy as ONNX: one file that other tools run, without Python and without this package.
 
 The graph holds the network alone, from the observation of Eq. 2 to an action in [-1, 1];
-the window of measurements and inputs is kept by whoever runs it. How, the contract says,
-which stands in the model's metadata as JSON, as in the policy's own file.
+the window of measurements and inputs is kept by the program that runs it. The contract says
+how; it is in the model's metadata as JSON, as in the policy's file.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -16,15 +15,14 @@ try:
     import onnx
     from onnx import TensorProto, helper, numpy_helper
 except ImportError:
-    onnx: Any = None
-    TensorProto = helper = numpy_helper = onnx
+    onnx = TensorProto = helper = numpy_helper = None
 
 from .. import __version__
 from ..files import json_text, require_new_file, tensors_from_bytes, write_bytes
 from .contract import FORMAT, Policy
 
 ONNX_ENDING = ".onnx"
-_OPSET = 13  # of 2020: every run-time in use knows it
+_OPSET = 13  # of 2020, supported by all runtimes in use
 
 
 def to_onnx(policy: Policy) -> bytes:
@@ -78,11 +76,11 @@ def write_onnx(policy: Policy, path: Path, overwrite: bool = False) -> None:
     write_bytes(path, to_onnx(policy))
 
 
-def _batch(name: str, size: int) -> Any:
+def _batch(name: str, size: int) -> onnx.ValueInfoProto:
     return helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size])
 
 
-def _network(policy: Policy) -> tuple[list[Any], dict[str, np.ndarray]]:
+def _network(policy: Policy) -> tuple[list[onnx.NodeProto], dict[str, np.ndarray]]:
     """Nodes and constants of `policy.forward`."""
     constants = {
         "lowest": np.array(-1, np.float32),

@@ -19,7 +19,7 @@ import numpy as np
 
 from .. import __version__
 from ..description import PlantDescription, display_unit
-from ..policy import Policy, mismatch, policy_path, read_policy, shipped_policies
+from ..policy import Policy, mismatch, policy_path, read_policy
 from ..record import Record, read_record, read_signal, require_record_path
 from ..record.read import SIGNAL_ENDINGS
 from ..report.tables import text_table
@@ -367,11 +367,7 @@ def _source(
     name = policy or plant or DEFAULT_POLICY
     if not isinstance(name, str | Path):
         name = name.definition.name
-    path = policy_path(str(name))
-    if path is None:
-        known = ", ".join(shipped_policies())
-        raise ValueError(f"no policy {str(name)!r} (there is {known}, path/to/policy.safetensors)")
-    return _Source(str(name), read_policy(path))
+    return _Source(str(name), read_policy(name))
 
 
 def _plant(plant: str | AbstractPlant | None, rig: str | AbstractRig) -> AbstractPlant | None:
@@ -387,7 +383,7 @@ def _plant(plant: str | AbstractPlant | None, rig: str | AbstractRig) -> Abstrac
 
 def _described(policy: Policy | None) -> PlantDescription:
     """Without JAX a plant is known from a policy: the one to be played, or a shipped one."""
-    return (policy or read_policy(shipped_policies()[DEFAULT_POLICY])).plant
+    return (policy or read_policy(DEFAULT_POLICY)).plant
 
 
 def _fits(plant: PlantDescription, rig: PlantDescription) -> bool:
