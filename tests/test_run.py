@@ -78,7 +78,9 @@ class Other:
 class NoEstimate(LiveEstimate):
     """In place of the live estimate, which compiles for long."""
 
-    latest = property(lambda _: {})
+    @property
+    def latest(self):
+        return {}
 
     def __init__(self, *_):
         pass

@@ -8,14 +8,16 @@ how; it is in the model's metadata as JSON, as in the policy's file.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 try:
     import onnx
-    from onnx import TensorProto, helper, numpy_helper
+    from onnx import NodeProto, TensorProto, ValueInfoProto, helper, numpy_helper
 except ImportError:
-    onnx = TensorProto = helper = numpy_helper = None
+    onnx: Any = None
+    TensorProto = helper = numpy_helper = onnx
 
 from .. import __version__
 from ..files import json_text, require_new_file, tensors_from_bytes, write_bytes
@@ -76,11 +78,11 @@ def write_onnx(policy: Policy, path: Path, overwrite: bool = False) -> None:
     write_bytes(path, to_onnx(policy))
 
 
-def _batch(name: str, size: int) -> onnx.ValueInfoProto:
+def _batch(name: str, size: int) -> ValueInfoProto:
     return helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size])
 
 
-def _network(policy: Policy) -> tuple[list[onnx.NodeProto], dict[str, np.ndarray]]:
+def _network(policy: Policy) -> tuple[list[NodeProto], dict[str, np.ndarray]]:
     """Nodes and constants of `policy.forward`."""
     constants = {
         "lowest": np.array(-1, np.float32),

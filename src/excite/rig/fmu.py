@@ -1,11 +1,11 @@
 """A functional mock-up unit as a rig: what other tools export as FMI 2 or 3, by FMPy.
 
-The unit brings its own integrator (co-simulation). Its inputs and outputs are found by the
-plant's names, or by `names` where they differ, so that an experiment, its supervisor and
-its record are the same as on any other rig. A wrong file or name is a ValueError before
-anything is started, a unit that fails while it runs a `RigError`.
+The unit contains its integrator (co-simulation). Its inputs and outputs are found by the
+plant's names, or by `names` where they differ; experiment, supervisor and record are then
+the same as on any other rig. A wrong file or name is a ValueError before anything is
+started; a unit that fails while it runs is a `RigError`.
 
-A unit holds native code, which is run: open only those you trust.
+A unit contains native code, which is run: open only units that you trust.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ import numpy as np
 try:
     import fmpy
     import fmpy.simulation as fmi
+    from fmpy.model_description import ModelDescription, ScalarVariable
 except ImportError:
     fmpy: Any = None
     fmi: Any = None
@@ -33,7 +34,7 @@ from ..description import PlantDescription, names_of
 from .contract import AbstractRig, Pacer, Reading, RigError
 
 _REAL = ("Real", "Float64", "Float32")
-_FATAL = 4  # the status after which not even the release of a unit may be called
+_FATAL = 4  # the status after which a unit may not even be released
 
 
 class FMURig(AbstractRig):
@@ -117,8 +118,8 @@ class FMURig(AbstractRig):
             shutil.rmtree(self._folder, ignore_errors=True)
         self._folder, self._is_running = None, False
 
-    def facts(self) -> dict[str, Any]:
-        """Which unit it was, by its file's hash, and with which start values."""
+    def facts(self) -> Mapping[str, object]:
+        """The unit, its file's hash, and the start values."""
         return {
             "fmu": self._path.name,
             "fmu_hash": self._hash,
@@ -151,8 +152,8 @@ class FMURig(AbstractRig):
         if done is not None and done[1]:  # FMI 3 tells more: event, terminate, early, until when
             raise RigError("it asked to end the simulation")
 
-    def _log(self, *message: Any) -> None:
-        """Keeps what the unit says; FMPy would print it."""
+    def _log(self, *message: bytes | int | None) -> None:
+        """Keeps the unit's last message, which FMPy would print."""
         self._said = (message[-1] or b"").decode(errors="replace")
 
     @contextlib.contextmanager
@@ -191,14 +192,14 @@ def simulate_fmu(
     return np.array(outputs)
 
 
-def _read(path: Path) -> tuple[Any, str]:
+def _read(path: Path) -> tuple[ModelDescription, str]:
     """FMPy's description of a co-simulation unit that runs on this machine, the file's hash."""
     if fmpy is None:
         raise ValueError("an FMU needs FMPy: pip install 'excite[fmu]'")
     try:
         with path.open("rb") as file:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
-            model: Any = fmpy.read_model_description(file)
+            model = fmpy.read_model_description(file)
             files = [name.split("/") for name in zipfile.ZipFile(file).namelist()]
     except OSError as error:
         raise ValueError(f"{path}: cannot be read ({error.strerror})") from None
@@ -208,8 +209,8 @@ def _read(path: Path) -> tuple[Any, str]:
         raise ValueError(f"{path}: FMI 1.0; FMI 2 and 3 are supported")
     if model.coSimulation is None:
         raise ValueError(
-            f"{path}: without an integrator of its own; export it for co-simulation, not for "
-            "model exchange alone"
+            f"{path}: contains no integrator; export it for co-simulation, not only for "
+            "model exchange"
         )
     here = fmpy.platform if model.fmiVersion == "2.0" else fmpy.platform_tuple
     platforms = sorted({name[1] for name in files if name[0] == "binaries" and len(name) > 2})
@@ -219,8 +220,8 @@ def _read(path: Path) -> tuple[Any, str]:
 
 
 def _variables(
-    model: Any, path: Path, description: PlantDescription, names: Mapping[str, str]
-) -> tuple[list[Any], list[Any]]:
+    model: ModelDescription, path: Path, description: PlantDescription, names: Mapping[str, str]
+) -> tuple[list[ScalarVariable], list[ScalarVariable]]:
     """Inputs and outputs of the unit in the plant's order."""
     inputs, outputs = names_of(description.inputs), names_of(description.outputs)
     for name in names:
@@ -229,20 +230,20 @@ def _variables(
     real = {v.name: v for v in model.modelVariables if v.type in _REAL and not v.shape}
     settable = {name: v for name, v in real.items() if v.causality == "input"}
     shown = {name: v for name, v in real.items() if v.causality == "output"}
-    found: list[list[Any]] = []
-    for kind, own, first, there in (
+    found: list[list[ScalarVariable]] = []
+    for kind, plant_names, first, there in (
         ("input", inputs, settable, settable),
-        ("output", outputs, shown, real),  # what is inside may be measured as well
+        ("output", outputs, shown, real),  # internal variables may be measured too
     ):
         found.append([])
-        for name in (names.get(name, name) for name in own):
+        for name in (names.get(name, name) for name in plant_names):
             if name not in there:
                 raise _unknown(f"{path}: has no real {kind}", name, first)
             found[-1].append(there[name])
     return found[0], found[1]
 
 
-def _require_settable(model: Any, path: Path, start: Mapping[str, float]) -> None:
+def _require_settable(model: ModelDescription, path: Path, start: Mapping[str, float]) -> None:
     """Raises ValueError where a start value has no variable that takes it."""
     settable = [
         v.name

@@ -1,8 +1,8 @@
-"""The Quanser Aero 2, yaw locked: its pitch, driven over Quanser's HIL interface; NumPy alone.
+"""The Quanser Aero 2, yaw locked: its pitch, over Quanser's HIL interface; NumPy alone.
 
-The interface comes with Quanser's SDK; the rest of the package does without it. The card's
-clock paces: a task on it reads the encoder at 500 Hz, and `read` waits for its next sample.
-The card's watchdog outlives this process: whatever kills it, the motors stop.
+The interface comes with Quanser's SDK; the rest of the package does not need it. The card's
+clock sets the pace: a task on the card reads the encoder at 500 Hz, and `read` waits for its
+next sample. The card's watchdog stops the motors even if this process is killed.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
+from collections.abc import Mapping
 from time import sleep
 from typing import Any
 
@@ -28,39 +29,39 @@ except ImportError:
     BufferOverflowMode: Any = None
 
 CARD = "quanser_aero2_usb"
-"""HIL's word for the Aero 2."""
+"""HIL's name of the Aero 2."""
 
 MAX_VOLTAGE = 24.0
-"""Of a motor [V]."""
+"""Maximum motor voltage [V]."""
 
 READING_RATE = 500.0
-"""Readings in one second."""
+"""Readings per second [Hz]."""
 
 COUNTS = 2880
 """Counts of the pitch encoder in one revolution."""
 
 WATCHDOG_TIMEOUT = 0.5
-"""Without a reading for so long, the card stops the motors [s].
+"""The card stops the motors after this time without a reading [s].
 
-The loop gives up by itself when it is late by one sampling time, 0.1 s: the watchdog is for
-a process that is gone or hangs. Until then full voltage moves a body at rest by 0.075 rad.
+The loop ends by itself when it is late by one sampling time, 0.1 s; the watchdog is for a
+process that was killed or hangs. In this time full voltage moves a body at rest by 0.075 rad.
 """
 
 REST_SECONDS = 0.5
-"""How long the body must not have moved when the rig is opened."""
+"""Time for which the body must not move when the rig is opened [s]."""
 
 _REST_READINGS = 10
 _MOTORS = np.array([0, 1], np.uint32)  # analog outputs, and digital ones of their amplifiers
 _ENCODERS = np.array([0, 1, 2, 3], np.uint32)  # rotors, pitch, yaw
 _PITCH = np.array([2], np.uint32)
-_WITHOUT_END = 2**32 - 1  # HIL's number of samples for a task that runs until it is stopped
+_WITHOUT_END = 2**32 - 1  # number of samples of a task that runs until it is stopped
 
 
 class QuanserAero2(AbstractRig):
     """An Aero 2, or its virtual twin: u on the first motor, -u on the second.
 
-    The body must be level and at rest when it is opened: this pitch is its zero. The sensor
-    in its description is the encoder, whatever sensor the plant was given with.
+    The body must be level and at rest when the rig is opened: this pitch becomes zero. The
+    sensor in the description is the encoder, whatever the plant's sensor.
     """
 
     starts_at_rest = True
@@ -73,7 +74,7 @@ class QuanserAero2(AbstractRig):
             address: HIL's board identifier: "0", or "0@tcpip://localhost:18950" (virtual).
 
         Raises:
-            ValueError: for a plant that is no Aero 2, or a dt that is no multiple of 2 ms.
+            ValueError: for a plant that is not an Aero 2, or a dt that is not a multiple of 2 ms.
         """
         largest = max(max(-i.lower, i.upper) for i in description.inputs)
         if (len(description.inputs), len(description.outputs)) != (1, 1) or largest > MAX_VOLTAGE:
@@ -90,14 +91,14 @@ class QuanserAero2(AbstractRig):
             )
         self.description, self._address = _with_encoder(description), address
         self._is_virtual = "@" in address
-        self._card: Any = None
-        self._task: Any = None
+        self._card: object = None
+        self._task: object = None
         self._num_read = 0
-        self._held: set[str] = set()  # calls that have not failed, so that `close` knows its part
+        self._held: set[str] = set()  # calls that did not fail, for `close`
         self._counts = np.zeros(1, np.int32)
 
     def open(self) -> None:
-        """Takes the card, zeroes encoders and motors, and enables the amplifiers."""
+        """Opens the card, sets encoders and motors to zero, and enables the amplifiers."""
         if hardware is None:
             raise RigError(
                 "Quanser's Python package `quanser` is missing: it comes with Quanser's SDK, "
@@ -106,8 +107,8 @@ class QuanserAero2(AbstractRig):
         self._num_read = 0
         self._card = hardware.HIL()
         self._call("open", CARD, self._address)
-        # A card whose watchdog expired accepts nothing until this. One that has nothing to
-        # clear may say so by an error; one that still accepts nothing fails at the next call.
+        # A card whose watchdog expired accepts nothing before this call. A card with nothing to
+        # clear may return an error; one that still accepts nothing fails at the next call.
         with contextlib.suppress(RigError):
             self._call("watchdog_clear")
         self._apply(0.0)
@@ -150,7 +151,7 @@ class QuanserAero2(AbstractRig):
         self._apply(voltage)
 
     def close(self) -> None:
-        """Stops the motors and releases what was taken, each step even after one that failed."""
+        """Stops the motors and releases the card, each step even after one that failed."""
         steps = (
             ("open", lambda: self._apply(0.0)),
             ("open", lambda: self._enable(False)),
@@ -161,19 +162,19 @@ class QuanserAero2(AbstractRig):
         )
         errors = []
         for i, (needed, step) in enumerate(steps):
-            # Where neither zero nor disabling came through, the watchdog is all that is left.
+            # If neither zero nor disabling succeeded, only the watchdog can stop the motors.
             if i == 2 and len(errors) == 2:
                 continue
             try:
                 if needed in self._held:
                     step()
-            except BaseException as error:  # nor may Ctrl-C leave the motors running
+            except BaseException as error:  # Ctrl-C must not leave the motors running either
                 errors.append(error)
         self._held.clear()
         if errors:
             raise errors[0]
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> Mapping[str, object]:
         """Card and address, and how it is read."""
         return {
             "kind": "quanser",
@@ -184,7 +185,7 @@ class QuanserAero2(AbstractRig):
         }
 
     def _require_rest(self) -> None:
-        """Raises RigError where the body still swings: its zero would be any angle."""
+        """Raises RigError if the body still moves: its zero would be an arbitrary angle."""
         seen = []
         for _ in range(_REST_READINGS):
             self._call("read_encoder", _PITCH, len(_PITCH), self._counts)
@@ -197,8 +198,8 @@ class QuanserAero2(AbstractRig):
             )
 
     def _start(self) -> None:
-        # Not when it is opened: what the task sampled before the first reading would be read in
-        # a burst that is no real time, and the watchdog would expire while the user prepares.
+        # Not in `open`: samples taken before the first reading would be read in a burst, and
+        # the watchdog would expire while the user prepares the experiment.
         self._call("watchdog_set_analog_expiration_state", _MOTORS, len(_MOTORS), np.zeros(2))
         self._call("watchdog_start", WATCHDOG_TIMEOUT)
         clock = hardware.Clock.HARDWARE_CLOCK_0
@@ -210,7 +211,7 @@ class QuanserAero2(AbstractRig):
     def _enable(self, on: bool) -> None:
         self._call("write_digital", _MOTORS, len(_MOTORS), np.full(2, on, np.int8))
 
-    def _call(self, name: str, *arguments: Any) -> Any:
+    def _call(self, name: str, *arguments: object) -> object:
         self._held.add(name)  # before: an interrupt may come after the card has done it
         try:
             return getattr(self._card, name)(*arguments)
@@ -221,7 +222,7 @@ class QuanserAero2(AbstractRig):
 
 
 def _with_encoder(description: PlantDescription) -> PlantDescription:
-    """The description with the encoder's resolution; a supervisor must know it."""
+    """The description with the encoder's resolution, which the supervisor needs."""
     (pitch,) = description.outputs
     pitch = dataclasses.replace(pitch, resolution=max(pitch.resolution, 2 * math.pi / COUNTS))
     return dataclasses.replace(description, outputs=(pitch,))

@@ -1,8 +1,7 @@
 """The record of an experiment under way: every sample is on disk before the next.
 
-The sidecar of a record is written before its first sample, without an end, and again at
-the end; a process that is killed leaves a record of all samples so far that can be read
-like any other.
+The sidecar of a record is written before its first sample, and again with the reason of the
+end. A process that is killed leaves a valid record of all samples so far.
 """
 
 from __future__ import annotations
@@ -10,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from ..description import PlantDescription
 from ..files import json_text, write_bytes
 from ..record import RECORD_KIND, require_record_path
 
-_RESERVE = 16_384  # spaces in a sidecar, in whose place its end is written on a full disk
+_RESERVE = 16_384  # spaces in a sidecar, overwritten by its end if the disk is full
 
 
 class Recorder:
@@ -28,7 +27,7 @@ class Recorder:
         self,
         path: Path,
         description: PlantDescription,
-        metadata: Mapping[str, Any],
+        metadata: Mapping[str, object],
         overwrite: bool = False,
     ) -> None:
         """A record at `path`, which ends in .csv.
@@ -37,13 +36,15 @@ class Recorder:
             metadata: for the sidecar: policy hash, limits, versions.
 
         Raises:
-            ValueError: where it may not be written.
+            ValueError: if it may not be written.
         """
         require_record_path(path, overwrite)
         if path.suffix.lower() != ".csv":
             raise ValueError(f"{path}: an experiment is recorded as .csv, line by line")
         if "clock" in description.columns:
-            raise ValueError("no input or output may be called 'clock': a record has its own")
+            raise ValueError(
+                "no input or output may be called 'clock': records have a column of this name"
+            )
         self._path, self._description = path, description
         self._metadata = {
             "plant": description.to_dict(),
@@ -56,8 +57,8 @@ class Recorder:
         self.num_samples = 0
 
     def __enter__(self) -> Self:
-        """Writes the sidecar and the header; what was there before stays where one cannot."""
-        # A line is one call, whole or not at all.
+        """Writes the sidecar and the header; an older record is kept if that fails."""
+        # Unbuffered: a line is one call.
         self._file = self._path.open("ab", buffering=0)
         try:
             self._write_sidecar({"ended": None}, _RESERVE)
@@ -79,8 +80,8 @@ class Recorder:
         self._line([repr(float(x)) for x in numbers])
         self.num_samples += 1
 
-    def end(self, ended: Mapping[str, Any]) -> None:
-        """Says in the sidecar how the experiment ended, on a full disk as well."""
+    def end(self, ended: Mapping[str, object]) -> None:
+        """Writes to the sidecar how the experiment ended, also on a full disk."""
         try:
             self._write_sidecar({"ended": dict(ended)})
         except ValueError:
@@ -99,9 +100,9 @@ class Recorder:
     def _line(self, words: list[str]) -> None:
         line, before = (",".join(words) + "\n").encode(), self._file.tell()
         if self._file.write(line) != len(line):
-            self._file.truncate(before)  # half a line would spoil all others
+            self._file.truncate(before)  # half a line would make the file unreadable
             raise OSError(f"{self._path}: the disk is full")
 
-    def _write_sidecar(self, more: Mapping[str, Any], reserve: int = 0) -> None:
+    def _write_sidecar(self, more: Mapping[str, object], reserve: int = 0) -> None:
         text = json_text({**self._metadata, **more}) + " " * reserve + "\n"
         write_bytes(self._path.with_suffix(".json"), text.encode())
