@@ -44,7 +44,6 @@ from excite.rig import (
     interruptible,
     run_loop,
 )
-from excite.rig import contract as base
 from excite.rig.excitation import ExcitationPlayer
 from excite.rig.filter import FilteredPlayer, SafetyFilter
 from excite.rig.live_estimate import LiveEstimate
@@ -816,7 +815,7 @@ def test_a_full_disk_does_not_lose_the_reason(tmp_path, monkeypatch):
 
     path = tmp_path / "a.csv"
     with ScriptedRig() as rig, Recorder(path, AERO, {}) as recorder:
-        monkeypatch.setattr(base, "write_bytes", full)
+        monkeypatch.setattr("excite.rig.recorder.write_bytes", full)
         before = path.with_suffix(".json").stat().st_size
         run_loop(rig, ScriptedPlayer(), Supervision.of(AERO), recorder)
     assert ended(path)["reason"] == "complete"

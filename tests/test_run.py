@@ -283,7 +283,7 @@ def test_a_position_loop_is_played_recorded_and_identified(call):
     provenance = record.metadata["provenance"]
     assert provenance["played"] == "loop-multisine"
     assert provenance["options"] == {"amplitude": 0.25, "gain": 12}
-    found = identify(Aero2Detailed(), [record])
+    found = identify([record], Aero2Detailed())
     for name, true in told["rig"]["true_params"].items():
         assert abs(found.params[name] / true - 1) < 0.01
 

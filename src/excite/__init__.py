@@ -28,6 +28,7 @@ _PLACES = {
     "evaluate": "study.evaluate",
     "run_study": "study.run",
     "report": "report.html",
+    "run": "rig.session",
     # nouns
     "Record": "record.record",
     "read_record": "record.read",
@@ -110,6 +111,7 @@ if TYPE_CHECKING:
     from .record.read import read_record as read_record
     from .record.record import Record as Record
     from .report.html import report as report
+    from .rig.session import run as run
     from .simulation import simulate as simulate
     from .study.catalogue import studies as studies
     from .study.evaluate import evaluate as evaluate

@@ -182,7 +182,7 @@ class Experiment:
         name = excitation if isinstance(excitation, str) else name_of(excitation)
         found, origin = excitation_and_origin(excitation, options or {}, chosen)
         source = excitation.source if isinstance(excitation, Record) else ""
-        num_steps = _num_steps(found, source or name, steps, isinstance(excitation, Record))
+        num_steps = experiment_length(found, source or name, steps, isinstance(excitation, Record))
         return cls(
             chosen, params_from(chosen, params), found, name, origin, num_steps, _checked(seed)
         )
@@ -232,7 +232,7 @@ class Experiment:
         return Record.of_episode(run.time, run.inputs, run.measured, metadata, "simulated record")
 
 
-def _num_steps(
+def experiment_length(
     excitation: AbstractExcitation, name: str, steps: int | None, is_record: bool
 ) -> int:
     """The length asked for, or the excitation's; ValueError where that is shorter."""

@@ -212,13 +212,6 @@ class Policy:
         object.__setattr__(self, "weights", layers)
         _check_layers(layers, self.layout.size, len(self.layout.input_half))
 
-    def __repr__(self) -> str:
-        sizes = [self.layout.size, *(len(bias) for _, bias in self.weights)]
-        return (
-            f"policy for {self.plant.name}, {self.layout.num_steps} steps of {self.plant.dt:g} s, "
-            f"layers of {', '.join(map(str, sizes))}"
-        )
-
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """Action in [-1, 1] for one observation.
 

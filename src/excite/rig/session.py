@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 
 from .. import __version__
-from ..description import PlantDescription, display_unit
+from ..description import PlantDescription, display_unit, wrong_type
 from ..policy import Policy, mismatch, policy_path, read_policy
 from ..record import Record, read_record, read_signal, require_record_path
 from ..record.read import SIGNAL_ENDINGS
@@ -34,19 +34,16 @@ if TYPE_CHECKING or HAS_JAX:
     import jax
     from jaxtyping import PRNGKeyArray
 
-    from ..excitation import AbstractExcitation
-    from ..excitation.catalogue import excitation_and_origin
+    from ..excitation.catalogue import ExcitationLike, excitation_and_origin, name_of
     from ..plant import AbstractPlant
-    from ..plant.catalogue import plant_named
+    from ..plant.catalogue import PlantLike, plant_from
+    from ..simulation import experiment_length
     from .excitation import ExcitationPlayer
     from .filter import FilteredPlayer, SafetyFilter
     from .live_estimate import LiveEstimate
 
 DEFAULT_POLICY = "aero2_detailed"
 """Of the simulated and the Quanser rig; also the name of their plant."""
-
-DEFAULT_STEPS = 500
-"""Length of an experiment with an excitation that has no length."""
 
 _BUDGET = 0.25  # fraction of a sampling time that one step of a player may take
 
@@ -174,9 +171,9 @@ def run(
     rig: str | AbstractRig = "simulated",
     policy: str | Path | Policy | None = None,
     *,
-    plant: str | AbstractPlant | None = None,
+    plant: PlantLike | None = None,
     signal: str | Path | None = None,
-    excitation: str | AbstractExcitation | None = None,
+    excitation: ExcitationLike | None = None,
     options: Mapping[str, object] | None = None,
     out: str | Path | None = None,
     overwrite: bool = False,
@@ -229,22 +226,26 @@ def run(
         RigError: for a rig that cannot be opened.
 
     Example:
-        >>> from excite.rig.session import run
-        >>> run(excitation="loop-multisine", fast=True, dry_run=True, steps=100)  # doctest: +SKIP
+        >>> import excite as ex
+        >>> ex.run(policy="aero2", dry_run=True).inputs.shape
+        (500, 1)
     """
     path = None if out is None else Path(out)
     if path is not None:
         require_record_path(path, overwrite)
     elif not dry_run:
         raise ValueError("--out FILE.csv is missing: an experiment is always recorded")
-    source = _source(policy, signal, excitation, options or {}, plant)
     known = _plant(plant, rig)
+    default = DEFAULT_POLICY if plant is None or known is None else known.definition.name
+    source = _source(policy, signal, excitation, options or {}, default)
     rig_options = RigOptions(address, fast, seed, spread, fault or {})
     if isinstance(rig, str):
         description = known.description if known is not None else _described(source.policy)
         opened = rig_named(rig, known, description, rig_options)
-    else:
+    elif isinstance(rig, AbstractRig):
         opened = rig
+    else:
+        raise wrong_type("rig", rig, "a name, FILE.fmu, path/to/file.py:ClassName or a rig")
     description = opened.description
     if known is not None and not _fits(known.description, description):
         if plant is not None or filter or source.excitation is not None:
@@ -289,7 +290,7 @@ class _Source:
     name: str
     policy: Policy | None = None
     signal: Path | None = None
-    excitation: str | AbstractExcitation | None = None
+    excitation: ExcitationLike | None = None
     options: Mapping[str, object] = field(default_factory=dict)
 
     def warnings(self, plant: PlantDescription) -> list[str]:
@@ -317,16 +318,13 @@ class _Source:
             inputs = read_signal(self.signal, description).inputs[:-1]
             longest, make = len(inputs), functools.partial(SignalPlayer, inputs[:steps])
         else:
-            plant, steps = _required(plant, "--excitation"), steps or DEFAULT_STEPS
-            return functools.partial(ExcitationPlayer, self._built(plant), plant, steps, _key(seed))
+            plant, given = _required(plant, "--excitation"), self.excitation or self.name
+            excitation, _ = excitation_and_origin(given, self.options, plant)
+            length = experiment_length(excitation, self.name, steps, isinstance(given, Record))
+            return functools.partial(ExcitationPlayer, excitation, plant, length, _key(seed))
         if steps is not None and steps > longest:
             raise ValueError(f"{self.name} was made for {longest} steps; --steps asks for {steps}")
         return make
-
-    def _built(self, plant: AbstractPlant) -> AbstractExcitation:
-        if isinstance(self.excitation, AbstractExcitation):
-            return self.excitation
-        return excitation_and_origin(str(self.excitation), self.options, plant)[0]
 
 
 def _key(seed: int) -> PRNGKeyArray:
@@ -343,39 +341,41 @@ def _required(plant: AbstractPlant | None, option: str) -> AbstractPlant:
 def _source(
     policy: str | Path | Policy | None,
     signal: str | Path | None,
-    excitation: str | AbstractExcitation | None,
+    excitation: ExcitationLike | None,
     options: Mapping[str, object],
-    plant: str | AbstractPlant | None,
+    default_policy: str,
 ) -> _Source:
-    """What is to be played; by default the policy with the plant's name."""
+    """What is to be played."""
     if sum(given is not None for given in (policy, signal, excitation)) > 1:
         raise ValueError("--policy, --input and --excitation exclude each other: give one of them")
-    if isinstance(excitation, str):
-        if policy_path(excitation) is not None:
+    if isinstance(excitation, Policy):
+        policy = excitation
+    elif isinstance(excitation, str | Path):
+        if policy_path(str(excitation)) is not None:
             policy = excitation
-        elif excitation.endswith(SIGNAL_ENDINGS):
+        elif str(excitation).endswith(SIGNAL_ENDINGS):
             signal = excitation
-    if options and (policy or signal or not isinstance(excitation, str)):
+    if options and (policy or signal or excitation is None):
         raise ValueError("--set has the options of an --excitation such as chirp or loop-multisine")
     if signal is not None:
         return _Source(str(signal), signal=Path(signal))
     if excitation is not None and policy is None:
-        name = excitation if isinstance(excitation, str) else type(excitation).__name__
+        is_name = isinstance(excitation, str) or not HAS_JAX
+        name = str(excitation) if is_name else name_of(excitation)
         return _Source(name, excitation=excitation, options=options)
     if isinstance(policy, Policy):
         return _Source(f"policy {policy.hash[:8]}", policy)
-    name = policy or plant or DEFAULT_POLICY
-    if not isinstance(name, str | Path):
-        name = name.definition.name
-    return _Source(str(name), read_policy(name))
+    if policy is None:
+        policy = default_policy
+    if not isinstance(policy, str | Path):
+        raise wrong_type("policy", policy, "a shipped policy's name, a file or a policy")
+    return _Source(str(policy), read_policy(policy))
 
 
-def _plant(plant: str | AbstractPlant | None, rig: str | AbstractRig) -> AbstractPlant | None:
+def _plant(plant: PlantLike | None, rig: str | AbstractRig) -> AbstractPlant | None:
     """The plant; None without JAX."""
     if HAS_JAX:
-        return (
-            plant_named(plant or DEFAULT_POLICY) if not isinstance(plant, AbstractPlant) else plant
-        )
+        return plant_from(DEFAULT_POLICY if plant is None else plant)
     if plant is not None or rig == "simulated":
         raise ValueError("--plant and a simulated rig need JAX, which is not installed")
     return None
