@@ -288,7 +288,7 @@ def test_a_layout_of_another_plant_is_refused():
 def test_a_contract_whose_plant_was_changed_is_refused():
     other = json.loads(json.dumps(POLICY.plant.to_dict()))
     other["constants"][0]["value"] *= 2
-    assert "not the one that was written" in refusal(file_of(plant=other))
+    assert "does not have the hash" in refusal(file_of(plant=other))
 
 
 def spoilt_tensors() -> dict[str, dict[str, np.ndarray]]:

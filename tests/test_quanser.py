@@ -416,7 +416,7 @@ from excite.rig.quanser import QuanserAero2
 from excite.safety import Supervision
 
 aero = PlantDescription.from_dict(json.loads(Path(sys.argv[1]).read_text()))
-with QuanserAero2(aero) as rig, Recorder(Path(sys.argv[2]), aero, {}) as recorder:
+with QuanserAero2(aero) as rig, Recorder(Path(sys.argv[2]), aero, {}, True) as recorder:
     signal = SignalPlayer(np.full((int(sys.argv[3]), 1), 2.0))
     outcome = run_loop(rig, signal, Supervision.of(aero), recorder)
 print(outcome.reason, sorted({"jax", "equinox"} & set(sys.modules)))

@@ -218,10 +218,10 @@ REFUSALS = {
     "own rig without file": ((*SIGNAL, *FAST, "--rig", "no.py:Still"), "no such file"),
     "a fault of a real rig": (
         (*SIGNAL, "--rig", "quanser", "--fault", "dropout=0.1", "--dry-run"),
-        "--fault is of a simulated rig, not of 'quanser'",
+        "--fault is an option of a simulated rig, not of 'quanser'",
     ),
     "a real rig in a hurry": (
-        (*SIGNAL, "--rig", "own.py:Still", "--fast", "--dry-run"), "--fast is of a simulated rig",
+        (*SIGNAL, "--rig", "own.py:Still", "--fast", "--dry-run"), "--fast is an option of a simulated rig",
     ),
     "own rig without class": ((*SIGNAL, *FAST, "--rig", "own.py:Quick"), "no rig class 'Quick'"),
     "own rig that is none": ((*SIGNAL, *FAST, "--rig", "own.py:Other"), "no rig class 'Other'"),
@@ -274,7 +274,7 @@ def test_a_filter_says_how_often_it_intervened(call):
 
 
 def test_a_position_loop_is_played_recorded_and_identified(call):
-    words = ("--excitation", "loop-multisine", "--set", "amplitude=0.25,gain=12", "--seed", 5)
+    words = ("--excitation", "loop-multisine", "--set", "amplitude=0.4,gain=16", "--seed", 5)
     code, out, err = call(*words, *FAST, "--json")
     assert (code, err) == (0, "")
     told = json.loads(out)
@@ -282,7 +282,7 @@ def test_a_position_loop_is_played_recorded_and_identified(call):
     record = read_record("r.csv", AERO)
     provenance = record.metadata["provenance"]
     assert provenance["played"] == "loop-multisine"
-    assert provenance["options"] == {"amplitude": 0.25, "gain": 12}
+    assert provenance["options"] == {"amplitude": 0.4, "gain": 16}
     found = identify([record], Aero2Detailed())
     for name, true in told["rig"]["true_params"].items():
         assert abs(found.params[name] / true - 1) < 0.01
@@ -291,7 +291,7 @@ def test_a_position_loop_is_played_recorded_and_identified(call):
 def test_an_excitation_may_be_a_policy_or_a_file(call):
     told = {}
     for words in (("--excitation", "aero2-ppo-all"), ("--policy", "aero2-ppo-all")):
-        code, out, err = call(*words, *FAST, "--steps", 20, "--json", "--overwrite")
+        code, out, err = call(*words, *FAST, "--steps", 8, "--json", "--overwrite")
         assert code == 0
         assert err.startswith("warning: aero2-ppo-all: the policy was trained on 'aero2'")
         told[words[0]] = json.loads(out)

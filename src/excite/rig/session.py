@@ -259,7 +259,8 @@ def run(
     for warning in warnings:
         on_warning(warning)
     make = source.maker(description, known, steps, seed)
-    safety_filter = SafetyFilter.of(_required(known, "--filter"), spread, slew) if filter else None
+    prior = _required(known, "--filter") if filter else None
+    safety_filter = None if prior is None else SafetyFilter.of(prior, spread, slew)
 
     def make_player() -> AbstractPlayer:
         bare = make()
