@@ -221,7 +221,8 @@ REFUSALS = {
         "--fault is an option of a simulated rig, not of 'quanser'",
     ),
     "a real rig in a hurry": (
-        (*SIGNAL, "--rig", "own.py:Still", "--fast", "--dry-run"), "--fast is an option of a simulated rig",
+        (*SIGNAL, "--rig", "own.py:Still", "--fast", "--dry-run"),
+        "--fast is an option of a simulated rig",
     ),
     "own rig without class": ((*SIGNAL, *FAST, "--rig", "own.py:Quick"), "no rig class 'Quick'"),
     "own rig that is none": ((*SIGNAL, *FAST, "--rig", "own.py:Other"), "no rig class 'Other'"),
