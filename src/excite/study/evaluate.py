@@ -8,7 +8,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from ..description import unknown
-from ..plant import AbstractARXPlant, AbstractPlant
+from ..plant import AbstractARXPlant
+from ..plant.catalogue import PlantLike
 from ..policy import POLICY_ENDING, Policy, mismatch, policy_path, read_policy, shipped_policies
 from ..report.study_table import StudyTable
 from ..training.checkpoint import Progress
@@ -18,7 +19,7 @@ from .spec import plant_tables, study_from
 
 def evaluate(
     policy: str | Path | Policy,
-    plant: str | AbstractPlant | type[AbstractPlant] | None = None,
+    plant: PlantLike | None = None,
     *,
     episodes: int = 1000,
     seed: int = 0,

@@ -23,7 +23,7 @@ from ..excitation.catalogue import excitation_and_origin, excitation_named
 from ..files import folder_word
 from ..information import require_noise
 from ..plant import AbstractARXPlant, AbstractPlant
-from ..plant.catalogue import PLANTS, plant_named, with_sensor
+from ..plant.catalogue import PLANTS, PlantLike, plant_from, plant_named, with_sensor
 from ..policy import POLICY_ENDING
 from ..record.read import SIGNAL_ENDINGS
 from ..training.settings import GradientSettings, PPOSettings
@@ -336,7 +336,7 @@ def study_from(content: Mapping[str, object], where: str) -> Study:
 
 
 def plant_tables(
-    plant: str | AbstractPlant | type[AbstractPlant], noise: Mapping[str, float] | None = None
+    plant: PlantLike, noise: Mapping[str, float] | None = None
 ) -> tuple[dict[str, object], AbstractPlant]:
     """What a study file says of a plant and its sensor, and the plant it means.
 
@@ -345,31 +345,30 @@ def plant_tables(
 
     Raises:
         ValueError: for a class that is in no file, or a plant with other numbers than its class.
+        TypeError: for an object that is no plant.
     """
-    word = plant if isinstance(plant, str) else _word(plant)
-    built = plant_named(word)
-    sensor: dict[str, dict[str, float]] = {}
-    if isinstance(plant, AbstractPlant):
-        own = built.definition.outputs, plant.description.outputs
-        sensor = {
-            mine.name: {"noise_sd": mine.noise_sd, "resolution": mine.resolution}
-            for usual, mine in zip(*own, strict=True)
-            if mine != usual
-        }
-        built = built.changed(sensor=plant.sensor)
-        if built.description.hash != plant.description.hash:
-            raise ValueError(
-                f"a study names its plant, and this {word} differs from its class in constants, dt "
-                "or initial state: write a class with these numbers"
-            )
+    given = plant_from(plant)
+    word = plant if isinstance(plant, str) else _word(type(given))
+    usual = given if isinstance(plant, str) else plant_named(word)
+    if usual.changed(sensor=given.sensor).description.hash != given.description.hash:
+        raise ValueError(
+            f"a study names its plant, and this {word} differs from its class in constants, dt or "
+            "initial state: write a class with these numbers"
+        )
+    pairs = zip(usual.description.outputs, given.description.outputs, strict=True)
+    sensor = {
+        mine.name: {"noise_sd": mine.noise_sd, "resolution": mine.resolution}
+        for own, mine in pairs
+        if mine != own
+    }
+    built = with_sensor(given, noise)
     for name, sd in (noise or {}).items():
         sensor[name] = {**sensor.get(name, {}), "noise_sd": sd}
-    return {"plant": word, "sensor": sensor}, with_sensor(built, noise or {}, {})
+    return {"plant": word, "sensor": sensor}, built
 
 
-def _word(plant: AbstractPlant | type[AbstractPlant]) -> str:
+def _word(kind: type[AbstractPlant]) -> str:
     """The name of a plant's class in a study file."""
-    kind = plant if isinstance(plant, type) else type(plant)
     shipped = [name for name, plant_class in PLANTS.items() if plant_class is kind]
     if shipped:
         return shipped[0]

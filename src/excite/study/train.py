@@ -6,7 +6,8 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from ..plant import AbstractARXPlant, AbstractPlant
+from ..plant import AbstractARXPlant
+from ..plant.catalogue import PlantLike
 from ..policy import Policy, read_policy
 from ..training.checkpoint import Progress
 from .folder import seed_folder
@@ -17,7 +18,7 @@ from .table import best_seeds
 
 
 def train(
-    plant: str | AbstractPlant | type[AbstractPlant],
+    plant: PlantLike,
     out: str | Path | None = None,
     *,
     method: str = "gradient",
@@ -101,7 +102,7 @@ def train(
 
 
 def _compared_with_a_chirp(
-    plant: str | AbstractPlant | type[AbstractPlant],
+    plant: PlantLike,
     noise: Mapping[str, float] | None,
     name: str,
     settings: Mapping[str, object],
