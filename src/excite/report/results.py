@@ -13,16 +13,14 @@ from typing import TYPE_CHECKING, Any
 from ..description import PlantDescription, display_unit
 from ..record import Record
 from ..record.rows import EstimateSummary
-from .numbers import number
-from .tables import (
-    Table,
-    html_table,
+from .estimates import (
     largest_correlation,
     parameter_cells,
     parameter_header,
     residual_in_words,
-    text_table,
 )
+from .numbers import number
+from .tables import Table, html_table, text_table
 
 if TYPE_CHECKING:
     import pandas

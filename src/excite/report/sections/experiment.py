@@ -13,6 +13,7 @@ from ...description import RARE, PlantDescription, display_unit, names_of
 from ...files import read_columns
 from ...record import Record
 from ...record.rows import EstimatedParameter, EstimateSummary
+from ..estimates import largest_correlation, parameter_cells, parameter_header, residual_cells
 from ..figures import (
     autocorrelation_figure,
     correlation_figure,
@@ -20,7 +21,6 @@ from ..figures import (
     identification_figure,
 )
 from ..numbers import number
-from ..tables import largest_correlation, parameter_cells, parameter_header, residual_cells
 from .elements import (
     Marker,
     Run,

@@ -1,0 +1,62 @@
+"""The cells of tables of estimates and their residuals."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ..description import RARE
+from ..record.rows import EstimatedParameter, EstimateSummary
+from .numbers import digits_for, number
+
+
+def parameter_header() -> list[str]:
+    """Column titles of a table of estimates."""
+    return ["symbol", "unit", "estimate", "standard error", "95 % interval", "relative to nominal"]
+
+
+def parameter_cells(name: str, param: EstimatedParameter) -> list[str]:
+    """One estimate, to two digits of its error."""
+    relative = param.relative_to_nominal
+    relative = "–" if relative is None else f"{relative:.4f}"
+    if param.held:
+        return [name, param.unit, f"{number(param.estimate, 5)} (held)", "–", "–", relative]
+    digits, (low, high) = digits_for(param.estimate, param.std_error), param.ci95
+    return [
+        name,
+        param.unit,
+        number(param.estimate, digits),
+        number(param.std_error),
+        f"{number(low, digits)} to {number(high, digits)}",
+        relative,
+    ]
+
+
+def residual_cells(result: EstimateSummary, output: str) -> list[str]:
+    """Whether a residual is white and whether it follows the input, each with its p-value."""
+    white, follows = result.whiteness_p_value[output], result.structure_p_value[output]
+    cells = []
+    for p, words in ((white, ("yes", "no")), (follows, ("no", "yes"))):
+        cells += [words[p < RARE], number(p)] if math.isfinite(p) else ["–", "–"]
+    return cells
+
+
+def residual_in_words(result: EstimateSummary, output: str) -> str:
+    """The same tests as a part of a sentence."""
+    white, p_white, follows, p_follows = residual_cells(result, output)
+    parts = []
+    if white != "–":
+        parts.append(f"residual {'white' if white == 'yes' else 'not white'} (p = {p_white})")
+    if follows != "–":
+        word = "follows" if follows == "yes" else "does not follow"
+        parts.append(f"{word} the input (p = {p_follows})")
+    return ", ".join(parts) or "residual too small to be tested"
+
+
+def largest_correlation(result: EstimateSummary) -> str:
+    """The largest correlation between two estimates, and between which."""
+    names, table = list(result.params), np.array(result.correlation, float)
+    table = np.nan_to_num(np.triu(table, 1))
+    i, j = np.unravel_index(np.argmax(np.abs(table)), table.shape)
+    return f"{table[i, j]:+.3f} between {names[i]} and {names[j]}"
