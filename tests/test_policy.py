@@ -527,3 +527,28 @@ def test_actions_of_one_are_the_limits():
         np.testing.assert_array_equal(scaled_action(xp, layout, xp.ones(2)), [5.0, 6.0])
         np.testing.assert_array_equal(scaled_action(xp, layout, -xp.ones(2)), [-5.0, 0.0])
         np.testing.assert_array_equal(scaled_action(xp, layout, xp.zeros(2)), [0.0, 3.0])
+
+
+# ------------------------------------------------------------------- by name, and shown
+
+
+def test_a_policy_is_saved_and_read_by_name_or_path(tmp_path):
+    policy = read_policy("aero2")
+    path = tmp_path / "own.safetensors"
+    policy.save(path)
+    assert read_policy(path).hash == read_policy(str(path)).hash == policy.hash
+    with pytest.raises(ValueError, match="--overwrite"):
+        policy.save(path)
+    with pytest.raises(ValueError, match=r"end in \.safetensors"):
+        policy.save(tmp_path / "own.bin")
+    with pytest.raises(ValueError, match="unknown policy 'areo2'; did you mean 'aero2'"):
+        read_policy("areo2")
+
+
+def test_a_policy_shows_itself_in_a_few_lines():
+    policy = read_policy("aero2")
+    lines = repr(policy).splitlines()
+    assert len(lines) <= 5
+    assert max(map(len, lines)) <= 80
+    for word in ("aero2", "500 steps", "gradient", policy.hash):
+        assert word in repr(policy)
