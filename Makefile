@@ -3,9 +3,9 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-PYTEST := $(BIN)/python -m pytest -n 2 --dist loadscope
+PYTEST := $(BIN)/python -m pytest -n 2 --dist worksteal
 
-.PHONY: help demo test test-pages test-science test-all check-results lint types docs results \
+.PHONY: help demo test test-pages test-science test-all check-results coverage lint types docs results \
     agents policies evaluations clean
 
 help: ## this list
@@ -27,6 +27,9 @@ check-results: .venv/dev ## the committed results are what the documentation say
 	$(BIN)/python -m pytest tests/results
 
 test-all: test test-pages test-science check-results ## all tests
+
+coverage: .venv/dev ## lines of the package that no unit or command-line test runs
+	$(PYTEST) --cov=excite --cov-report=term-missing:skip-covered
 
 lint: .venv/dev ## style
 	$(BIN)/ruff check .

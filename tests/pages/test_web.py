@@ -23,7 +23,7 @@ import httpx2 as httpx
 import numpy as np
 import pytest
 import scipy.io
-from commands import PATIENCE
+from commands import PATIENCE, excite
 from served import EXPERIMENT, MAX_GAP, Told, browser, served, streamed
 from starlette.requests import Request
 from starlette.testclient import TestClient
@@ -93,10 +93,10 @@ def told(address: str) -> Told:
     return events
 
 
-def excite(*words: str, folder: Path) -> dict[str, Any]:
+def printed(*words: str, folder: Path) -> dict[str, Any]:
     """What a command prints as JSON."""
-    command = [sys.executable, "-m", "excite", *words, "--json"]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
+    done = excite(*words, "--json", cwd=folder)
+    assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 
 
@@ -106,13 +106,13 @@ def excite(*words: str, folder: Path) -> dict[str, Any]:
 def test_numbers_are_those_of_the_command_line(told: Told, tmp_path: Path):
     chosen = ["--params", "J_p=0.025"]
     words = ["simulate", "aero2", "--excitation", "chirp", "--set", "amplitude=7.2", *chosen]
-    simulated = excite(*words, "--seed", "3", "--out", "record.csv", folder=tmp_path)
+    simulated = printed(*words, "--seed", "3", "--out", "record.csv", folder=tmp_path)
     assert told.of("record.csv")[0]["text"] == (tmp_path / "record.csv").read_text()
     assert told.of("record.json")[0]["text"] == (tmp_path / "record.json").read_text()
     result = told.of("result")[0]
-    identified = excite("identify", "record.csv", "--plant", "aero2", folder=tmp_path)
+    identified = printed("identify", "record.csv", "--plant", "aero2", folder=tmp_path)
     assert result["identification"] == identified
-    bound = excite("information", "aero2", "record.csv", *chosen, folder=tmp_path)
+    bound = printed("information", "aero2", "record.csv", *chosen, folder=tmp_path)
     assert result["row"]["max_abs_output"] == pytest.approx(simulated["max_abs_output"])
     assert result["row"]["is_violation"] == simulated["is_violation"]
     assert result["row"]["log_det_information"] == pytest.approx(bound["log_det_information"])
@@ -203,7 +203,7 @@ def test_the_command_of_an_upload_does_the_same(
     (tmp_path / name).write_text(text.getvalue())
     words = shlex.split(json.loads((run / "run.json").read_text())["command"])
     assert words[:3] == ["excite", "identify", f"./{name}"]
-    assert excite(*words[1:], folder=tmp_path)["params"] == event["identification"]["params"]
+    assert printed(*words[1:], folder=tmp_path)["params"] == event["identification"]["params"]
 
 
 def test_an_uploaded_mat_file_is_identified(client, told: Told, tmp_path: Path):
