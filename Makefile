@@ -41,12 +41,12 @@ types: .venv/dev ## types
 docs: .venv/dev ## this documentation as a site, in site/ (open site/index.html)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
-results: .venv/core ## the committed results, afresh (minutes in docs/reference/studies.md)
+results: .venv/core ## computes the committed results again (minutes in docs/reference/studies.md)
 	for study in baselines nls nls_quantised decay damping damping_encoder damping_noise_free; do \
 	  $(BIN)/excite study run $$study --out results/$$study --overwrite || exit 1; \
 	done
 
-agents: .venv/dev ## the trained agents of the studies, afresh (hours; goes on where it was interrupted)
+agents: .venv/dev ## trains the agents of the studies again (hours; rerun to resume)
 	for study in table1 paper frontier emps dc_motor cart_pole aero2_lag half amplitude nls_reward spread reward \
 	    two_minutes sim_to_real; do \
 	  $(BIN)/excite study run $$study --out runs/$$study || exit 1; \
@@ -66,7 +66,7 @@ policies: ## what is shipped in src/excite/policy/shipped, from the results of t
 	cp results/cart_pole/seeds/gradient_D/0/policy.safetensors src/excite/policy/shipped/cart_pole.safetensors
 	cp results/sim_to_real/seeds/gradient_robust/0/policy.safetensors src/excite/policy/shipped/aero2_detailed.safetensors
 
-evaluations: .venv/core ## the shipped policies on plants they have never met, in results/policies
+evaluations: .venv/core ## evaluates the shipped policies on new plants, in results/policies
 	mkdir -p results/policies
 	for policy in $(filter-out cart_pole aero2 aero2-goals aero2-damping,$(notdir $(basename $(wildcard src/excite/policy/shipped/*.safetensors)))); do \
 	  $(BIN)/excite evaluate $$policy --episodes 1000 --seed 7 --json > results/policies/$$policy.json || exit 1; \

@@ -1,4 +1,4 @@
-# From a plant of your own to its parameters. Run from anywhere: sh 01_own_plant.sh
+# From your plant to its parameters. Run from anywhere: sh 01_own_plant.sh
 set -e
 plant=$(dirname "$0")/flexible_drive.py:FlexibleDrive
 folder=$(mktemp -d)

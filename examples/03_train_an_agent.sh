@@ -1,5 +1,5 @@
-# Train an agent, look at its table, play its policy on a simulated plant, identify from the record.
-# Needs the extra: python -m pip install -e '.[ppo]'
+# Train an agent, show its table, play its policy on a simulated plant, identify from the record.
+# Needs the extra: pip install 'excite[ppo]'
 # After a minute of training the policy is far worse than the chirp in its table.
 here=$(dirname "$0")
 excite study run "$here/first_agent.toml" --out first_agent

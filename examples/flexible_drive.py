@@ -1,4 +1,4 @@
-"""A plant of your own: a motor that turns a load through a flexible shaft."""
+"""An example plant: a motor that turns a load through a flexible shaft."""
 
 import jax.numpy as jnp
 
