@@ -71,13 +71,15 @@ def test_the_commands_of_a_page_run(page: Path, tmp_path: Path):
             assert " ".join(line.split()) in printed, line
     if page == README:
         assert "successful" in run.stdout
-        [python] = re.findall(r"```python\n(.*?)```", page.read_text(), re.S)
+        [(python, shown)] = re.findall(
+            r"```python\n(.*?)```\n\n```text\n(.*?)```", page.read_text(), re.S
+        )
         run = subprocess.run(
             [sys.executable, "-c", python], cwd=tmp_path,
             capture_output=True, text=True, timeout=PATIENCE, check=False,
         )  # fmt: skip
         assert run.returncode == 0, run.stderr
-        assert "J_p" in run.stdout
+        assert run.stdout == shown
 
 
 @pytest.mark.parametrize("script", sorted(ROOT.glob("docs/figures/*.py")), ids=name)
