@@ -1,65 +1,75 @@
-"""The figures of docs/reference/gallery.md: input, response and information of each excitation."""
+"""The figures of docs/reference/gallery.md, from the committed results."""
 
+import json
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
 
-import excite as ex
-
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "docs" / "figures" / "gallery"
-ROBUST = str(ROOT / "studies" / "frontier_robust.csv")
-SIGNALS = {  # file: plant, excitation, options
-    "random": ("aero2", "random", {}),
-    "prbs": ("aero2", "prbs", {}),
-    "chirp": ("aero2", "chirp", {}),
-    "multisine": ("aero2", "multisine", {}),
-    "square": ("aero2", "square", {}),
-    "decay": ("aero2", "decay", {"amplitude": 1.0, "frequency": 0.149, "pump": 0.2}),
-    "loop": ("emps", "loop-multisine", {"amplitude": 0.05, "gain": 2000.0, "damping": 300.0}),
-    "robust": ("aero2", ROBUST, {}),
+SHOWN = {  # file: study and method
+    "random": ("frontier", "random"),
+    "prbs": ("frontier", "prbs"),
+    "chirp": ("frontier", "chirp"),
+    "multisine": ("frontier", "multisine tuned"),
+    "square": ("frontier", "square tuned"),
+    "decay": ("decay", "decay 1 V"),
+    "loop": ("emps", "loop-multisine tuned"),
+    "robust": ("frontier", "robust"),
+    "aero2": ("frontier", "gradient D"),
+    "aero2-goals": ("frontier", "gradient goals"),
+    "aero2-damping": ("frontier", "gradient D_p"),
+    "aero2_lag": ("aero2_lag", "gradient D"),
+    "aero2_detailed": ("sim_to_real", "gradient robust"),
+    "dc_motor": ("dc_motor", "gradient D"),
+    "cart_pole": ("cart_pole", "gradient D"),
+    "emps": ("emps", "gradient D"),
+    "aero2-ppo-all": ("table1", "RL(all)"),
+    "aero2-ppo-J_p": ("table1", "RL(J_p)"),
+    "aero2-ppo-K_pu": ("table1", "RL(K_pu)"),
+    "aero2-ppo-D_p": ("table1", "RL(D_p)"),
 }
-POLICIES = {
-    "aero2": "aero2", "aero2-goals": "aero2", "aero2-damping": "aero2", "aero2-ppo-all": "aero2",
-    "aero2-ppo-J_p": "aero2", "aero2-ppo-K_pu": "aero2", "aero2-ppo-D_p": "aero2",
-    "aero2_lag": "aero2_lag", "aero2_detailed": "aero2_detailed", "dc_motor": "dc_motor",
-    "cart_pole": "cart_pole", "emps": "emps",
-}  # fmt: skip
 BLUE, ORANGE = "#0072B2", "#D55E00"
 
 
 def main() -> None:
     plt.rcParams.update({"font.size": 8, "axes.spines.top": False, "axes.spines.right": False})
     FOLDER.mkdir(exist_ok=True)
-    shown = SIGNALS | {name: (plant, name, {}) for name, plant in POLICIES.items()}
-    for file, (plant, excitation, options) in shown.items():
-        draw(file, plant, excitation, options)
+    for file, (study, method) in SHOWN.items():
+        draw(file, study, method)
 
 
-def draw(file: str, plant: str, excitation: str, options: dict) -> None:
-    """Input, first output that has a critical level (or the first), and the bounds."""
-    record = ex.simulate(plant, excitation, options=options)
-    bounds = ex.information(plant, excitation, options=options)
-    outputs = record.description.outputs
-    i = next((i for i, o in enumerate(outputs) if o.critical_level is not None), 0)
-    output, input = outputs[i], record.description.inputs[0]
-    factor, unit = (180 / np.pi, "°") if output.unit == "rad" else (1.0, output.unit)
+def read(study: str, name: str) -> dict:
+    return json.loads((ROOT / "results" / study / f"{name}.json").read_text())
+
+
+def draw(file: str, study: str, method: str) -> None:
+    """One episode, and the mean bounds of all: input, first output, least deviations."""
+    plant, episode = read(study, "run")["plant"], read(study, "episodes")[method]
+    row = next(row for row in read(study, "table")["rows"] if row["method"] == method)
+    input, output, time = plant["inputs"][0], plant["outputs"][0], episode["time"]
+    factor, unit = (180 / np.pi, "°") if output["unit"] == "rad" else (1.0, output["unit"])
     figure, (left, middle, right) = plt.subplots(
         1, 3, figsize=(9, 1.9), width_ratios=(3, 3, 2), layout="constrained"
     )
-    left.step(record.time, record.inputs[:, 0], color=BLUE, linewidth=0.7, where="post")
-    left.set(xlabel="time [s]", ylabel=f"{input.name} [{input.unit}]")
-    middle.plot(record.time, factor * record.outputs[:, i], color=BLUE, linewidth=0.9)
-    middle.set(xlabel="time [s]", ylabel=f"{output.name} [{unit}]")
-    for level in filter(None, (output.warning_level, output.critical_level)):
-        dash = "--" if level == output.critical_level else ":"
-        for side in (level, -level):
-            middle.axhline(factor * side, color=ORANGE, linestyle=dash, linewidth=0.8)
-    percent = {name: bound.cramer_rao_percent for name, bound in bounds.params.items()}
-    right.barh(list(percent), [p or np.nan for p in percent.values()], color=BLUE, height=0.5)
-    right.set_xscale("log")
-    right.set(title=f"log det {bounds.log_det_information:.1f}", xlabel="least sd [%]")
+    played = episode["inputs"][input["name"]]
+    left.step(time[: len(played)], played, color=BLUE, linewidth=0.7, where="post")
+    left.set(xlabel="time [s]", ylabel=f"{input['name']} [{input['unit']}]")
+    response = factor * np.array(episode["outputs"][output["name"]])
+    middle.plot(time[: len(response)], response, color=BLUE, linewidth=0.9)
+    middle.set(xlabel="time [s]", ylabel=f"{output['name']} [{unit}]")
+    for level, dash in (("warning_level", ":"), ("critical_level", "--")):
+        for side in (1, -1) if output[level] is not None else ():
+            middle.axhline(side * factor * output[level], color=ORANGE, ls=dash, lw=0.8)
+    percent = row["cramer_rao_percent"]
+    right.barh(list(percent), list(percent.values()), color=BLUE, height=0.5)
+    for place, value in enumerate(percent.values()):
+        right.text(value, place, f" {value:.2g}", va="center", fontsize=7)
+    right.set(xscale="log", xlabel="least standard deviation [%]")
+    right.set_xlim(min(percent.values()) / 3, 4 * max(percent.values()))
+    if row["log_det_information"] is not None:
+        right.set_title(f"log det {row['log_det_information']:.1f}", fontsize=8)
     right.invert_yaxis()
     figure.savefig(FOLDER / f"{file}.png", dpi=90)
     plt.close(figure)
