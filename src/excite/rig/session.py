@@ -148,8 +148,7 @@ class DryRun:
         """What this is."""
         return (
             f"{self.played}: {len(self.inputs)} samples of {self.description.dt:g} s; nothing is "
-            "sent.\nA policy or a loop answers to measurements; these are its inputs for a plant "
-            "at rest."
+            "sent.\nA policy or a loop reacts to measurements; this is for a plant at rest."
         )
 
     header = ("input", "smallest", "largest", "rms", "first")
