@@ -257,10 +257,9 @@ def test_a_smaller_spread_draws_closer_plants():
 PROGRAM = """
 import sys
 import gymnasium, jax, jax.numpy as jnp, numpy as np
-if "double" in sys.argv:
-    jax.config.update("jax_enable_x64", True)
 from excite.plant import Aero2
 
+jax.config.update("jax_enable_x64", "double" in sys.argv)  # after the package switched it on
 dtype = jnp.float64 if "double" in sys.argv else jnp.float32
 seen = []
 choices = [{}, {"plant": Aero2(initial_state=jnp.array([0.25, 0.0]))}]
