@@ -42,7 +42,7 @@ def test_a_verb_with_the_name_of_a_module_is_a_verb_whatever_was_imported(record
     import excite.information
     import excite.report
 
-    assert excite.information.cramer_rao_bound
+    assert excite.information.cramer_rao_bound  # pyright: ignore[reportFunctionMemberAccess]
     assert ex.information("aero2", steps=100).plant.name == "aero2"
     with pytest.raises(ValueError, match="html"):
         ex.report([], "page.txt")

@@ -13,7 +13,7 @@ from excite.cli import main
 from excite.report.html import report_html
 from excite.web import jobs as live
 
-ASKED: dict[str, Any] = {
+ASKED: Any = {
     "plant": "aero2",
     "excitation": "prbs",
     "amplitude": 5.125,
@@ -23,7 +23,7 @@ ASKED: dict[str, Any] = {
     "seed": 7,
     "others": [],
 }
-MAPPED: dict[str, Any] = {
+MAPPED: Any = {
     "plant": "aero2",
     "estimator": "arx-rls-wide",
     "initial_state": "free",
@@ -64,7 +64,7 @@ def assert_same(first: Path, second: Path) -> None:
 def test_the_command_of_an_experiment_makes_it_again(change: dict[str, Any], tmp_path: Path):
     run = tmp_path / "page" / "run"
     run.parent.mkdir()
-    list(live.followed({**ASKED, **change}, str(run)))
+    list(live.followed(ASKED | change, str(run)))
     for line in read(run / "run.json")["command"].splitlines():
         assert line in report_html([run])
     assert_same(run, again(run, tmp_path))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import click
 
@@ -32,8 +32,8 @@ from .simulate import excitation_options, given_experiment, show_warnings
 @json_option
 @computing
 def information(
-    plant: str, input_file: Path | None, initial_state: str | None, plot: Path | None,
-    as_json: bool, **options: Any,
+    plant: str, input_file: Path | None, initial_state: Literal["free", "known"] | None,
+    plot: Path | None, as_json: bool, **options: Any,
 ) -> None:  # fmt: skip
     """Standard deviation that each parameter of PLANT can at best reach (Cramér-Rao bound).
 

@@ -43,7 +43,7 @@ def estimator_from(
     if isinstance(given, str):
         return estimator_named(given)
     if isinstance(given, type) and issubclass(given, AbstractEstimator):
-        given = given()
+        given = given()  # pyright: ignore[reportCallIssue] - finals have defaults
     if not isinstance(given, AbstractEstimator):
         raise wrong_type("estimator", given, "a name, an estimator or its class")
     return given

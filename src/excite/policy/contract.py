@@ -202,7 +202,7 @@ class Policy:
     plant: PlantDescription
     layout: Layout
     weights: Weights
-    provenance: Mapping[str, object] = dataclasses.field(default_factory=dict)
+    provenance: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
         layers = tuple(

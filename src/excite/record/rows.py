@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
 from pydantic import (
     BaseModel,
@@ -55,7 +55,7 @@ class Saved(BaseModel):
         except ValidationError:
             raise damaged(path, advice) from None
 
-    def data(self) -> dict[str, object]:
+    def data(self) -> dict[str, Any]:
         """The content as JSON-ready data, as far as it was set."""
         return json_ready(self.model_dump(exclude_unset=True))
 

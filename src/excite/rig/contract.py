@@ -13,7 +13,7 @@ import contextlib
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -110,7 +110,7 @@ class AbstractRig(abc.ABC):
         """Input applied when an experiment ends: zero, or the nearest limit."""
         return safe_input(self.description)
 
-    def facts(self) -> Mapping[str, object]:
+    def facts(self) -> Mapping[str, Any]:
         """What the record says about the rig, JSON-ready; asked after the experiment."""
         return {}
 

@@ -9,6 +9,7 @@ whether the safe input was enough. The true parameters are shown only at the end
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -208,7 +209,7 @@ class SimulatedRig(AbstractRig):
     def close(self) -> None:
         """Nothing to release."""
 
-    def facts(self) -> Mapping[str, object]:
+    def facts(self) -> Mapping[str, Any]:
         """What was hidden: true parameters, largest true outputs."""
         names = names_of(self.description.parameters)
         return {

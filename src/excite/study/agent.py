@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from jaxtyping import PyTree
 from pydantic import Field
@@ -242,7 +242,7 @@ class Agent:
         done = steps / (self.training.num_plants * num_steps)
         return f"updating {done:,.0f} of {self.training.num_updates:,}"
 
-    def settings(self, plant: AbstractPlant) -> dict[str, object]:
+    def settings(self, plant: AbstractPlant) -> dict[str, Any]:
         """All that decides what it becomes, defaults included, JSON-ready."""
         names = names_of(plant.definition.parameters)
         mask = target_mask(plant.definition, self.targets)

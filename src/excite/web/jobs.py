@@ -11,7 +11,7 @@ import contextlib
 import dataclasses
 import shlex
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import cast
 
@@ -27,7 +27,6 @@ from ..description import (
     Parameter,
     PlantDescription,
     display_unit,
-    names_of,
     unknown,
 )
 from ..estimation import NLS, Experiments, Status, stack_experiments
@@ -280,8 +279,8 @@ def _outcome(
     }, result
 
 
-def _by_name(parts: Sequence[Parameter | Output], values: ArrayLike) -> dict[str, float]:
-    return dict(zip(names_of(parts), map(float, np.asarray(values)), strict=True))
+def _by_name(parts: Sequence[Parameter | Output], values: Iterable[ArrayLike]) -> dict[str, float]:
+    return {part.name: float(np.asarray(v)) for part, v in zip(parts, values, strict=True)}
 
 
 # --------------------------------------------------------------------------------- files
