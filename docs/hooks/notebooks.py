@@ -13,7 +13,7 @@ from nbclient import NotebookClient
 from nbconvert import MarkdownExporter
 
 _NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
-_SECONDS = 300  # at most, for one cell
+_SECONDS = 900  # at most, for one cell
 
 
 def on_files(files: Files, *, config: Any) -> Files:
