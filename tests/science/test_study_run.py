@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -221,7 +222,7 @@ def test_a_gradient_seed_that_is_worth_more_but_unsafe_is_not_the_best(tmp_path,
         },
         "x",
     )  # fmt: skip
-    monkeypatch.setattr(table, "_metrics", lambda *key: {"validation": looks[key[-1]]})
+    monkeypatch.setattr(table, "_metrics", lambda *key: SimpleNamespace(validation=looks[key[-1]]))
     assert best_seeds(study, tmp_path) == {"A": 0}
 
 
@@ -373,7 +374,7 @@ def test_progress_may_be_anything(run, tmp_path):
     study, folder = read_study(run.parent / "tiny.toml"), tmp_path / "run"
     place = seed_folder(folder, "RL(all)", 0)
     place.mkdir(parents=True)
-    for content in ("", "{}", "[]", "null", '{"steps": 1, "return": null}', "\udcff"):
+    for content in ("", "{}", "[]", "null", '{"return": 1}', "\udcff"):
         (place / "progress.json").write_bytes(content.encode("utf-8", "surrogateescape"))
         assert _live(study, ("seed", "RL(all)", 0), folder) == (0.0, "")
 

@@ -31,7 +31,7 @@ def read_progress(seed_folder: Path) -> dict[str, float | None] | None:
         return None
     if not isinstance(look, dict) or not all(_is_number(value) for value in look.values()):
         return None
-    return look if _is_number(look.get("steps")) and look["steps"] is not None else None
+    return None if look.get("steps") is None else look
 
 
 def _is_number(value: object) -> bool:
