@@ -16,8 +16,8 @@ runs = pytest.mark.parametrize("folder", RUNS, ids=lambda folder: folder.name)
 @runs
 def test_the_table_follows_from_the_rows_of_methods_and_seeds(folder: Path):
     committed, computed = finished_table(folder), study_table(folder)
-    assert committed.rows == computed.rows
-    assert committed.differences == computed.differences
+    for part in ("rows", "differences"):  # as JSON: a number that does not exist equals itself
+        assert committed.data().get(part) == computed.data().get(part)
     assert json.loads((folder / "table.json").read_text()) == committed.data()
 
 
