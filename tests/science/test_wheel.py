@@ -96,7 +96,7 @@ def test_commands_work_without_a_checkout(installed: Installed, tmp_path: Path):
     assert {path.stem for path in (ROOT / "studies").glob("*.toml")} == {s["name"] for s in listed}
     for study in listed:
         assert Path(study["file"]).is_relative_to(installed.python.parent.parent)
-    assert "multisine" in installed.excite(tmp_path, "study run baselines --episodes 20")
+    assert "chirp" in installed.excite(tmp_path, "study run baselines --episodes 20")
     installed.excite(tmp_path, "simulate aero2 --out record.csv --plot record.png")
     assert "J_p" in installed.excite(tmp_path, "identify record.csv --plant aero2")
     installed.excite(tmp_path, "information aero2 --excitation aero2-damping")
