@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -13,12 +12,8 @@ from mkdocs.structure.files import File, Files
 from nbclient import NotebookClient
 from nbconvert import MarkdownExporter
 
-from excite.cli.options import cache_folder
-
 _NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
 _SECONDS = 900  # at most, for one cell
-_CACHE = "JAX_COMPILATION_CACHE_DIR"
-_QUIET = {"TF_CPP_MIN_LOG_LEVEL": "3", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
 
 
 def on_files(files: Files, *, config: Any) -> Files:
