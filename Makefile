@@ -4,6 +4,9 @@ BIN := .venv/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
 PYTEST := $(BIN)/python -m pytest -n 2 --dist worksteal
+# Thousands of small programs are compiled in the tests and run once: compiling is most of their time.
+# The flags are of the jaxlib in constraints.txt; the other suites compile as users do.
+QUICK := XLA_FLAGS="--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
 
 .PHONY: help demo test test-pages test-science test-all check-results coverage lint types docs results \
     agents policies evaluations clean
@@ -15,10 +18,10 @@ demo: .venv/core ## the baseline rows of the paper's Table 1, with three estimat
 	$(BIN)/excite study run baselines --out runs/baselines --overwrite
 
 test: lint types ## style, types, unit and command-line tests
-	$(PYTEST)
+	$(QUICK) $(PYTEST)
 
 test-pages: .venv/dev ## commands of the documentation, and the bench page in a browser
-	$(PYTEST) tests/pages
+	$(QUICK) $(PYTEST) tests/pages
 
 test-science: .venv/dev ## promises of the shipped policies, baselines, trainings from end to end
 	$(PYTEST) tests/science
@@ -29,7 +32,7 @@ check-results: .venv/dev ## the committed results are what the documentation say
 test-all: test test-pages test-science check-results ## all tests
 
 coverage: .venv/dev ## lines of the package that no unit or command-line test runs
-	$(PYTEST) --cov=excite --cov-report=term-missing:skip-covered
+	$(QUICK) $(PYTEST) --cov=excite --cov-report=term-missing:skip-covered
 
 lint: .venv/dev ## style
 	$(BIN)/ruff check .

@@ -41,8 +41,8 @@ class Memory:
     They stay as long as the process, and there are thousands of them.
     """
 
-    limit = 1.2e9
-    step = 0.3e9
+    limit = 1.6e9
+    step = 0.2e9
 
     def used(self) -> int:
         """Bytes in memory; 0 where that is not told."""

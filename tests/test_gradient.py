@@ -93,13 +93,17 @@ def test_the_error_of_the_output_error_estimate_is_that_of_nls(seed):
     inputs = Chirp().sequence(plant, 300, KEYS[0])
     outputs = response(plant, params, inputs)
     noise = plant.sensor.sd[None] * jax.random.normal(jax.random.key(seed), outputs.shape)
-    measured, state = outputs + noise, plant.initial_state
+    measured = outputs + noise
     memory = objective.init(plant, measured[0])
-    advance = eqx.filter_jit(objective.update)
-    for k, input in enumerate(inputs):
-        sample = StepData(params, state, input, measured[k + 1])
-        memory, _ = advance(plant, memory, sample, jnp.asarray(k))
-        state = step(plant, state, input, params)
+
+    def advance(carry: tuple, now: tuple) -> tuple[tuple, None]:
+        (memory, state), (k, input, seen) = carry, now
+        memory, _ = objective.update(plant, memory, StepData(params, state, input, seen), k)
+        return (memory, step(plant, state, input, params)), None
+
+    samples = jnp.arange(len(inputs)), inputs, measured[1:]
+    scan = eqx.filter_jit(jax.lax.scan)
+    (memory, _), _ = scan(advance, (memory, plant.initial_state), samples)
     found = NLS()(plant, stack_experiments(plant, [inputs], [measured], True))
     theirs = np.abs(np.stack(found.params) / np.stack(params) - 1)
     ours = objective.relative_errors(plant, memory, params)
@@ -112,16 +116,18 @@ def test_sensitivities_are_held_to_their_limit_and_below_it_left_alone():
 
     def largest(limit: float) -> float:
         objective = InformationGain(ALL, prior_sd_of(0.3), max_sensitivity=limit)
-        memory, state = objective.init(plant, jnp.zeros(1)), plant.initial_state
-        advance, sizes = eqx.filter_jit(objective.update), []
-        for k, input in enumerate(inputs):
-            before = memory.sensitivity
+
+        def advance(carry: tuple, now: tuple) -> tuple[tuple, Array]:
+            (memory, state), (k, input) = carry, now
             sample = StepData(plant.nominal, state, input, jnp.zeros(1))
-            memory, _ = advance(plant, memory, sample, jnp.asarray(k))
-            sizes.append(np.abs(memory.sensitivity[0]).max())
-            state = step(plant, state, input, plant.nominal)
-            assert memory.sensitivity.shape == before.shape
-        return float(np.max(sizes) / plant.definition.outputs[0].critical_level)
+            memory, _ = objective.update(plant, memory, sample, k)
+            size = jnp.abs(memory.sensitivity[0]).max()
+            return (memory, step(plant, state, input, plant.nominal)), size
+
+        start = objective.init(plant, jnp.zeros(1)), plant.initial_state
+        samples = jnp.arange(len(inputs)), inputs
+        sizes = eqx.filter_jit(jax.lax.scan)(advance, start, samples)[1]
+        return float(jnp.max(sizes) / plant.definition.outputs[0].critical_level)
 
     free = largest(30.0)
     assert 0.05 < free < 30.0

@@ -1,6 +1,6 @@
 """What tables and figures share: numbers as text, axes, levels, files.
 
-Degrees and percent live in this room and in the command line only.
+Here and in the command line angles are in degrees and fractions in percent; elsewhere in SI units.
 """
 
 from __future__ import annotations
@@ -9,10 +9,11 @@ import contextlib
 import io
 import re
 import textwrap
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, Literal
+from xml.etree import ElementTree
 
 import matplotlib.axes
 import matplotlib.axis
@@ -93,11 +94,22 @@ def inline_svg(figure: matplotlib.figure.Figure, prefix: str) -> str:
                 _set_plain(axis)
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
-    svg = buffer.getvalue()
-    svg = re.sub("<metadata>.*?</metadata>|<style.*?</style>", "", svg, flags=re.DOTALL)
-    used = set(re.findall(r'(?:href="|url\()#(\w+)', svg))
-    tags = re.sub("<[^>]*>", lambda tag: _of_page(tag[0], prefix, used), svg)
-    return re.sub(r"\s*\n\s*", "\n", tags[tags.index("<svg") :])
+    svg = ElementTree.fromstring(buffer.getvalue())
+    for element in list(svg.iter()):
+        for child in [child for child in element if child.tag.endswith(("}metadata", "}style"))]:
+            element.remove(child)
+    values = " ".join(value for element in svg.iter() for value in element.attrib.values())
+    used = set(re.findall(r"#(\w+)", values))
+    for element in svg.iter():
+        element.tag = element.tag.rpartition("}")[2]
+        named = {name.rpartition("}")[2]: value for name, value in element.attrib.items()}
+        element.attrib = {
+            name: _of_page(name, value, prefix)
+            for name, value in named.items()
+            if name != "id" or value in used
+        }
+    svg.attrib = {"viewBox": svg.attrib["viewBox"], "style": f"--width: {svg.attrib['width']}"}
+    return re.sub(r"\s*\n\s*", "\n", ElementTree.tostring(svg, encoding="unicode"))
 
 
 def _set_plain(axis: matplotlib.axis.Axis) -> None:
@@ -109,16 +121,15 @@ def _set_plain(axis: matplotlib.axis.Axis) -> None:
         axis.set_minor_locator(matplotlib.ticker.NullLocator())
 
 
-def _of_page(tag: str, prefix: str, used: Collection[str]) -> str:
-    """One of Matplotlib's tags: ids of its own, the page's colours and font, shorter numbers."""
-    tag = re.sub(r' id="([^"]*)"', lambda m: f' id="{prefix}-{m[1]}"' if m[1] in used else "", tag)
-    tag = tag.replace('xlink:href="#', f'href="#{prefix}-').replace("url(#", f"url(#{prefix}-")
-    if tag.startswith("<svg"):
-        width, box = re.findall(r' (?:width|viewBox)="([^"]*)"', tag)
-        return f'<svg viewBox="{box}" style="--width: {width}">'
-    tag = re.sub(r" font-family: [^;]*;", "", tag)
-    tag = re.sub(r"(\.\d\d)\d+", r"\1", tag)  # hundredths of a point cannot be seen
-    return re.sub("#[0-9a-f]{6}", lambda m: _PAGE_COLOURS.get(m[0], m[0]), tag)
+def _of_page(name: str, value: str, prefix: str) -> str:
+    """An attribute's value on a page: unique ids, the page's colours and font, shorter numbers."""
+    if name == "id":
+        return f"{prefix}-{value}"
+    if name == "href":
+        return value.replace("#", f"#{prefix}-")
+    value = re.sub(r" ?font-family: [^;]*;", "", value.replace("url(#", f"url(#{prefix}-"))
+    value = re.sub(r"(\.\d\d)\d+", r"\1", value)  # hundredths of a point cannot be seen
+    return re.sub("#[0-9a-f]{6}", lambda m: _PAGE_COLOURS.get(m[0], m[0]), value)
 
 
 class _Figure(matplotlib.figure.Figure):
