@@ -46,10 +46,10 @@ def policies(as_json: bool) -> None:
     if as_json:
         show_json({"policies": found})
         return
-    header = ["name", "plant", "default", "steps", "trained by", "agent", "of study"]
+    header = ["name", "plant", "default", "steps", "agent", "study"]
     rows = [
         [p["name"], p["plant"], "yes" if p["default"] else "", str(p["num_steps"]),
-         str(p["method"]), str(p["agent"]), str(p["study"])]
+         str(p["agent"]), str(p["study"])]
         for p in found
     ]  # fmt: skip
     show_table("shipped policies; use a name as --excitation", header, rows)

@@ -27,14 +27,12 @@ from ..rig.filter import SafetyFilter
 from ..rig.simulated import bodies, evaluate_on_rig, readings_per_sample
 from ..safety import Supervision, Trip
 from ..simulation import Trajectory
+from ..training.checkpoint import Progress
 from .spec import Study
-from .statistics import Outcome, table_row
+from .statistics import Scores, table_row
 
 CHUNK = 100
 """Episodes computed in one call: enough to be fast, few enough to show progress."""
-
-Progress = Callable[[str, int, int], None]
-"""Called with what is being computed, how much of it is done, and how much there is."""
 
 
 @eqx.filter_jit
@@ -110,7 +108,7 @@ def evaluate_method(
     estimators = study.build_estimators(plant)
     middle = np.mean(plant.input_limits, axis=0)
     keys = episode_keys(study)
-    outcomes: dict[str, list[Outcome]] = {e: [] for e in estimators}
+    parts: dict[str, list[Scores]] = {e: [] for e in estimators}
     play, squares = player_of(study, plant), []
     for c, first in enumerate(range(0, study.episodes, CHUNK)):
         progress(c)
@@ -119,8 +117,8 @@ def evaluate_method(
         inputs = np.asarray(episodes.trajectory.inputs) - middle
         squares.append(np.mean(inputs**2, axis=1))
         for e, estimator in estimators.items():
-            outcomes[e].append(outcome(plant, estimator, episodes, on_rig))
-    rows = [table_row(study, plant.description, (name, e), joined(o)) for e, o in outcomes.items()]
+            parts[e].append(scores(plant, estimator, episodes, on_rig))
+    rows = [table_row(study, plant.description, (name, e), joined(o)) for e, o in parts.items()]
     if study.lengths:
         bounds = {"bound_by_length": _bound_by_length(study, plant, excitation)}
         rows = [row.model_copy(update=bounds) for row in rows]
@@ -144,15 +142,15 @@ def _bound_by_length(
     return BoundByLength(num_steps=tuple(study.lengths), cramer_rao_percent=percent)
 
 
-def outcome(
+def scores(
     plant: AbstractPlant,
     estimator: AbstractEstimator,
     episodes: Episodes,
     on_rig: Mapping[str, np.ndarray] = MappingProxyType({}),
-) -> Outcome:
+) -> Scores:
     """What an estimator makes of a batch of episodes."""
     estimated, std_error, status = estimate_all(plant, estimator, episodes.trajectory)
-    return Outcome(
+    return Scores(
         true=np.stack(episodes.params, axis=1),
         estimated=np.asarray(estimated),
         std_error=np.asarray(std_error),
@@ -165,7 +163,7 @@ def outcome(
     )
 
 
-def joined(parts: list[Outcome]) -> Outcome:
+def joined(parts: list[Scores]) -> Scores:
     """Several batches as one."""
     return jax.tree.map(lambda *arrays: np.concatenate(arrays), *parts)
 

@@ -38,11 +38,12 @@ from ..report.figure import image
 from ..report.frontier import frontier_figure, lengths_figure
 from ..report.study_figures import agents_figure, curves_figure
 from ..report.study_table import StudyTable, differences_csv
+from ..training.checkpoint import Progress
 from .catalogue import study_path
 from .cluster import dask_engine
 from .engine import Engine, local_engine, run
 from .episodes import episodes_data, example_episodes
-from .evaluation import Progress, compared, method_rows
+from .evaluation import compared, method_rows
 from .folder import agent_settings, fingerprint, read_json, seed_folder, study_of
 from .progress import read_progress, remove_progress
 from .spec import Study, read_study
@@ -105,8 +106,7 @@ def run_study(
         StudyFailedError: where tasks failed; what is finished is kept.
     """
     chosen = study if isinstance(study, Study) else read_study(study_path(study))
-    names = estimators if isinstance(estimators, str | None) else ",".join(estimators)
-    chosen = chosen.changed(episodes=episodes, seed=seed, estimators=names)
+    chosen = chosen.changed(episodes=episodes, seed=seed, estimators=estimators)
     machine = _engine(engine, workers, address, on_wait)
     what = "agents to train" if chosen.agents else "signals to design" if chosen.clairvoyant else ""
     if out is None:

@@ -16,7 +16,7 @@ from ..safety import watched_output
 from .spec import Study
 
 
-class Outcome(eqx.Module):
+class Scores(eqx.Module):
     """All episodes of one method and one estimator, on NumPy arrays.
 
     Attributes:
@@ -35,7 +35,7 @@ class Outcome(eqx.Module):
 
 
 def table_row(
-    study: Study, description: PlantDescription, names: tuple[str, str], outcome: Outcome
+    study: Study, description: PlantDescription, names: tuple[str, str], outcome: Scores
 ) -> Row:
     """One row of the table.
 

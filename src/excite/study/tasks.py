@@ -31,7 +31,7 @@ from ..record.rows import Rows, SeedMetrics
 from ..training.checkpoint import Checkpoint, Trained
 from ..training.signals import clairvoyant_signals, signal_env
 from .agent import Agent
-from .evaluation import episode_keys, evaluate_method, method_rows, outcome
+from .evaluation import episode_keys, evaluate_method, method_rows, scores
 from .folder import agent_settings, fingerprint
 from .progress import write_progress
 from .spec import Study, study_from
@@ -198,7 +198,7 @@ def clairvoyant_task(study: Mapping[str, object], plant: Mapping[str, str | None
         design = clairvoyant_signals(env, keys, chosen.clairvoyant.starts)
         episodes = _played(built, jnp.asarray(design.inputs), chosen.spread, keys)
         rows = [
-            table_row(chosen, built.description, (METHOD, name), outcome(built, e, episodes))
+            table_row(chosen, built.description, (METHOD, name), scores(built, e, episodes))
             for name, e in chosen.build_estimators(built).items()
         ]
         spread = np.ptp(design.worth_by_start, axis=1).tolist()
