@@ -1,6 +1,9 @@
 """The grid: a new plant or excitation is tested by being listed here."""
 
+from functools import partial
+
 import jax.numpy as jnp
+import pytest
 
 from excite.description import Constant, Input, Output, Parameter, PlantDescription, State
 from excite.excitation import PRBS, AbstractShape, Chirp, Decay, Multisine, Random, Square
@@ -55,6 +58,12 @@ PLANTS: dict[str, AbstractPlant] = {
         TwoMasses(),
     )
 }
+
+LONG = partial(pytest.param, marks=pytest.mark.science)
+"""A parameter of the long tests."""
+
+FEW_AND_ALL = [name if name in ("aero2", "two_masses") else LONG(name) for name in PLANTS]
+"""Names of two plants that differ in everything, and of the others in the long tests."""
 
 EXCITATIONS: dict[str, AbstractShape] = {
     "random": Random(),

@@ -68,6 +68,7 @@ def on_rig() -> list[dict[str, Any]]:
     )  # fmt: skip
 
 
+@pytest.mark.science
 def test_what_a_supervisor_ended_has_no_estimate_and_a_filter_prevents_it(on_rig):
     gentle, strong = on_rig
     quiet = {"trips": 0, "filtered_violations": 0, "filtered_trips": 0, "interventions": 0}
@@ -80,6 +81,7 @@ def test_what_a_supervisor_ended_has_no_estimate_and_a_filter_prevents_it(on_rig
     assert strong["on_rig"]["interventions"] > 0
 
 
+@pytest.mark.science
 def test_latency_that_a_record_knows_costs_no_accuracy(on_rig):
     for name in PARAMETERS:  # 10 ms that are not known cost half of D_p
         assert on_rig[0]["rms_over_cramer_rao"][name] < 3

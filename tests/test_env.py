@@ -11,7 +11,7 @@ import numpy as np
 import plain_env
 import pytest
 import scipy.signal
-from catalogue import PLANTS, TwoMasses
+from catalogue import FEW_AND_ALL, PLANTS, TwoMasses
 from plain_env import PlainAero2Env
 
 from excite import safety
@@ -122,7 +122,7 @@ def test_the_process_is_that_of_plain_numpy(name, noisy):
 # ------------------------------------------------------------------ the grid, the state
 
 
-@plants
+@pytest.mark.parametrize("plant", FEW_AND_ALL)
 def test_the_sum_of_rewards_is_the_information_gained(plant):
     plant = PLANTS[plant]
     targets = target_mask(plant.definition, None)

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from catalogue import LONG
 from jaxtyping import Array
 
 from excite.description import Input, Output, Parameter, PlantDescription, State
@@ -227,6 +228,7 @@ def test_training_learns_and_one_seed_gives_one_policy():
     assert not np.array_equal(first.weights[0][0], other.weights[0][0])
 
 
+@pytest.mark.science
 def test_the_penalty_grows_while_plants_are_in_danger():
     definition = Aero2.definition
     pitch = dataclasses.replace(definition.outputs[0], warning_level=5e-5, critical_level=1e-4)
@@ -305,7 +307,7 @@ class Steep(InformationGain):
         return jnp.sqrt(jnp.where(is_flat, 1.0, 0.0) + value - jax.lax.stop_gradient(value))
 
 
-@pytest.mark.parametrize("limit", [0.0, 0.028])
+@pytest.mark.parametrize("limit", [LONG(0.0), 0.028])
 def test_updates_that_are_not_finite_are_counted_and_never_reach_the_weights(limit):
     env = env_of(Steep(ALL, prior_sd_of(0.3), dense=False, limit=limit))
     settings = dataclasses.replace(FEW, num_updates=12, watch_every=12)
@@ -318,6 +320,7 @@ def test_updates_that_are_not_finite_are_counted_and_never_reach_the_weights(lim
         assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(trained.weights))
 
 
+@pytest.mark.science
 def test_several_seeds_side_by_side_are_those_trained_alone():
     env = env_of(OBJECTIVES["D"])
     together = train_all(env, FEW, [0, 1])

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from catalogue import PLANTS, TwoMasses
+from catalogue import FEW_AND_ALL, PLANTS, TwoMasses
 
 from excite.description import Input, Output, Parameter, PlantDescription, State, names_of
 from excite.estimation import NLS, AbstractEstimator, Status, bound_reached, stack_experiments
@@ -59,7 +59,7 @@ def test_noise_free_data_give_the_parameters(name):
     assert np.all(np.abs(estimate.residual) < 1e-7 * scale)
 
 
-@names
+@pytest.mark.parametrize("name", FEW_AND_ALL)
 def test_noise_free_data_give_the_initial_state_too(name):
     plant = PLANTS[name]
     inputs = Chirp().sequence(plant, NUM_STEPS, KEY)

@@ -491,6 +491,7 @@ def chirp(num_steps, amplitude=None):
     return excitation, np.asarray(excitation.sequence(PLANT, num_steps, jax.random.key(0)))
 
 
+@pytest.mark.science
 def test_the_loop_and_the_batch_are_one_experiment(many, tmp_path):
     policy = read_policy(shipped_policies()["aero2-ppo-all"])
     gentle, sequence = chirp(80, 3.0)
@@ -680,6 +681,7 @@ def safety():
     return SafetyFilter.of(PLANT, 0.3)
 
 
+@pytest.mark.science
 def test_the_filter_prevents_every_violation_and_only_these(many, safety):
     shape = 200, NUM_READINGS
     strong, gentle = Chirp(amplitude=12.0), Chirp(amplitude=4.0)
@@ -736,6 +738,7 @@ def test_a_filter_that_has_lost_the_plant_lets_nothing_pass(safety):
     assert not float(input[0]) > 0
 
 
+@pytest.mark.science
 @pytest.mark.parametrize("slew", [math.inf, 30.0])
 def test_no_plant_of_the_set_is_driven_over_the_level(slew):
     """Full voltage either way, at and beside resonance, on every plant that the filter knows."""

@@ -133,6 +133,7 @@ def test_an_experiment_that_completes_is_one_json_object_and_a_record(call):
     }
 
 
+@pytest.mark.science
 @pytest.mark.parametrize("seed", [3])
 def test_what_ran_on_the_rig_identifies_its_hidden_parameters(seed, call):
     """The path of an engineer, with the rig's own policy and plant, then with the paper's."""
