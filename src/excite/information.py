@@ -282,7 +282,7 @@ def information(
         'N m s/rad'
 
     Args:
-        plant, excitation, options, steps, params, noise, resolution, seed: as for `simulate`.
+        plant: as for `simulate`, like all arguments but the last.
         initial_state: "known", or "free" where it must be estimated along; "auto" is known, for
             a record only where its sidecar says that it starts at the plant's initial state.
 

@@ -91,7 +91,9 @@ def run_study(
     Args:
         study: a study, a file, or the name of a shipped study.
         out: run folder; a study without agents needs none.
-        episodes, seed, estimators: in place of the study's.
+        episodes: in place of the study's.
+        seed: in place of the study's.
+        estimators: in place of the study's: their names, or these with commas between.
         engine: processes of this machine, or a Dask cluster.
         workers: processes of the local engine; default one a core.
         address: of the cluster's scheduler, tcp://HOST:PORT.
