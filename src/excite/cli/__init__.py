@@ -1,8 +1,8 @@
 """The command line: reads options, calls one function, shows what it returns.
 
 Nothing is computed here. Commands import what they need when they run, so that `--help`
-answers at once. A user's error is one sentence on stderr and exit code 2; a run that
-failed exits with 1; a traceback comes only with `--debug`.
+is fast. A user's error is one sentence on stderr and exit code 2; a run that failed
+exits with 1; a traceback is printed only with `--debug`.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ class _MainGroup(RememberingGroup):
 @click.option(_DEBUG, is_flag=True, help="Show the traceback of an error.")
 def cli(debug: bool) -> None:
     """Safe, informative experiments for mechatronic systems, and the parameters they identify."""
-    del debug  # read from the arguments in `main`, where errors arrive
+    del debug  # `main`, which handles errors, reads it from the arguments
 
 
 def _document(command: click.Command, example: str) -> None:
@@ -103,7 +103,7 @@ for name, example in _STUDY_EXAMPLES.items():
 
 
 def main() -> None:
-    """Runs the command line; the only place where errors become sentences."""
+    """Runs the command line; only here errors become messages."""
     debug = _DEBUG in sys.argv
     if debug:
         sys.argv.remove(_DEBUG)
@@ -120,7 +120,7 @@ def main() -> None:
     except RunFailedError as error:
         _fail(str(error), 1, debug)
     except Exception as error:
-        # Sentences for the user are plain ValueErrors; its subclasses come from libraries.
+        # Messages for the user are plain ValueErrors; its subclasses come from libraries.
         if type(error) is ValueError or isinstance(error, OSError):
             _fail(str(error), 2, debug)
         _fail(f"failed: {type(error).__name__}: {error} (--debug shows where)", 1, debug)

@@ -13,7 +13,7 @@ from .study import changes, run_study_here, study_in
 @click.command(hidden=True)
 @click.argument("study", metavar="STUDY")
 @changes
-@click.option("--out", type=OUT_FILE, metavar="FOLDER", help="Leave a run folder.")
+@click.option("--out", type=OUT_FILE, metavar="FOLDER", help="Run folder to write.")
 @plot_option
 @json_option
 @computing

@@ -1,8 +1,8 @@
 """Names that a shell completes, found without importing anything that computes.
 
-A shell asks at every press of the Tab key, so the answer must come at once: names of plants,
+The shell calls this at every press of the Tab key, so it must be fast. Names of plants,
 excitations and estimators are read from the source of their catalogue, those of policies and
-studies from the folders of the files that are shipped.
+studies from the folders of the shipped files.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def studies() -> list[str]:
 
 
 def _keys(file: str, dictionary: str) -> list[str]:
-    """Keys of a dictionary that a module of the package writes out."""
+    """Keys of a dictionary literal in a module of the package."""
     tree = ast.parse((_PACKAGE / file).read_text(encoding="utf-8"))
     return [
         key.value
@@ -68,14 +68,14 @@ class Names(click.ParamType):
         self._sources, self._designs = sources, designs
 
     def convert(self, value: str, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """The text as it is: what it names is looked up by what uses it."""
+        """The text, unchanged; the command looks up what it names."""
         del param, ctx
         return value
 
     def shell_complete(
         self, ctx: click.Context, param: click.Parameter, incomplete: str
     ) -> list[CompletionItem]:
-        """Names that begin so, after the last comma of a list; files where there is none."""
+        """Names that begin with what follows the last comma of a list; files if none does."""
         del ctx, param
         before, comma, word = incomplete.rpartition(",")
         names = [*self._designs, *(name for source in self._sources for name in source())]

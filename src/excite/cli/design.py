@@ -1,4 +1,4 @@
-"""`excite design`: a signal that anyone can play on a rig."""
+"""`excite design`: an open-loop signal to be played on a rig."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ from .options import (
     type=click.Choice(["D", "A", "E"]),
     default="D",
     show_default=True,
-    help="Of the Fisher information: its determinant, the trace of its inverse, or its "
+    help="Criterion of the Fisher information: determinant, trace of the inverse, or "
     "smallest eigenvalue.",
 )
-@click.option("--out", type=OUT_FILE, required=True, metavar="FILE.csv", help="The signal.")
+@click.option("--out", type=OUT_FILE, required=True, metavar="FILE.csv", help="Signal to write.")
 @click.option("--overwrite", is_flag=True, help="Replace the file if it exists.")
 @click.option(
     "--kind",
@@ -49,14 +49,16 @@ from .options import (
     metavar="T",
     help="Length in samples.",
 )
-@click.option("--spread", type=float, default=0.3, show_default=True, help="Of the parameters.")
-@click.option("--noise", type=NUMBERS, multiple=True, help="An output's noise, in its unit.")
+@click.option("--spread", type=float, default=0.3, show_default=True, help="Spread of the plants.")
+@click.option("--noise", type=NUMBERS, multiple=True, help="Noise sd of an output, in its unit.")
 @click.option(
-    "--seed", type=WholeNumber(0, 2**63 - 2), default=0, show_default=True, help="Of the search."
+    "--seed",
+    type=WholeNumber(0, 2**63 - 2),
+    default=0,
+    show_default=True,
+    help="Seed of the search.",
 )
-@click.option(
-    "--starts", type=WholeNumber(1), help="Of a search by gradient, side by side; default 4."
-)
+@click.option("--starts", type=WholeNumber(1), help="Starts of a search by gradient; default 4.")
 @click.option(
     "--updates",
     type=WholeNumber(1),

@@ -1,4 +1,4 @@
-"""`excite identify`: from recorded experiments to parameters with confidence."""
+"""`excite identify`: parameters and their confidence intervals from recorded experiments."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from .options import (
     type=click.Choice(["auto", "free", "known"]),
     default="auto",
     show_default=True,
-    help="Estimate initial states, or take the plant's; auto: known where the "
+    help="Estimate initial states, or use the plant's; auto: known where the "
     "sidecar says that the record starts there.",
 )
 @click.option(
@@ -72,7 +72,7 @@ from .options import (
     multiple=True,
     help="Factors from the file's units to the plant's: pitch=0.01745.",
 )
-@click.option("--out", type=OUT_FILE, metavar="FOLDER", help="Leave a run folder.")
+@click.option("--out", type=OUT_FILE, metavar="FOLDER", help="Run folder to write.")
 @click.option("--overwrite", is_flag=True, help="Replace the run folder if it exists.")
 @plot_option
 @json_option

@@ -1,4 +1,4 @@
-"""`excite information`: how well an experiment can determine each parameter at best."""
+"""`excite information`: how precisely an experiment can determine each parameter."""
 
 from __future__ import annotations
 
@@ -25,8 +25,7 @@ from .simulate import excitation_options, given_experiment, show_warnings
 @click.option(
     "--initial-state",
     type=click.Choice(["known", "free"]),
-    help="Whether it must be estimated along; default known, for a file only where its "
-    "sidecar says so.",
+    help="free: estimated too; default known, for a file only where its sidecar says so.",
 )
 @plot_option
 @json_option
@@ -35,7 +34,7 @@ def information(
     plant: str, input_file: Path | None, initial_state: Literal["free", "known"] | None,
     plot: Path | None, as_json: bool, **options: Any,
 ) -> None:  # fmt: skip
-    """Standard deviation that each parameter of PLANT can at best reach (Cramér-Rao bound).
+    """Smallest possible standard deviation of each parameter of PLANT (Cramér-Rao bound).
 
     For an excitation, or for the recorded or designed input in INPUT_FILE.
     """

@@ -15,7 +15,7 @@ class LiveView:
     """One line: time, outputs between their levels, inputs, and the live estimate."""
 
     def __init__(self) -> None:
-        """Draws in a thread of its own: a terminal that blocks must not delay the loop."""
+        """Draws in a separate thread: a terminal that blocks must not delay the loop."""
         self._latest: Sample | None = None
         self._end = threading.Event()
         self._thread = threading.Thread(target=self._draw, daemon=True)
@@ -43,7 +43,7 @@ class LiveView:
 
 
 def line(sample: Sample) -> str:
-    """What is shown of a sample."""
+    """The line for a sample."""
     d = sample.description
     parts = [f"{sample.time:5.1f} / {sample.num_steps * d.dt:g} s"]
     parts += [_gauge(o, y) for o, y in zip(d.outputs, sample.measured, strict=True)]
@@ -53,7 +53,7 @@ def line(sample: Sample) -> str:
 
 
 def _gauge(output: Output, value: float) -> str:
-    """An output in its place between its critical levels, with the warning levels marked."""
+    """An output as a mark between its critical levels, with the warning levels marked."""
     unit, factor = display_unit(output.unit)
     text = f"{output.name} {factor * value:+7.2f} {unit}"
     if output.critical_level is None:

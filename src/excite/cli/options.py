@@ -1,4 +1,4 @@
-"""What every command does at the door: options in, computing prepared, results shown."""
+"""Shared by all commands: option types, preparation of JAX, progress, output."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ Value = TypeVar("Value")
 
 
 class RunFailedError(Exception):
-    """A run that failed through no mistake in its options: exit code 1."""
+    """A run that failed although its options are valid: exit code 1."""
 
 
 class RememberingGroup(click.Group):
-    """A group that remembers the words it was called with, for `command_line`."""
+    """A group that keeps its arguments for `command_line`."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """As any group does it, which uses up the words."""
+        """Parses the arguments and keeps a copy."""
         ctx.meta[_WORDS] = list(args)
         return super().parse_args(ctx, args)
 
@@ -43,7 +43,7 @@ _WORDS = "excite.words"
 
 
 def command_line() -> str:
-    """The command that is running, as one would type it again."""
+    """The running command, as it was typed."""
     return shlex.join(["excite", *click.get_current_context().meta.get(_WORDS, [])])
 
 
@@ -79,7 +79,7 @@ class Assignments(click.ParamType, Generic[Value]):
 
 
 class WholeNumber(click.IntRange):
-    """A whole number of a range, called so when it is none."""
+    """A whole number in a range, with this word in its messages."""
 
     name = "whole number"
 
@@ -140,7 +140,7 @@ def computing(command: Callable[P, Result]) -> Callable[P, Result]:
 
 def prepare_jax() -> None:
     """Double precision, and a cache of compiled programs."""
-    # The compiler's remarks on its own cache are no concern of the user's.
+    # The user cannot act on the compiler's messages about its cache.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     import jax
 
@@ -154,7 +154,7 @@ def _keep_compiled_programs() -> None:
     folder = cache_folder()
     try:
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError:  # a home that cannot be written to makes commands slower, not wrong
+    except OSError:  # without a cache commands are slower, not wrong
         return
     if os.access(folder, os.W_OK):
         jax.config.update("jax_compilation_cache_dir", str(folder))
@@ -163,14 +163,14 @@ def _keep_compiled_programs() -> None:
 
 
 def cache_folder() -> Path:
-    """Where compiled programs are kept: EXCITE_CACHE, or the user's cache folder."""
+    """Folder of compiled programs: EXCITE_CACHE, or the user's cache folder."""
     own = os.environ.get("EXCITE_CACHE")
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(own) if own else Path(base) / "excite"
 
 
 class Lines:
-    """How far a command is: a line on stderr every ten seconds, where it is no terminal.
+    """Progress of a command: a line on stderr every ten seconds, if stderr is no terminal.
 
     EXCITE_PROGRESS sets another time between two lines [s]; 0 means none.
     """
@@ -185,24 +185,24 @@ class Lines:
         self._teller = threading.Thread(target=self._tell, daemon=True)
 
     def __enter__(self) -> Self:
-        """Begins to tell."""
+        """Starts printing."""
         self._teller.start()
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Says nothing more."""
+        """Stops printing."""
         self._end.set()
         self._teller.join()
 
     def update(self, text: str, done: float, total: float) -> None:
-        """Sets what is being done, how much is done, and of how much."""
+        """Sets the current step, how much is done, and the total."""
         self._text, self._share = text, done / total if total else 0.0
         self._first = self._first or (time.monotonic(), self._share)
 
     def line(self) -> str:
-        """What is done, how much of it, and how long it will take or has taken."""
+        """The current step, how much of it is done, and the time left or elapsed."""
         now = time.monotonic()
-        began, before = self._first or (now, 0.0)  # what is resumed has been done at once
+        began, before = self._first or (now, 0.0)  # resumed work counts as done at the start
         if (gained := self._share - before) > 0:
             time_left = (now - began) * (1 - self._share) / gained
             how_far = f"{100 * self._share:.0f} %, {_duration(time_left)} left"
@@ -217,7 +217,7 @@ class Lines:
 
 
 def _duration(seconds: float) -> str:
-    """In the units of a clock."""
+    """A duration in hours, minutes or seconds."""
     hours, minutes = divmod(round(seconds / 60), 60)
     if hours:
         return f"{hours} h {minutes} min"
@@ -235,9 +235,9 @@ def warnings_shown() -> Iterator[None]:
 
 @contextlib.contextmanager
 def progress_bar(what: str) -> Iterator[Callable[[str, float, float], None]]:
-    """Shows how far a command is on stderr: a bar on a terminal, lines elsewhere.
+    """Shows the progress of a command on stderr: a bar on a terminal, lines elsewhere.
 
-    Yields a function that sets what is being done, how much is done, and of how much.
+    Yields a function that sets the current step, how much is done, and the total.
     """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TimeRemainingColumn
@@ -265,7 +265,7 @@ def progress_bar(what: str) -> Iterator[Callable[[str, float, float], None]]:
 
 @contextlib.contextmanager
 def _interrupts() -> Iterator[list[int]]:
-    """Every Ctrl-C, as it comes; one that is raised in a library's callback would be lost."""
+    """Counts every Ctrl-C; one raised in a library's callback would be lost."""
     came, usual = list[int](), signal.getsignal(signal.SIGINT)
 
     def remember(number: int, frame: object) -> None:
@@ -273,7 +273,7 @@ def _interrupts() -> Iterator[list[int]]:
         came.append(number)
         raise KeyboardInterrupt
 
-    if usual is not signal.default_int_handler:  # somebody else's, or ignored
+    if usual is not signal.default_int_handler:  # another handler, or ignored
         yield came
         return
     signal.signal(signal.SIGINT, remember)

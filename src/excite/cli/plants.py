@@ -1,4 +1,4 @@
-"""`excite plants`: what is shipped, and everything about one plant."""
+"""`excite plants`: the shipped plants, and the description of one plant."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def plants(plant: str | None, as_json: bool, plot: Path | None) -> None:
         show_json({"plants": [{**d.to_dict(), "hash": d.hash} for d in descriptions]})
     elif plant is None:
         show_table(
-            "Plants (excite plants NAME tells all of one)",
+            "Plants (details: excite plants NAME)",
             ["plant", "inputs", "outputs", "parameters", "dt [s]"],
             [
                 [

@@ -1,4 +1,4 @@
-"""`excite policies` and `excite evaluate`: what is shipped, and what a policy is worth."""
+"""`excite policies` and `excite evaluate`: the shipped policies, and the score of one."""
 
 from __future__ import annotations
 
@@ -59,14 +59,16 @@ def policies(as_json: bool) -> None:
 @click.argument("policy")
 @click.option("--plant", help="Name or path/to/file.py:ClassName; default the policy's plant.")
 @click.option(
-    "--episodes", type=WholeNumber(1), default=1000, show_default=True, help="Fresh plants."
+    "--episodes", type=WholeNumber(1), default=1000, show_default=True, help="Plants drawn."
 )
-@click.option("--seed", type=WholeNumber(0), default=0, show_default=True, help="Of the plants.")
-@click.option("--spread", type=float, default=0.3, show_default=True, help="Of the parameters.")
-@click.option("--noise", type=NUMBERS, multiple=True, help="An output's noise, in its unit.")
-@click.option("--estimators", metavar="NAME,...", help="Default nls, and arx-rls where it can.")
-@click.option("--rig", "on_rig", is_flag=True, help="On the plant's simulated rig.")
-@click.option("--filter", "filtered", is_flag=True, help="There, once more behind a safety filter.")
+@click.option(
+    "--seed", type=WholeNumber(0), default=0, show_default=True, help="Seed of the plants."
+)
+@click.option("--spread", type=float, default=0.3, show_default=True, help="Spread of the plants.")
+@click.option("--noise", type=NUMBERS, multiple=True, help="Noise sd of an output, in its unit.")
+@click.option("--estimators", metavar="NAME,...", help="Default nls, and arx-rls if possible.")
+@click.option("--rig", "on_rig", is_flag=True, help="Use the plant's simulated rig.")
+@click.option("--filter", "filtered", is_flag=True, help="With --rig: also behind a safety filter.")
 @json_option
 @computing
 def evaluate(policy: str, as_json: bool, **options: Any) -> None:

@@ -1,4 +1,4 @@
-"""`excite report`: runs as one page to send to a colleague."""
+"""`excite report`: runs as one self-contained HTML page."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from .options import OUT_FILE, json_option, progress_bar, show_json
 
 @click.command()
 @click.argument("runs", nargs=-1, required=True, type=OUT_FILE, metavar="RUN...")
-@click.option("--out", type=OUT_FILE, required=True, metavar="FILE.html", help="The page.")
+@click.option("--out", type=OUT_FILE, required=True, metavar="FILE.html", help="Page to write.")
 @click.option("--overwrite", is_flag=True, help="Replace the page if it exists.")
 @json_option
 def report(runs: tuple[Path, ...], out: Path, overwrite: bool, as_json: bool) -> None:
-    """One page of figures, tables and provenance that needs nothing else.
+    """Write one self-contained page of figures, tables and provenance.
 
     RUN is a run folder of `excite identify` or `excite study run`, or a record with its
     sidecar; several are shown side by side.

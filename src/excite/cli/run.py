@@ -38,7 +38,7 @@ def _options(command: Callable[..., int]) -> Callable[..., int]:
         click.option("--rig", default="simulated", show_default=True, metavar="NAME",
                      help="simulated, quanser, a co-simulation unit FILE.fmu, or your class as "
                      "path/to/file.py:ClassName."),
-        click.option("--plant", help="Of the rig, where JAX is installed; default aero2_detailed."),
+        click.option("--plant", help="Plant of the rig; needs JAX; default aero2_detailed."),
         click.option("--policy", metavar="NAME",
                      help="Play a policy: shipped, or a file; default that of the plant."),
         click.option("--input", "signal", type=OUT_FILE, metavar="FILE",
@@ -48,31 +48,31 @@ def _options(command: Callable[..., int]) -> Callable[..., int]:
                      "needs JAX."),
         click.option("--set", "settings", type=VALUES, multiple=True,
                      help="Options of the excitation: amplitude, gain, frequencies, ..."),
-        click.option("--out", type=OUT_FILE, metavar="FILE.csv", help="The record."),
+        click.option("--out", type=OUT_FILE, metavar="FILE.csv", help="Record to write."),
         click.option("--overwrite", is_flag=True, help="Replace the record if it exists."),
         click.option("--steps", type=WholeNumber(2), metavar="T",
-                     help="Samples; default all of a policy or file, else 500."),
+                     help="Number of samples; default all of a policy or file, else 500."),
         click.option("--slew", type=float, default=math.inf, metavar="RATE",
-                     help="Largest change of an input in a second, in its unit; default any."),
+                     help="Largest change of an input per second, in its unit; default no limit."),
         click.option("--filter", is_flag=True,
                      help="Predictive safety filter: changes an input where a plant of the prior "
                      "could no longer be brought to rest before its critical level."),
         click.option("--address", default="0", show_default=True,
-                     help="Of the Quanser rig: a board, or a virtual one "
+                     help="Board of the Quanser rig, or a virtual one "
                      "(0@tcpip://localhost:18950)."),
         click.option("--fast", is_flag=True,
                      help="Run a simulated rig or an FMU as fast as it can."),
         click.option("--dry-run", is_flag=True, help="Show the inputs; send nothing."),
         click.option("--seed", type=WholeNumber(0), default=0, show_default=True,
-                     help="Of a simulated rig's hidden parameters, noise and jitter, and of random "
-                     "signals."),
+                     help="Seed of a simulated rig's hidden parameters, noise and jitter, and of "
+                     "random signals."),
         click.option("--spread", type=click.FloatRange(0, 1, max_open=True), default=0.3,
                      show_default=True,
-                     help="Of these parameters and of the filter's prior, in fractions of their "
-                     "scales."),
+                     help="Spread of these parameters and of the filter's prior, as a fraction of "
+                     "their scales."),
         click.option("--fault", "faults", type=NUMBERS, multiple=True,
-                     help="Of a simulated rig: latency, jitter [s], dropout (probability of a "
-                     "lost reading)."),
+                     help="Faults of a simulated rig: latency, jitter [s], dropout (probability "
+                     "of a lost reading)."),
     ]):  # fmt: skip
         command = option(command)
     return command

@@ -16,14 +16,14 @@ from .options import OUT_FILE, WholeNumber, cache_folder, json_option, show_json
     default="127.0.0.1",
     show_default=True,
     metavar="ADDRESS",
-    help="Where to listen; other computers get in by the token alone.",
+    help="Address to listen on; other computers need the token.",
 )
 @click.option(
     "--port",
     type=WholeNumber(0, 65535),
     default=8000,
     show_default=True,
-    help="0 takes a free one.",
+    help="Port to listen on; 0 takes a free one.",
 )
 @click.option(
     "--runs",
@@ -31,18 +31,18 @@ from .options import OUT_FILE, WholeNumber, cache_folder, json_option, show_json
     default=Path("runs"),
     show_default=True,
     metavar="FOLDER",
-    help="The run folder that is shown.",
+    help="Run folder to show.",
 )
 @click.option(
     "--token",
     metavar="TEXT",
-    help="What a browser must show; default one drawn at "
-    "random where --host is not this computer alone, none where it is.",
+    help="Token that a browser must send; default none if --host is "
+    "this computer alone, else a random one.",
 )
 @click.option(
     "--workers",
     type=WholeNumber(1, 64),
-    help="Processes that compute; default one a core, at most four.",
+    help="Worker processes; default one per core, at most four.",
 )
 @json_option
 def serve(
@@ -50,7 +50,7 @@ def serve(
 ) -> None:  # fmt: skip
     """Serve the bench page until interrupted: run an excitation and watch what it identifies.
 
-    Bound to this computer alone unless --host says otherwise.
+    Other computers cannot reach it unless --host is set.
     """
     try:
         from ..web import PageSettings, address_of, listening_at
@@ -60,7 +60,7 @@ def serve(
 
     source = click.get_current_context().get_parameter_source("runs")
     if source is ParameterSource.DEFAULT and not runs.exists():
-        runs.mkdir()  # nobody has left a run here yet
+        runs.mkdir()  # no run yet
     settings = PageSettings.of(runs, host, token, workers, cache_folder())
     with listening_at(host, port) as listening:
         address = address_of(settings, listening)

@@ -43,14 +43,14 @@ def excitation_options(command: Callable[..., Any]) -> Callable[..., Any]:
                          help="Length in samples; default 500, that of a policy, or all of a "
                          "file."),
             click.option("--params", type=NUMBERS, multiple=True,
-                         help="True parameters where they are not the nominal ones."),
+                         help="True parameters that differ from the nominal ones."),
             click.option("--noise", type=NUMBERS, multiple=True,
                          help="Standard deviation of an output's noise, in its unit."),
             click.option("--resolution", type=NUMBERS, multiple=True,
                          help="Step of an output's encoder, in its unit."),
             click.option("--seed", type=click.IntRange(0, 2**63 - 1), default=0, show_default=True),
             click.option("--column", type=NAMES, multiple=True,
-                         help="Columns of the input file that have another name."),
+                         help="Columns of the input file with another name: voltage=u."),
             click.option("--scale", type=NUMBERS, multiple=True,
                          help="Factors from the input file's units to the plant's."),
         ]
@@ -99,7 +99,7 @@ def simulate(
     plant: str, input_file: Path | None, out: Path | None, plot: Path | None, as_json: bool,
     **options: Any,
 ) -> None:  # fmt: skip
-    """Run one experiment on PLANT and record what its sensor shows.
+    """Run one experiment on PLANT and record its measured outputs.
 
     The input is an excitation, or replayed from INPUT_FILE (columns: time and the inputs).
     """

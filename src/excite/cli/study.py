@@ -1,4 +1,4 @@
-"""`excite study`: compares methods, trains agents, and shows the table."""
+"""`excite study`: compares methods, trains agents, prints the table."""
 
 from __future__ import annotations
 
@@ -96,10 +96,10 @@ def run_study_here(
 
 @contextlib.contextmanager
 def running(name: str, keeps: Path | None) -> Iterator[dict[str, Any]]:
-    """What a running study says, as arguments of a verb; how it ends; shared with `train`.
+    """Messages of a running study, as arguments of a verb; shared with `train`.
 
     Args:
-        keeps: folder that keeps what is finished when it is interrupted.
+        keeps: folder that keeps finished tasks after an interruption.
     """
     from ..study.run import StudyFailedError
 

@@ -12,7 +12,7 @@ from .study import running, show_comparison
 
 
 def _options(command: Any) -> Any:
-    """What is trained, on what, and for what."""
+    """The options that choose objective, method, plants and experiment."""
     for option in reversed(
         [
             click.option("--method", type=click.Choice(["gradient", "ppo"]), default="gradient",
@@ -22,19 +22,19 @@ def _options(command: Any) -> Any:
                          "estimator (relative, log, goals) or of nonlinear least squares (nls); "
                          "repeated, a sum with these weights. Default D."),
             click.option("--target", multiple=True, metavar="NAME",
-                         help="Parameter that counts; default the plant's targets."),
+                         help="Parameter in the objective; default the plant's targets."),
             click.option("--goal", type=NUMBERS, multiple=True,
-                         help="Relative error of a parameter that counts as one."),
+                         help="Relative error of a parameter that is scaled to one."),
             click.option("--output-scale", type=NUMBERS, multiple=True,
-                         help="What an output is divided by before it is observed, in its unit."),
+                         help="Scale by which an observed output is divided, in its unit."),
             click.option("--window", type=WholeNumber(1, 10_000),
-                         help="Samples observed; default 80."),
+                         help="Number of samples observed; default 80."),
             click.option("--clock", type=float, multiple=True, metavar="HZ",
-                         help="Observe sine and cosine of this frequency too."),
+                         help="Also observe sine and cosine of this frequency."),
             click.option("--set", "training", type=VALUES, multiple=True,
                          help="Hyper-parameters of the method, for instance num_updates=300."),
             click.option("--seeds", type=WholeNumber(1, 1000), default=1, show_default=True,
-                         help="Independent trainings."),
+                         help="Number of independent trainings."),
             click.option("--spread", type=click.FloatRange(0, 1, max_open=True), default=0.3,
                          show_default=True,
                          help="Plants are drawn from nominal values ± this fraction."),
@@ -43,7 +43,7 @@ def _options(command: Any) -> Any:
             click.option("--noise", type=NUMBERS, multiple=True,
                          help="Standard deviation of an output's noise, in its unit."),
             click.option("--episodes", type=WholeNumber(1), default=100, show_default=True,
-                         help="Evaluation episodes."),
+                         help="Number of evaluation episodes."),
         ]
     ):  # fmt: skip
         command = option(command)
@@ -52,7 +52,7 @@ def _options(command: Any) -> Any:
 
 @click.command()
 @click.argument("plant")
-@click.option("--out", type=OUT_FILE, required=True, metavar="FOLDER", help="Its run folder.")
+@click.option("--out", type=OUT_FILE, required=True, metavar="FOLDER", help="Run folder.")
 @_options
 @json_option
 @computing

@@ -1,4 +1,4 @@
-// Requests to the server, and the little that every part of the page needs.
+// Requests to the server, and functions that every part of the page uses.
 
 /** An element: el("td", {class: "best"}, "text", child, ...); texts stay texts. */
 export function el(name, attributes = {}, ...children) {
@@ -33,7 +33,7 @@ export function say(form, sentence, isBad = false) {
 export const tell = (form, sentence) => { form.querySelector(".progress").textContent = sentence; };
 
 async function sentenceOf(response) {
-  try { return (await response.json()).sentence ?? "the server did not understand"; }
+  try { return (await response.json()).sentence ?? "the server rejected the request"; }
   catch { return `the server answered with ${response.status}`; }
 }
 
@@ -85,7 +85,7 @@ export class Task {
     if (this.isBusy) return;
     this.isBusy = true;
     this.refresh();
-    let ending = "the stream ended too early; run it again";
+    let ending = "the connection ended too early; run it again";
     try {
       await stream(address, content, (event) => {
         if (event.kind === "job") this.job = event.job;

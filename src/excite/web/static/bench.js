@@ -1,4 +1,4 @@
-// The page as a whole: its parts, the token, what there is to choose from.
+// The whole page: its parts, the token, the lists to choose from.
 
 import { get, post, say } from "./api.js";
 import * as experiment from "./experiment.js";
@@ -56,7 +56,7 @@ try {
   const brought = new URLSearchParams(`token=${location.hash.slice(1)}`).get("token");
   if (isKnown) await enter();
   else if (brought && !isPart(brought)) {
-    history.replaceState(null, "", location.pathname); // the token stays out of the history
+    history.replaceState(null, "", location.pathname); // keeps the token out of the history
     await show(brought);
   } else knock();
 } catch (error) {

@@ -1,4 +1,4 @@
-// Choose a plant and an excitation, press run, watch what is identified.
+// Choose a plant and an excitation, run the experiment, watch the estimates.
 
 import { download, el, options, say, symbol, Task, tell } from "./api.js";
 import { digits, Plot, range, shown } from "./plot.js";
@@ -67,7 +67,7 @@ function chooseExcitation() {
 
 function tellLength() {
   const seconds = +at("steps").value * plant.dt;
-  at("seconds").textContent = `${shown(seconds)} s at ${shown(1000 * plant.dt)} ms a sample`;
+  at("seconds").textContent = `${shown(seconds)} s at ${shown(1000 * plant.dt)} ms per sample`;
 }
 
 function drawParams() {
@@ -93,7 +93,7 @@ function asked() {
 }
 
 const waiting = (live) => (live.found.length ? "Estimating and comparing…"
-  : "Compiling the estimator for this plant and length; only the first run waits for this…");
+  : "Compiling the estimator for this plant and length; only needed for the first run…");
 
 function run() {
   const wanted = asked();
@@ -130,9 +130,9 @@ class Live {
     const title = (part) => el("span", {}, part.name, " ", el("span", { class: "unit" }, part.shown_unit));
     const from = (name) => el("span", {}, symbol(name), " ", el("span", { class: "unit" }, "% from the true value"));
     this.plots = [...plan.plant.inputs, ...plan.plant.outputs].map((part) =>
-      new Plot(at("signals"), title(part), `${part.name} over time, with its safety levels where it has some`));
+      new Plot(at("signals"), title(part), `${part.name} over time, with its safety levels`));
     this.tracks = plan.plant.parameters.map((p) =>
-      new Plot(at("estimates"), from(p.name), `estimate of ${p.name} over time in percent from the true value, 95 % interval and Cramér-Rao bound`));
+      new Plot(at("estimates"), from(p.name), `estimate of ${p.name} over time, deviation from the true value in percent, 95 % interval and Cramér-Rao bound`));
     this.draw();
   }
 
@@ -153,7 +153,7 @@ class Live {
       const column = (what) => this.found.map((e) => (e[what][name] === null ? null : e[what][name] * per));
       const middle = column("estimate").map((v) => (v === null ? null : v - true_ * per));
       const half = column("half"), bound = column("bound");
-      // The first estimates are far off: the picture follows the later ones.
+      // The first estimates are far off: the scale follows the later ones.
       const from = Math.floor(this.found.length / 2.5), reach = [];
       for (let j = from; j < middle.length; j++) if (middle[j] !== null) reach.push(Math.abs(middle[j]) + half[j], bound[j]);
       const top = 1.15 * (Math.max(...reach.filter(Number.isFinite), 0) || 100);
@@ -189,7 +189,7 @@ class Live {
         x, y: range(values, ...levels.map((l) => 1.1 * l.y), ...(levels.length ? [] : [-0.1 * part.scale * part.factor, 0.1 * part.scale * part.factor])), unit: "s", levels,
         lines: [{ x: this.time, y: values, color: "output" }],
       });
-      // Whether it is a violation is a question to the true output: the comparison answers it.
+      // A violation is one of the true output, which only the comparison shows.
       this.plots[inputs.length + i].note.textContent = `largest measured ${shown(largest)} ${part.shown_unit}`;
     });
   }
@@ -226,7 +226,7 @@ function conclude(event) {
   downloads.replaceChildren(...(identification ? [
     download(`api/results/${result}/report.html`, "Report"),
     download(`api/results/${result}/record.csv`, "Record"),
-    download(`api/results/${result}/record.json`, "Its sidecar"),
+    download(`api/results/${result}/record.json`, "Sidecar"),
     download(`api/results/${result}/estimate.json`, "Estimate"),
   ] : []));
 }

@@ -98,7 +98,7 @@ function show({ identification, plant: fitted, result, time, inputs, outputs, si
   section.querySelector(".downloads").replaceChildren(
     download(`api/results/${result}/report.html`, "Report"),
     download(`api/results/${result}/record.csv`, "Record"),
-    download(`api/results/${result}/record.json`, "Its sidecar"),
+    download(`api/results/${result}/record.json`, "Sidecar"),
     download(`api/results/${result}/estimate.json`, "Estimate"));
   const parent = at("record-signals"), x = [time[0], time.at(-1)];
   parent.replaceChildren();

@@ -1,4 +1,4 @@
-// The run folder: what the command line and the trainings of this page have left.
+// The run folder: results of the command line and of trainings started on this page.
 
 import { download, el, get, say } from "./api.js";
 import { curves } from "./curves.js";
@@ -26,7 +26,7 @@ async function show(run, button) {
   const name = encodeURIComponent(run.name), address = (file) => `api/run/file?name=${name}&file=${encodeURIComponent(file)}`;
   try {
     const content = await get(`api/run?name=${name}`);
-    if (chosen !== run.name) return; // another was chosen while this one came
+    if (chosen !== run.name) return; // another was chosen while this one was loading
     const card = el("section", { class: "card" }, el("h2", {}, content.title || run.name));
     if (content.estimate.params) {
       const estimate = el("table");

@@ -46,7 +46,7 @@ const isRunning = ({ state }) => ["starting", "training", "stopping"].includes(s
 function show(training) {
   if (!cards.has(training.name)) cards.set(training.name, newCard(training));
   const card = cards.get(training.name), rows = training.curve;
-  const running = { starting: "starting; the first look takes a minute or so", training: "training", stopped: "stopped; rerun the command to resume from the last checkpoint (one every twenty seconds)" };
+  const running = { starting: "starting; the first evaluation takes about a minute", training: "training", stopped: "stopped; rerun the command to resume from the last checkpoint (one every twenty seconds)" };
   const sentence = training.sentence || running[training.state] || training.state;
   if (card.state.textContent !== sentence) card.state.textContent = sentence;
   card.far.textContent = isRunning(training) && rows.length ? `${rows.at(-1).steps} steps` : "";
