@@ -327,7 +327,7 @@ def test_a_policy_is_an_excitation_like_any_other(run, policy, tmp_path):
     ("words", "sentence"),
     [
         (("emps",), "trained for the input 'voltage'"),
-        (("aero2", "--steps", 41), "policy.safetensors was made for 40 steps; 41 are asked for"),
+        (("aero2", "--steps", 41), "policy.safetensors was made for 40 steps: got 41"),
         (("aero2", "--steps", 40, "--set", "amplitude=3"), "a policy has no options"),
     ],
 )

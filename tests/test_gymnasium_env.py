@@ -327,4 +327,4 @@ def test_a_process_for_each_environment_is_spawned_or_refused(context, tmp_path)
         assert done.stdout == "(1, 161)\n", done.stderr
     else:
         assert done.returncode == 1
-        assert "JAX does not survive a fork" in done.stderr
+        assert "JAX does not support fork" in done.stderr

@@ -334,7 +334,7 @@ def test_a_simulated_plants_own_parameters_stand_beside_the_estimates(made):
 def test_every_record_of_an_experiment_is_drawn_with_its_fit(made):
     for name, count in (("one", 1), ("both", 2)):
         words = page_of(made / name).words
-        captions = [w for w in words if "measured against simulated" in w]
+        captions = [w for w in words if "measured and simulated output" in w]
         assert len(captions) == count
 
 
@@ -347,8 +347,8 @@ def test_a_page_says_how_to_do_it_again(made, tmp_path):
     shutil.copytree(RESULTS / "half", tmp_path / "half")
     marker = read(tmp_path / "half" / "run.json")
     (tmp_path / "half" / "run.json").write_text(json.dumps({**marker, "command": ""}))
-    old = page_of(tmp_path / "half").section("Do it again")
-    assert "most likely" in old
+    old = page_of(tmp_path / "half").section("Repeat the run")
+    assert "Most likely" in old
     assert "excite study run half.toml --out FOLDER" in old
 
 
@@ -363,7 +363,7 @@ def test_a_record_says_how_the_experiment_ended(made):
 def test_a_record_that_was_cut_off_says_so(here):
     sidecar = here / "rig.json"
     sidecar.write_text(json.dumps({**read(sidecar), "ended": None}))
-    assert "has not ended, or was killed" in report_html([here / "rig.csv"])
+    assert "is still running, or its process was killed" in report_html([here / "rig.csv"])
 
 
 def test_levels_that_were_reached_are_named(here):
@@ -475,7 +475,7 @@ def test_long_records_make_no_large_page(here, drawn, monkeypatch):
     monkeypatch.setattr("excite.report.html._NUM_POINTS", (4000,))
     large = report_html([here / "one", here / "one"])
     assert len(large) > 350_000
-    assert "easier to send on several" in large
+    assert "several pages are easier to send" in large
 
 
 def test_what_scrolls_on_a_screen_is_reached_by_the_keyboard_and_named(made):

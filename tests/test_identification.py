@@ -158,7 +158,7 @@ def test_a_lag_may_be_known_or_estimated():
 
 @pytest.mark.parametrize(
     ("hold", "complaint"),
-    [(("J",), "no parameter 'J'"), (("J_p", "K_pu", "D_p"), "every parameter is held")],
+    [(("J",), "no parameter 'J'"), (("J_p", "K_pu", "D_p"), "all parameters are held")],
 )
 def test_what_cannot_be_held_is_refused(chirp, hold, complaint):
     with pytest.raises(ValueError, match=complaint):

@@ -222,10 +222,10 @@ def test_a_pickle_is_refused_and_not_opened(tmp_path):
     ({"format": FORMAT, "data": "{'layout': 1}"}, "no excite policy file"),
     ({"format": FORMAT, "data": "[" * 100_000}, "no excite policy file"),
     ({"format": FORMAT, "data": "{}"}, "incomplete or malformed contract ('layout')"),
-    ({"format": FORMAT, "data": "[]"}, "its data are no JSON object"),
-    ({"format": FORMAT, "data": "3"}, "its data are no JSON object"),
-    ({"format": FORMAT, "data": "null"}, "its data are no JSON object"),
-    ({"format": FORMAT, "data": '"layout"'}, "its data are no JSON object"),
+    ({"format": FORMAT, "data": "[]"}, "its data are not a JSON object"),
+    ({"format": FORMAT, "data": "3"}, "its data are not a JSON object"),
+    ({"format": FORMAT, "data": "null"}, "its data are not a JSON object"),
+    ({"format": FORMAT, "data": '"layout"'}, "its data are not a JSON object"),
 ])  # fmt: skip
 def test_metadata_that_are_no_contract_are_refused(metadata, sentence):
     assert sentence in refusal(file_of(metadata=metadata))

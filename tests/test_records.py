@@ -316,7 +316,9 @@ BAD_FILES: dict[str, tuple[str, str | bytes | Callable[[Path], None], tuple[str,
     ),
     "repeated time": ("r.csv", spoiled(time={5: "0.4"}), ("uneven", "samples 5 and 6")),
     "time in reverse": (
-        "r.csv", text_of({n: list(reversed(v)) for n, v in table().items()}), ("does not grow",),
+        "r.csv",
+        text_of({n: list(reversed(v)) for n, v in table().items()}),
+        ("does not increase",),
     ),
     "input in millivolts": (
         "r.csv", spoiled(voltage={3: "7200.0"}),
@@ -429,7 +431,7 @@ def test_a_mapping_of_a_column_that_the_plant_has_not_is_refused(mapping, tmp_pa
 def test_a_scale_of_one_says_that_the_unit_is_right(tmp_path):
     path = tmp_path / "r.csv"
     path.write_text(spoiled(voltage={3: "72.0"}))
-    with pytest.raises(ValueError, match="1 says that the unit is right"):
+    with pytest.raises(ValueError, match="1 confirms that the unit is right"):
         read_record(path, AERO2)
     assert read_record(path, AERO2, scales={"voltage": 1.0}).inputs.max() == 72
 

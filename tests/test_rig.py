@@ -237,7 +237,7 @@ ENDINGS = {
     "the rig fails to read": ({"script": SHAKEN}, None, "the cable is out", None, 6),
     "its clock stands": ({"clock": 0.0}, None, "stood still", "stale", 1),
     "its clock is none": ({"clock": math.nan}, None, "stood still", "stale", 1),
-    "its clock runs": ({"clock": 1.5}, None, "left the plan", "duration", 6),
+    "its clock runs": ({"clock": 1.5}, None, "too fast or too slow", "duration", 6),
     "SIGHUP": ({}, kill(signal.SIGHUP), "interrupted by SIGHUP", None, 5),
 }
 
@@ -858,7 +858,7 @@ def experiment_under_way(folder: Path, num_needed: int) -> Iterator[subprocess.P
                         return
                     time.sleep(0.02)
                 out = process.communicate()[0]
-                assert "deadlines were lost" in out, out
+                assert "deadlines were missed" in out, out
             finally:
                 process.kill()
     pytest.fail("no experiment came so far")

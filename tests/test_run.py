@@ -197,7 +197,7 @@ REFUSALS = {
         (*FAST, "--policy", "aero2-ppo-all", "--excitation", "chirp"), "exclude each other",
     ),
     "excitation": ((*FAST, "--excitation", "chrip"), "did you mean 'chirp'"),
-    "options of nothing": ((*FAST, "--set", "amplitude=1"), "--set has the options of an"),
+    "options of nothing": ((*FAST, "--set", "amplitude=1"), "--set needs an --excitation"),
     "option of an excitation": (
         (*FAST, "--excitation", "loop-multisine", "--set", "gain=-1"), "must not be negative",
     ),
@@ -317,7 +317,7 @@ def test_run_is_a_function_of_the_library(call, tmp_path):
     dry = session.run(dry_run=True, steps=20, policy=read_policy("aero2_detailed"))
     assert dry.inputs.shape == (20, 1)
     assert "nothing is sent" in repr(dry)
-    with pytest.raises(ValueError, match="always recorded"):
+    with pytest.raises(ValueError, match="must be recorded"):
         session.run(fast=True)
 
 

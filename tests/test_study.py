@@ -315,7 +315,7 @@ BAD_STUDIES: dict[str, tuple[str, tuple[str, ...]]] = {
     "no terms": (MINIMAL + "[agents.a.decision]\nterms = []\n", ("terms", "at least 1")),
     "a reward beside terms": (
         MINIMAL + "[agents.a]\n[agents.a.decision]\nreward = 'log'\nterms = [{ weight = 2.0 }]\n",
-        ("agents.a: decision: with terms, 'reward' belongs to one of them",),
+        ("agents.a: decision: with terms, set 'reward' in one of them",),
     ),
     "an unknown key in a term": (
         MINIMAL + "[agents.a]\n[decision]\nterms = [{ wight = 2.0 }]\n", ("wight", "weight"),

@@ -1,10 +1,9 @@
-"""What a plant is, as plain data: names, units, limits, levels, sensor, nominal values.
+"""The description of a plant as plain data: names, units, limits, levels, sensor, values.
 
 A `PlantDescription` needs neither JAX nor NumPy, so that a report, a web page or a
-laboratory computer reads it at once. Its hash identifies the plant in records and
-policies: it is the SHA-256 of canonical JSON with a format number, never of source
-code, so that moving or reformatting a plant file does not change it, and changing any
-number does.
+laboratory computer can read it fast. Its hash identifies the plant in records and
+policies. It is the SHA-256 of canonical JSON with a format number, not of source code:
+it changes with any number, but not when a plant file is moved or reformatted.
 
 All values are in SI units and radians.
 """
@@ -28,8 +27,8 @@ HALF_95 = 1.959964
 """Half of a 95 % interval in standard deviations, wherever one is shown."""
 
 RARE = 0.01
-"""p-value below which a residual is said not to be white, or to follow the input: in sentences,
-in tables, and where intervals are widened for it."""
+"""p-value below which a residual is reported as not white, or as following the input, and
+below which intervals are widened."""
 
 
 _T = TypeVar("_T")
@@ -103,7 +102,7 @@ class Input(_Named):
         super().__post_init__()
         _require(
             self.lower < self.upper,
-            f"limits of input {self.name!r} must grow: got {self.lower} to {self.upper}",
+            f"limits of input {self.name!r} must increase: got {self.lower} to {self.upper}",
         )
         half = (self.upper - self.lower) / 2
         if self.amplitude == 0:
@@ -119,7 +118,7 @@ class Output(_Named):
     """One measured output: typical size, sensor, and the safety levels of its magnitude.
 
     `noise_sd` is the standard deviation of Gaussian sensor noise, `resolution` the step
-    of an encoder (0: none), both in `unit`. A level left out is a level not watched.
+    of an encoder (0: none), both in `unit`. A level left out is not checked.
 
         >>> import excite as ex
         >>> ex.Output("pitch", "rad", scale=0.8, resolution=0.002).critical_level is None
@@ -157,9 +156,8 @@ class Parameter(_Named):
     """One unknown parameter.
 
     `positive` parameters are estimated through their logarithm, free ones over `scale`.
-    `target` says whether an experiment is designed for it. `symbol` is how a report
-    writes it (TeX), `scale` the size of a relevant change
-    (left out: that of the nominal value).
+    `target`: whether an experiment is designed for it. `symbol`: TeX for a report.
+    `scale`: size of a relevant change (left out: the size of the nominal value).
 
         >>> import excite as ex
         >>> ex.Parameter("J_p", "kg m²", 0.0232).scale
@@ -236,11 +234,11 @@ class PlantDescription:
           parameters area = 1.5 m²
 
     Attributes:
-        name: the word by which command line, studies and records know it.
+        name: used by the command line, studies and records.
         states, inputs, outputs, parameters, constants: in the order of their arrays.
         dt: sampling time [s]; inputs are held over it.
         substeps: Runge-Kutta steps in one `dt`.
-        band: lowest and highest frequency [Hz] at which the plant is worth exciting.
+        band: lowest and highest frequency [Hz] that a signal excites by default.
     """
 
     name: str
@@ -260,7 +258,7 @@ class PlantDescription:
         _require(self.substeps >= 1, f"substeps must be at least 1: got {self.substeps}")
         _require(
             0 < self.band[0] < self.band[1] <= 0.5 / self.dt,
-            f"band must grow and end at or below {0.5 / self.dt:g} Hz, half the sampling "
+            f"band must increase and end at or below {0.5 / self.dt:g} Hz, half the sampling "
             f"rate: got {self.band[0]:g} to {self.band[1]:g} Hz",
         )
         for kind in ("states", "inputs", "outputs", "parameters", "constants"):
@@ -332,7 +330,7 @@ def first_line(kind: type) -> str:
 
 
 class Listing(dict[str, str]):
-    """What there is, by name, with one line each; it shows itself as two columns."""
+    """A list of names with one line each; its `repr` has two columns."""
 
     def __repr__(self) -> str:
         widest = max(map(len, self), default=0)
@@ -342,7 +340,7 @@ class Listing(dict[str, str]):
 
 
 class Named(dict[str, _T]):
-    """Values by name, which are attributes too: `values["D_p"]` is `values.D_p`."""
+    """Values by name, also as attributes: `values["D_p"]` is `values.D_p`."""
 
     def __getattr__(self, name: str) -> _T:
         if name in self:
@@ -354,14 +352,14 @@ class Named(dict[str, _T]):
 
 
 def display_unit(unit: str) -> tuple[str, float]:
-    """Unit in which people read a quantity, and its factor: degrees for radians."""
+    """Unit in which a quantity is shown, and its factor: degrees for radians."""
     if unit in ("rad", "rad/s"):
         return unit.replace("rad", "deg"), 180 / math.pi
     return unit, 1.0
 
 
 def unknown(kind: str, word: str, allowed: Iterable[str]) -> ValueError:
-    """The error for a word that is not known, with the nearest that is."""
+    """The error for an unknown word; it names the nearest known one."""
     allowed = list(allowed)
     nearest = difflib.get_close_matches(word, allowed, n=1, cutoff=0.5)
     hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
@@ -369,7 +367,7 @@ def unknown(kind: str, word: str, allowed: Iterable[str]) -> ValueError:
 
 
 def wrong_type(what: str, value: object, allowed: str) -> TypeError:
-    """The error for an object of another type than those allowed: what came, what is allowed."""
+    """The error for an object of a wrong type: what is allowed, and what was given."""
     text = reprlib.repr(value)
     shown = "" if text.startswith("<") or "\n" in text else f" {text}"
     kind = f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__

@@ -1,7 +1,7 @@
-"""Files and folders that are written whole or not at all; JSON and CSV as text.
+"""Files and folders that are written completely or not at all; JSON and CSV as text.
 
-Everything is written under another name first and then renamed, so that a reader, or a
-run that is interrupted, never leaves or meets half of anything.
+Everything is written under a temporary name and then renamed. A reader never finds a
+partial file, and an interrupted run leaves none.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def csv_text(columns: Mapping[str, Any]) -> str:
 
 
 def json_ready(value: Any) -> Any:
-    """A copy with plain types only; a number that is not finite becomes None."""
+    """A copy with plain types; a number that is not finite becomes None."""
     if isinstance(value, Mapping):
         return {str(k): json_ready(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
@@ -63,17 +63,17 @@ def json_text(value: Any) -> str:
 
 
 def folder_word(name: str) -> str:
-    """A name as the word of a folder: letters, digits and underscores."""
+    """A name as a folder name: letters, digits and underscores."""
     return re.sub(r"\W+", "_", name).strip("_")
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Writes `value` as JSON, whole or not at all."""
+    """Writes `value` as JSON, completely or not at all."""
     write_bytes(path, (json_text(value) + "\n").encode())
 
 
 def read_json(path: Path, *keys: str, advice: str = "") -> dict[str, Any]:
-    """Content of a JSON file that was written here, an object with these keys.
+    """Content of a JSON file of this package, an object with these keys.
 
     Args:
         advice: what helps where the file is damaged; it ends the message.
@@ -109,7 +109,7 @@ def read_columns(path: Path, names: Iterable[str] = (), advice: str = "") -> dic
 
 
 def numbers_of(value: Any) -> Any:
-    """A copy of what JSON held, None become the numbers that do not exist again."""
+    """A copy of JSON data in which None becomes NaN."""
     if isinstance(value, dict):
         return {key: numbers_of(part) for key, part in value.items()}
     if isinstance(value, list):
@@ -118,12 +118,12 @@ def numbers_of(value: Any) -> Any:
 
 
 def damaged(path: Path, advice: str = "") -> ValueError:
-    """The error for a file that is not as it was written, and what helps."""
+    """The error for a damaged file, with advice."""
     return ValueError(f"{path} is damaged" + f"; {advice}" * bool(advice))
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Writes a file, whole or not at all.
+    """Writes a file, completely or not at all.
 
     Raises:
         ValueError: where the folder does not exist or cannot be written.
@@ -138,7 +138,7 @@ def write_bytes(path: Path, content: bytes) -> None:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
-        os.chmod(name, 0o644)  # mkstemp makes files that nobody else may read
+        os.chmod(name, 0o644)  # mkstemp makes files that other users cannot read
         os.replace(name, path)
     except OSError as error:
         raise ValueError(f"{path}: cannot be written ({error.strerror})") from None
@@ -147,13 +147,13 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 
 def require_folder(path: Path) -> None:
-    """Raises ValueError where a file has no folder to be written into."""
+    """Raises ValueError where the folder of a file does not exist."""
     if not path.parent.is_dir():
         raise ValueError(f"{path}: the folder {path.parent} does not exist")
 
 
 def require_new_file(path: Path, overwrite: bool) -> None:
-    """Raises ValueError, before anything is computed, where no such file may be written."""
+    """Raises ValueError, before anything is computed, where a file may not be written."""
     require_folder(path)
     if path.is_dir():
         raise ValueError(f"{path} is a folder; choose another name")
@@ -162,7 +162,7 @@ def require_new_file(path: Path, overwrite: bool) -> None:
 
 
 def require_free_run_folder(path: Path, overwrite: bool) -> None:
-    """Raises ValueError where a run folder at `path` would hide or lose something."""
+    """Raises ValueError where a run folder may not be written at `path`."""
     for parent in path.absolute().parents:
         if parent.exists():
             if not parent.is_dir():
@@ -178,7 +178,7 @@ def require_free_run_folder(path: Path, overwrite: bool) -> None:
 
 @contextlib.contextmanager
 def new_run_folder(path: Path, overwrite: bool = False) -> Iterator[Path]:
-    """A folder to fill, which appears at `path` only when everything in it is written."""
+    """A folder to fill; it appears at `path` when everything in it is written."""
     require_free_run_folder(path, overwrite)
     path = path.absolute()
     try:
@@ -197,7 +197,7 @@ def new_run_folder(path: Path, overwrite: bool = False) -> Iterator[Path]:
 
 
 def took_lock(file: IO[str]) -> bool:
-    """Whether an open file is now locked for this process alone, until it is closed."""
+    """Locks an open file for this process until it is closed; whether that succeeded."""
     try:
         if fcntl is not None:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -209,7 +209,7 @@ def took_lock(file: IO[str]) -> bool:
 
 
 def class_at(path: Path, word: str, base: type, kind: str) -> Any:
-    """A class derived from `base` in a user's file, which is run.
+    """A class derived from `base` in a user's file. Importing the file runs its code.
 
     Args:
         kind: what such a class is called in a message.
@@ -231,7 +231,7 @@ def _module_at(path: Path) -> Any:
     if spec is None or spec.loader is None:
         raise ValueError(f"{path} cannot be imported")
     module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # Equinox looks a class's module up by name
+    sys.modules[name] = module  # Equinox looks up a class's module by name
     try:
         spec.loader.exec_module(module)
     except (Exception, SystemExit) as error:
@@ -249,7 +249,7 @@ def tensors_to_bytes(
     arrays = {name: np.ascontiguousarray(array) for name, array in tensors.items()}
     metadata = {"format": file_format, "data": json_text(data)}
     header, rest = _split(safetensors.numpy.save(arrays, metadata=metadata))
-    # The library orders metadata by chance; equal policies must be equal files.
+    # The library's order of metadata varies; equal policies must give equal files.
     text = json.dumps(json.loads(header), sort_keys=True, separators=(",", ":")).encode()
     text += b" " * (-len(text) % _NUM_HEADER_BYTES)
     return len(text).to_bytes(_NUM_HEADER_BYTES, "little") + text + rest
@@ -278,7 +278,7 @@ def tensors_from_bytes(
             raise ValueError(f"{where}: format {found!r}; this version reads {file_format!r} files")
         data = json.loads(metadata["data"])
         if not isinstance(data, dict):
-            raise TypeError("its data are no JSON object")
+            raise TypeError("its data are not a JSON object")
         return tensors, data
     except (
         safetensors.SafetensorError, KeyError, TypeError, RecursionError, json.JSONDecodeError

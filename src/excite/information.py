@@ -1,10 +1,10 @@
-"""What an experiment can tell about its parameters, before anything is estimated.
+"""Information of an experiment about its parameters, before anything is estimated.
 
 With outputs y(theta) and independent Gaussian noise of standard deviation sigma, the
 Fisher information is M = sum_k S_k' S_k / sigma^2, S = dy/dtheta, and no unbiased
 estimator has a covariance below M^-1 (Cramér-Rao; L. Ljung, System Identification, 2nd
 ed., ch. 7; G. Goodwin and R. Payne, Dynamic System Identification, 1977). In logarithms
-of the parameters all of it is relative, and comparable between parameters.
+of the parameters the information is relative and can be compared between parameters.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 Information = Float[Array, "param param"]
 
 UNSEEN_SD = 0.5
-"""A direction of relative changes known no better than this is not identifiable: its
-95 % interval reaches from nothing to the double."""
+"""A direction of relative changes with a larger standard deviation is not identifiable: its
+95 % interval reaches from zero to twice the value."""
 
 
 def require_noise(plant: AbstractPlant) -> None:
@@ -74,7 +74,7 @@ def marginal_information(
     weighted = (sensitivity / noise_sd[None, :, None]).reshape(-1, sensitivity.shape[-1])
     columns = jnp.roll(weighted, -num_params, axis=1)
     num_others = columns.shape[1] - num_params
-    # A direction of the others that the data do not see must not make the rest singular.
+    # An undetermined direction of the others must not make the rest singular.
     prior = jnp.concatenate(
         [1e-6 * jnp.eye(num_others), jnp.zeros((num_others, num_params))], axis=1
     )
@@ -94,8 +94,8 @@ def experiment_information(
     In logarithms of positive parameters, and of free ones over their scale.
 
     Args:
-        initial_state_known: False where the initial state must be estimated along; the
-            experiment starts at the plant's in either case.
+        initial_state_known: False where the initial state must be estimated too; the
+            experiment starts at the plant's initial state in either case.
     """
     require_double_precision()
     theta = jnp.stack([jnp.asarray(p, float) for p in params])
@@ -117,7 +117,7 @@ def experiment_information(
 def running_information(
     plant: AbstractPlant, params: Params, inputs: Float[Array, "time input"]
 ) -> Float[Array, "time param param"]:
-    """What `experiment_information` is after each step, the initial state known.
+    """`experiment_information` after each step, with a known initial state.
 
     The last is that of the whole experiment.
     """
@@ -132,7 +132,7 @@ def running_information(
 
 
 def relative_size(plant: AbstractPlant, params: Params) -> Float[Array, " param"]:
-    """What one unit of relative information means for each parameter, in its unit."""
+    """Size of a relative change of one, for each parameter in its unit."""
     return jnp.stack(
         [
             jnp.asarray(value if p.positive else p.scale, float)
@@ -148,17 +148,17 @@ def d_optimality(information: Information) -> Float[Array, ""]:
 
 
 def a_optimality(information: Information) -> Float[Array, ""]:
-    """Trace M^-1: the sum of the parameters' least variances."""
+    """Trace M^-1: the sum of the parameters' smallest possible variances."""
     return jnp.sum(cramer_rao_bound(information) ** 2)
 
 
 def e_optimality(information: Information) -> Float[Array, ""]:
-    """Smallest eigenvalue of M: the information in the direction seen worst."""
+    """Smallest eigenvalue of M: the information in the least certain direction."""
     return jnp.linalg.eigvalsh(information)[0]
 
 
 def cramer_rao_bound(information: Information) -> Float[Array, " param"]:
-    """Least standard deviation of each parameter; infinite where M is singular."""
+    """Smallest possible standard deviation of each parameter; infinite where M is singular."""
     # Scaling to a unit diagonal first: parameters may differ by many orders of magnitude.
     size = jnp.sqrt(jnp.diagonal(information))
     safe = jnp.where(size > 0, size, 1.0)
@@ -171,11 +171,11 @@ def cramer_rao_bound(information: Information) -> Float[Array, " param"]:
 
 @dataclass(frozen=True)
 class Bound:
-    """The least standard deviation of one parameter.
+    """The smallest possible standard deviation of one parameter.
 
     Attributes:
         value: at which the bound holds.
-        cramer_rao_bound: least standard deviation [unit]; None where there is none.
+        cramer_rao_bound: smallest standard deviation [unit]; None where there is none.
         cramer_rao_percent: the same in percent of the value.
     """
 
@@ -187,7 +187,7 @@ class Bound:
 
 @dataclass(frozen=True, repr=False)
 class InformationResult:
-    """How well an experiment can determine each parameter at best; the result of `information`.
+    """How precisely an experiment can determine each parameter; the result of `information`.
 
         >>> import excite as ex
         >>> ex.information("aero2").params.J_p.cramer_rao_percent < 0.1
@@ -195,12 +195,12 @@ class InformationResult:
 
     Attributes:
         plant: with the numbers of the experiment.
-        initial_state: "known", or "free" where it must be estimated along.
+        initial_state: "known", or "free" where it must be estimated too.
         params: by parameter, in the order of the plant, as attribute or item.
         log_det_information, a_optimality, e_optimality: criteria of the relative information:
             log det M, trace M^-1, smallest eigenvalue of M.
         information: relative Fisher information, see `experiment_information`.
-        verdict: sentences on what cannot be identified, and how certain the rest is.
+        verdict: sentences: what cannot be identified, and how certain the rest is.
         inputs: of the experiment [input units].
         excitation: its name.
         warnings: a sentence where a policy was trained on another plant.
@@ -228,7 +228,7 @@ class InformationResult:
         return information_html(self.to_dict())
 
     def plot(self) -> Figure:
-        """The input, and the least standard deviation of each parameter in percent."""
+        """The input, and the smallest possible standard deviation of each parameter in percent."""
         from .report.figures import information_figure
 
         time = np.arange(len(self.inputs) + 1) * self.plant.dt
@@ -237,7 +237,7 @@ class InformationResult:
         return information_figure(self.plant, drawn, percent)
 
     def to_pandas(self) -> DataFrame:
-        """One row a parameter: value, least standard deviation, the same in percent, unit.
+        """One row per parameter: value, smallest standard deviation, the same in percent, unit.
 
         Raises:
             ValueError: where pandas is not installed.
@@ -274,7 +274,7 @@ def information(
     seed: int | PRNGKeyArray = 0,
     initial_state: Literal["auto", "known", "free"] = "auto",
 ) -> InformationResult:
-    """Least standard deviation of each parameter for an experiment (Cramér-Rao bound).
+    """Smallest possible standard deviation of each parameter for an experiment (Cramér-Rao bound).
 
         >>> import excite as ex
         >>> result = ex.information("aero2", "multisine", steps=200)
@@ -282,8 +282,8 @@ def information(
         'N m s/rad'
 
     Args:
-        plant: as for `simulate`, like all arguments but the last.
-        initial_state: "known", or "free" where it must be estimated along; "auto" is known, for
+        plant: as for `simulate`, like all arguments except the last.
+        initial_state: "known", or "free" where it must be estimated too; "auto" is known, for
             a record only where its sidecar says that it starts at the plant's initial state.
 
     Raises:
@@ -312,7 +312,7 @@ def best_possible(
     *,
     initial_state_known: bool,
 ) -> InformationResult:
-    """Least standard deviation of each parameter for these inputs.
+    """Smallest possible standard deviation of each parameter for these inputs.
 
     Raises:
         ValueError: for a sensor without noise, which sets no bound, and for a response
@@ -354,7 +354,7 @@ def best_possible(
 
 
 def _verdict(names: tuple[str, ...], information: np.ndarray) -> tuple[str, ...]:
-    """What cannot be identified, one sentence each, and how certain the rest is."""
+    """Sentences: each parameter that cannot be identified, and how certain the rest is."""
     free, sentences = np.ones(len(names), bool), []
     while (unseen := worst_seen(names, information, free)) is not None:
         free[unseen[0]] = False
@@ -368,7 +368,7 @@ def _verdict(names: tuple[str, ...], information: np.ndarray) -> tuple[str, ...]
 def worst_seen(
     names: tuple[str, ...], information: Float[np.ndarray, "param param"], free: np.ndarray
 ) -> tuple[int, str] | None:
-    """The free parameter to hold because the data do not determine it, and why, in words.
+    """The free parameter to hold because the data do not determine it, and the reason.
 
     None when every direction of the free parameters is known better than `UNSEEN_SD`.
     The direction is the eigenvector of the information with the smallest eigenvalue.
@@ -401,7 +401,7 @@ def worst_seen(
 def identifiability(
     names: tuple[str, ...], covariance: Float[np.ndarray, "param param"], free: np.ndarray
 ) -> str:
-    """How certain the least certain direction of the free parameters is, in words.
+    """A sentence on the standard deviation of the least certain direction of free parameters.
 
     Args:
         covariance: of relative changes.

@@ -117,10 +117,10 @@ _TRIPS = {
     Trip.PREDICTED_LEVEL: "an output was about to reach its critical level",
     Trip.NOT_FINITE: "a measurement was not a finite number",
     Trip.JUMP: "a measurement jumped",
-    Trip.STALE: "a measurement stood still while the plant was moving or driven",
+    Trip.STALE: "a measurement did not change while the plant was moving or driven",
     Trip.INPUT_NOT_FINITE: "the excitation asked for an input that is not a finite number",
-    Trip.DEADLINES: "deadlines were lost",
-    Trip.DURATION: "the rig's clock left the plan, too fast or too slow",
+    Trip.DEADLINES: "deadlines were missed",
+    Trip.DURATION: "the rig's clock is too fast or too slow",
 }
 
 
@@ -222,7 +222,7 @@ class Watch(NamedTuple):
 
 
 def tripped(xp: ModuleType, watch: Watch, condition: AnyArray, trip: Trip) -> Watch:
-    """The watch after a condition for a trip was checked; the first reason stays."""
+    """The watch after a condition for a trip was checked; the first trip is kept."""
     is_first = condition & (watch.trip == int(Trip.NONE))
     return watch._replace(trip=xp.where(is_first, int(trip), watch.trip))
 
@@ -262,7 +262,7 @@ def check_sample(xp: ModuleType, rules: Supervision, watch: Watch) -> Watch:
         last_move=xp.where(is_still, watch.last_move, abs(newest - last)),
         num_driven=xp.where(is_still, watch.num_driven + is_driven, 0),
     )
-    # A swing slows down before it turns: what stops at once is the sensor, not the plant.
+    # A swing slows down before it turns: a sudden stop is a fault of the sensor.
     is_stuck = (watch.num_still >= rules.num_still) & (watch.last_move > 4 * rules.resolution)
     is_dead = watch.num_driven >= rules.num_dead
     return tripped(xp, watch, (is_stuck | is_dead).any(), Trip.STALE)

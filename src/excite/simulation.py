@@ -33,7 +33,7 @@ class Trajectory(eqx.Module):
     Attributes:
         time: sampling instants [s].
         inputs: row k is held from time[k] to time[k + 1].
-        measured: outputs as the sensor saw them.
+        measured: outputs of the sensor.
         outputs: true outputs.
     """
 
@@ -59,7 +59,7 @@ def step(
         k4 = plant.derivative(x + h * k3, input, params)
         return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4), None
 
-    # A few substeps are unrolled: the inner loop's own cost would exceed theirs.
+    # A few substeps are unrolled: an inner loop would cost more than they do.
     unroll = min(plant.substeps, 4)
     return jax.lax.scan(substep, state, None, length=plant.substeps, unroll=unroll)[0]
 
@@ -85,7 +85,7 @@ def response(
 def measure(
     plant: AbstractPlant, output: Float[Array, " output"], key: PRNGKeyArray
 ) -> Float[Array, " output"]:
-    """What the sensor shows: noise is added, then an encoder rounds to its step."""
+    """Measurement of the outputs: noise is added, then an encoder rounds to its step."""
     sensor = plant.sensor
     noisy = output + sensor.noise_sd * jax.random.normal(key, output.shape, float)
     resolution = jnp.where(sensor.resolution > 0, sensor.resolution, 1.0)
@@ -104,8 +104,8 @@ def run_episode(
 ) -> Trajectory:
     """One experiment in closed loop: measure, excite, clip to the limits, integrate.
 
-    The sensor's noise depends on the key alone, so that with one key every excitation
-    meets the same noise.
+    The sensor noise depends on the key alone: with one key it is the same for every
+    excitation.
     """
     excitation_key, sensor_key = jax.random.split(key)
     noise_keys = jax.random.split(sensor_key, num_steps + 1)
@@ -136,15 +136,15 @@ class DivergedError(ValueError):
 
 @dataclasses.dataclass(frozen=True)
 class Experiment:
-    """One simulated experiment, everything chosen.
+    """All choices of one simulated experiment.
 
     Attributes:
         plant: with the sensor of this experiment.
         params: true ones.
         name: of the excitation.
-        origin: what the record must say of a policy or of a signal's file.
+        origin: entries of the record about a policy or a signal's file.
         num_steps: length [samples].
-        seed: what its noise depends on; a whole number or a JAX key.
+        seed: of the noise; a whole number or a JAX key.
     """
 
     plant: AbstractPlant
@@ -168,10 +168,10 @@ class Experiment:
         resolution: Mapping[str, float] | None = None,
         seed: int | PRNGKeyArray = 0,
     ) -> Experiment:
-        """The experiment that `simulate` runs; its arguments are explained there.
+        """The experiment that `simulate` runs, with the same arguments.
 
         Raises:
-            ValueError: for anything that is not known or not allowed.
+            ValueError: for an unknown name or a value that is not allowed.
             TypeError: for an argument of another type.
         """
         chosen = with_sensor(plant_from(plant), noise, resolution)
@@ -212,7 +212,7 @@ class Experiment:
         return run
 
     def record(self, run: Trajectory) -> Record:
-        """The measurements, and all that says how they came about."""
+        """The record: measurements, and how they were made."""
         is_number = isinstance(self.seed, int)
         seed = self.seed if is_number else jax.random.key_data(self.seed).tolist()
         names, description = names_of(self.plant.definition.parameters), self.plant.description
@@ -235,7 +235,7 @@ class Experiment:
 def experiment_length(
     excitation: AbstractExcitation, name: str, steps: int | None, is_record: bool
 ) -> int:
-    """The length asked for, or the excitation's; ValueError where that is shorter."""
+    """The requested length, or the excitation's; ValueError where that is shorter."""
     if steps is not None and (not isinstance(steps, int) or isinstance(steps, bool)):
         raise wrong_type("steps", steps, "a whole number")
     if steps is not None and steps < 2:
@@ -248,7 +248,7 @@ def experiment_length(
     else:
         return steps or 500
     if (steps or usual) > longest:
-        raise ValueError(f"{name} was made for {longest} steps; {steps} are asked for")
+        raise ValueError(f"{name} was made for {longest} steps: got {steps}")
     return steps or usual
 
 
@@ -274,7 +274,7 @@ def simulate(
     resolution: Mapping[str, float] | None = None,
     seed: int | PRNGKeyArray = 0,
 ) -> Record:
-    """The record of one simulated experiment: what the plant's sensor shows.
+    """The record of one simulated experiment, with the measurements of the plant's sensor.
 
         >>> import excite as ex
         >>> record = ex.simulate("aero2", "prbs", params={"D_p": 0.0012}, steps=200, seed=1)
@@ -289,11 +289,11 @@ def simulate(
             inputs by sample and input [input units].
         options: of the excitation, by name.
         steps: length [samples]; default 500, or that of a policy, a record or a signal.
-        params: true parameters where they are not the nominal ones, by name or as the
+        params: true parameters that differ from the nominal ones, by name or as the
             plant's named tuple.
         noise: standard deviation of an output's noise, by name [output unit].
         resolution: step of an output's encoder, by name [output unit].
-        seed: what excitation and noise depend on; a whole number or a JAX key.
+        seed: of excitation and noise; a whole number or a JAX key.
 
     Raises:
         ValueError: for a name, an option or a value that is not allowed; `DivergedError`

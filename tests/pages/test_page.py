@@ -346,7 +346,7 @@ def test_a_token_lets_the_browser_in_and_leaves_the_address(chromium: Browser, t
         expect(stranger.locator("#door")).to_be_visible()
         stranger.get_by_label("Token").fill("a-bad-token")
         stranger.keyboard.press("Enter")
-        expect(stranger.locator("#door .status")).to_have_text("this is not the token")
+        expect(stranger.locator("#door .status")).to_have_text("wrong token")
         stranger.close()
         known = chromium.new_page()
         known.goto(where)

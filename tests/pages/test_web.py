@@ -668,14 +668,17 @@ def test_a_defect_is_one_sentence(page: TestClient, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr("excite.web.runs.found", lambda folder: 1 / 0)
     answer = page.get("/api/runs")
     assert answer.status_code == 500
-    assert "its terminal says why" in answer.json()["sentence"]
+    assert "its terminal shows the reason" in answer.json()["sentence"]
     assert answer.headers["x-content-type-options"] == "nosniff"
 
 
 def test_half_a_character_is_no_token(runs: Path, scratch: Path):
     client = guarded(runs, scratch, token="right-token")
     answer = client.post("/api/session", content=b'{"token": "\\ud800"}')
-    assert (answer.status_code, answer.json()["sentence"]) == (400, "the request is no JSON object")
+    assert (answer.status_code, answer.json()["sentence"]) == (
+        400,
+        "the request is not a JSON object",
+    )
 
 
 @pytest.mark.parametrize("content", [b"", b"[1]", b"{", b"\xff", b"[" * 10000, b"NaN"])
@@ -751,7 +754,7 @@ def test_a_file_that_stops_coming_is_given_up(tmp_path: Path, monkeypatch: pytes
         return message
 
     request = Request({"type": "http", "headers": []}, receive)
-    with pytest.raises(RefusedError, match="stopped coming"):
+    with pytest.raises(RefusedError, match="the upload stopped"):
         asyncio.run(_receive(request, tmp_path / "a.csv", tmp_path))
 
 

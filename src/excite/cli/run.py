@@ -87,7 +87,7 @@ def run(
     as_json: bool,
     **options: Any,
 ) -> int:
-    """Run an experiment on a rig: supervised, recorded as it happens, ended by zero input.
+    """Run a supervised experiment on a rig; record every sample; end with zero input.
 
     Without JAX, a policy or a signal is played with NumPy alone; the live estimate and the
     filter are then off.

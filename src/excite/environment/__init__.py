@@ -1,4 +1,4 @@
-"""The decision process (`process`), its Gymnasium face (`gymnasium`), objectives, and episodes.
+"""The decision process (`process`), its Gymnasium interface (`gymnasium`), objectives, episodes.
 
 `gymnasium` is imported by its module's name, because it loads Gymnasium.
 """

@@ -1,7 +1,7 @@
-"""Scoring an excitation: many experiments, each on a plant of its own.
+"""Evaluates an excitation: many experiments, each on another plant.
 
-The only way anything is scored here, signals and policies alike: the plant and the noise
-of an episode depend on its key alone.
+Signals and policies are evaluated by the same function. The plant and the noise of an
+episode depend on its key alone.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class Episodes(eqx.Module):
         is_violation: whether the critical level was reached.
         max_abs_output: largest magnitude of each output.
         information: relative Fisher information of each episode's inputs.
-        bound: least relative standard deviation of each parameter (Cramér-Rao).
+        bound: smallest relative standard deviation of each parameter (Cramér-Rao).
     """
 
     params: Params
@@ -46,7 +46,7 @@ def run_episodes(
     spread: float,
     keys: Key[Array, " episode"],
 ) -> Episodes:
-    """One episode a key. The plant and the noise of a key are the same for any excitation."""
+    """One episode per key. Plant and noise of a key are the same for any excitation."""
 
     def episode(key: PRNGKeyArray) -> Episodes:
         params_key, episode_key = jax.random.split(key)
@@ -57,7 +57,7 @@ def run_episodes(
 
 
 def scored(plant: AbstractPlant, params: Params, trajectory: Trajectory) -> Episodes:
-    """One experiment, and how informative and how safe it was."""
+    """One experiment with its information and its largest outputs."""
     information = experiment_information(plant, params, trajectory.inputs)
     relative = relative_size(plant, params) / jnp.abs(jnp.stack(params))
     return Episodes(

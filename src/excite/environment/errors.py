@@ -1,4 +1,4 @@
-"""The error of an estimate at the end of an experiment: of ARX, and of the output error."""
+"""Errors of the estimate at the end of an experiment: ARX and output error."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from .objective import (
 
 
 class ARXMemory(eqx.Module):
-    """Recursive least squares, and the samples its next regressor needs."""
+    """State of recursive least squares, and the samples for the next regressor."""
 
     rls: RLSState
     y_1: Float[Array, ""]
@@ -54,7 +54,7 @@ class EstimationError(AbstractError):
     def update(
         self, plant: AbstractPlant, memory: ARXMemory, sample: StepData, k: Int[Array, ""]
     ) -> tuple[ARXMemory, Float[Array, ""]]:
-        """One recursion; the first sample with a whole regressor is the third."""
+        """One recursion; the third sample is the first with a complete regressor."""
         del plant
         y, u_1 = sample.measured[0], sample.input[0]
         row = regressor(memory.y_1, memory.y_2, u_1, memory.u_2)
@@ -80,7 +80,7 @@ def _require_arx(plant: AbstractPlant) -> AbstractARXPlant:
 
 
 class OutputErrorMemory(Knowledge):
-    """Beside what is known, the score S' (y - y_true) / sigma^2."""
+    """The information so far, and the score S' (y - y_true) / sigma^2."""
 
     score: Float[Array, " param"]
 
@@ -89,12 +89,12 @@ class OutputError(AbstractError):
     """Errors of the output-error estimate (nonlinear least squares), for any plant.
 
     To first order in the noise: the estimate is one Gauss-Newton step away from the true
-    parameters, M^-1 S' (y - y_true) / sigma^2, with the noise that the episode met
+    parameters, M^-1 S' (y - y_true) / sigma^2, with the noise of the episode
     (L. Ljung, System Identification, 2nd ed., ch. 9).
 
     Attributes:
         prior_sd: standard deviation of each relative parameter before the experiment; it
-            keeps the step finite before there are data.
+            keeps the step finite at the start.
         max_sensitivity: larger ones are scaled down, see MAX_SENSITIVITY.
     """
 
@@ -111,7 +111,7 @@ class OutputError(AbstractError):
     def update(
         self, plant: AbstractPlant, memory: OutputErrorMemory, sample: StepData, k: Int[Array, ""]
     ) -> tuple[OutputErrorMemory, Float[Array, ""]]:
-        """One measurement more."""
+        """Adds one measurement."""
         del k
         sensitivity, information, weighted, output = next_knowledge(
             plant, memory, sample, self.max_sensitivity

@@ -1,14 +1,14 @@
-"""The decision process with a Gymnasium face: one plant, or hundreds as one batch.
+"""The decision process as a Gymnasium environment: one plant, or hundreds as one batch.
 
     gymnasium.make("excite.environment.gymnasium:excite/Aero2-v0")
     gymnasium.make_vec("excite.environment.gymnasium:excite/Aero2-v0", num_envs=64)
 
-Both run the same pure functions of `process`, compiled, in double precision whatever the
-program around them uses. Any choice of `Env.of` is a keyword argument (`objective`,
+Both run the same pure functions of `process`, compiled, and always in double precision.
+Any choice of `Env.of` is a keyword argument (`objective`,
 `layout`, `spread`, `penalty_weight`), and `plant` another plant of the class.
 
-JAX does not survive a fork: processes of one environment each (`vectorization_mode="async"`)
-must be spawned, `vector_kwargs={"context": "spawn"}`. The batch is far quicker.
+JAX does not support fork: processes of one environment each (`vectorization_mode="async"`)
+must be spawned, `vector_kwargs={"context": "spawn"}`. The batch is much faster.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ _step = eqx.filter_jit(Env.step)
 def _process(
     plant_class: type[AbstractPlant], plant: AbstractPlant | None, choices: Choices
 ) -> Env:
-    """The process in double precision, whatever the given parts of it were made in.
+    """The process in double precision, whatever the precision of the given parts.
 
     Raises:
         ValueError: for a spread or a penalty weight that is not allowed.
@@ -62,7 +62,7 @@ def _process(
     """
     if type(multiprocessing.current_process()).__name__ == "ForkProcess":
         raise RuntimeError(
-            "JAX does not survive a fork: spawn the processes, as with vector_kwargs="
+            "JAX does not support fork: spawn the processes, as with vector_kwargs="
             '{"context": "spawn"}, or step all environments as one batch, make_vec\'s default'
         )
     spread, penalty_weight = choices.get("spread", 0.3), choices.get("penalty_weight", 1.0)
@@ -88,7 +88,7 @@ def _spaces(env: Env) -> tuple[spaces.Box, spaces.Box]:
 
 
 def _info(env: Env, transition: Transition) -> dict[str, np.ndarray]:
-    """What a step tells beside observation and reward; the error is a fraction."""
+    """The `info` of a step; the errors are fractions."""
     names = names_of(env.plant.definition.parameters)
     errors = np.asarray(transition.relative_errors)
     return {
@@ -102,8 +102,8 @@ class ExperimentEnv(gymnasium.Env[Observation, Action]):
 
     ## Description
     A plant with unknown parameters is drawn at the start of every episode. The agent
-    chooses its input at every sample so that the parameters can be told from what was
-    measured, without an output reaching its critical level.
+    chooses its input at every sample so that the parameters can be identified from the
+    measurements, without an output reaching its critical level.
 
     ## Action Space
     `Box(-1, 1, (inputs,), float32)`. For `excite/Aero2-v0`:
@@ -125,9 +125,9 @@ class ExperimentEnv(gymnasium.Env[Observation, Action]):
     Samples before the first are zero.
 
     ## Rewards
-    At every step the safety penalty of Eq. 3 on the true outputs: up to -0.1 between
+    At every step the safety penalty of Eq. 3 on the true outputs: down to -0.1 between
     warning and critical level, -1 and below beyond. At the last step minus the sum of the
-    relative errors of the estimated parameters (Eq. 4); plants without a mapping from ARX
+    relative errors of the estimated parameters (Eq. 4). Plants without a mapping from ARX
     coefficients get the increment of log det of the Fisher information at every step.
 
     ## Starting State
@@ -144,7 +144,7 @@ class ExperimentEnv(gymnasium.Env[Observation, Action]):
     `plant`, and all choices of `excite.environment.Env.of`.
     """
 
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  (Gymnasium's own form)
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  (as Gymnasium requires)
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""The information that an experiment brings, at every step or at the end."""
+"""The information gained by an experiment, as a reward at every step or at the end."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .objective import (
 
 
 class InformationMemory(Knowledge):
-    """Beside what is known, the criterion as last rewarded."""
+    """The information so far, and the criterion at the last reward."""
 
     value: Float[Array, ""]
 
@@ -30,18 +30,18 @@ class InformationGain(AbstractObjective):
     """Dense reward: the increment of log det of the Fisher information at every step.
 
     The information is relative (logarithms of positive parameters) and begins with that
-    of the prior, so that the sum over an episode is what the experiment adds to what was
-    known before. Where some parameters are no targets, they are eliminated first
+    of the prior, so that the sum over an episode is the gain of the experiment over the
+    prior. Parameters that are not targets are eliminated first
     (D_s-optimality; A. Atkinson, A. Donev, R. Tobias, Optimum Experimental Designs, 2007).
-    Sensitivities follow the state by one directional derivative a parameter.
+    Sensitivities are computed with the state, by one directional derivative per parameter.
 
     Attributes:
-        targets: which parameters count.
+        targets: which parameters are rewarded.
         prior_sd: standard deviation of each relative parameter before the experiment.
         weight: factor of the reward.
         criterion: of the targets' covariance bound: minus the logarithm of its determinant
             (`D`), of its trace (`A`), or of its largest eigenvalue (`E`).
-        dense: whether every step is rewarded by its increment, or the last by all of it.
+        dense: whether every step is rewarded by its increment, or the last by the total.
         max_sensitivity: larger ones are scaled down, see MAX_SENSITIVITY.
     """
 
@@ -66,7 +66,7 @@ class InformationGain(AbstractObjective):
     def update(
         self, plant: AbstractPlant, memory: InformationMemory, sample: StepData, k: Int[Array, ""]
     ) -> tuple[InformationMemory, Float[Array, ""]]:
-        """Sensitivities one step on, and what the measurement at its end adds."""
+        """Sensitivities after one step, and the information of the measurement at its end."""
         del k
         known = next_knowledge(plant, memory, sample, self.max_sensitivity)[:2]
         if not self.dense:
@@ -78,7 +78,7 @@ class InformationGain(AbstractObjective):
     def final(
         self, plant: AbstractPlant, memory: InformationMemory, params: Params
     ) -> Float[Array, ""]:
-        """What was gained, unless it was rewarded on the way."""
+        """The total gain, unless it was rewarded at every step."""
         del plant, params
         if self.dense:
             return jnp.zeros(())
@@ -87,7 +87,7 @@ class InformationGain(AbstractObjective):
     def relative_errors(
         self, plant: AbstractPlant, memory: InformationMemory, params: Params
     ) -> Float[Array, " param"]:
-        """Least relative standard deviations (Cramér-Rao with the prior)."""
+        """Smallest relative standard deviations (Cramér-Rao with the prior)."""
         deviation = jnp.sqrt(jnp.diagonal(jnp.linalg.inv(memory.information)))
         return deviation * relative_size(plant, params) / jnp.abs(jnp.stack(params))
 

@@ -1,4 +1,4 @@
-"""What an experiment is worth: the contract, and what objectives share."""
+"""Objectives: the contract, and functions that objectives share."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from ..safety import critical_levels
 from ..simulation import step
 
 MAX_ERROR = 100.0
-"""Relative error at which an estimate counts as nothing (10,000 %); also for one not finite."""
+"""Largest relative error that counts (10,000 %); also the error of an estimate not finite."""
 
 MAX_SENSITIVITY = 30.0
 """Of an output to a relative parameter, over the output's critical level or scale.
 
-Where a plant turns chaotic sensitivities grow without bound, and what they promise no
-estimator can find.
+Where a plant is chaotic, sensitivities grow without bound, and no estimator reaches the
+information that they indicate.
 """
 
 
 class StepData(eqx.Module):
-    """What one step shows an objective; only the last two are known on a rig.
+    """Data of one step for an objective; only the last two are known on a rig.
 
     Attributes:
         params, state: true parameters, and the true state when the input began to act.
@@ -45,7 +45,7 @@ class StepData(eqx.Module):
 
 
 class AbstractObjective(eqx.Module):
-    """What an experiment is worth."""
+    """What an experiment is rewarded for."""
 
     @abc.abstractmethod
     def init(self, plant: AbstractPlant, measured: Float[Array, " output"]) -> PyTree:
@@ -65,17 +65,17 @@ class AbstractObjective(eqx.Module):
     def relative_errors(
         self, plant: AbstractPlant, memory: PyTree, params: Params
     ) -> Float[Array, " param"]:
-        """Relative error of each parameter as far as the objective knows it, to watch."""
+        """Relative error of each parameter as the objective knows it, for display."""
 
     def outcome(
         self, plant: AbstractPlant, memory: PyTree, params: Params, worth: Float[Array, ""]
     ) -> PyTree:
-        """What `of_batch` needs to know of one experiment: its rewards summed, `worth`."""
+        """The outcome of one experiment for `of_batch`: the sum of its rewards, `worth`."""
         del plant, memory, params
         return worth
 
     def of_batch(self, outcomes: PyTree) -> Float[Array, ""]:
-        """What experiments on many plants are worth together, of their outcomes: the mean."""
+        """The worth of experiments on many plants from their outcomes: the mean."""
         return jnp.mean(outcomes)
 
 
@@ -84,10 +84,10 @@ def toward_goals(
     goals: Float[Array, " param"],
     targets: tuple[bool, ...],
 ) -> Float[Array, ""]:
-    """How far mean errors lie above their goals: the worst of them, smoothly.
+    """The largest mean error over its goal, smoothed.
 
-    A soft maximum of mean error over goal; a tenth of the mean logarithm keeps a gradient
-    on the errors that are not the worst.
+    A soft maximum of mean error over goal. A tenth of the mean logarithm is added, so that
+    the other errors have a gradient.
     """
     chosen = np.flatnonzero(targets)
     ratio = (errors / goals[None])[:, chosen]
@@ -99,11 +99,11 @@ class AbstractError(AbstractObjective):
     """Terminal reward: minus the errors of an estimate, summed (Eq. 4) or otherwise.
 
     Attributes:
-        targets: which parameters count.
-        goals: relative error of each parameter that counts as one; the paper's are ones.
-        form: `relative`, the sum of error over goal; `log`, that of log(1 + error / goal):
-            a factor counts the same however large the error is, until the goal is reached;
-            `goals`, the worst mean error over its goal, see `toward_goals`.
+        targets: which parameters are rewarded.
+        goals: relative error by which that of each parameter is divided; one in the paper.
+        form: `relative`, the sum of error over goal; `log`, that of log(1 + error / goal),
+            in which a factor has the same weight for any error above its goal;
+            `goals`, the largest mean error over its goal, see `toward_goals`.
         weight: factor of the reward.
     """
 
@@ -118,11 +118,11 @@ class AbstractError(AbstractObjective):
             raise ValueError(f"form must be relative, log or goals: got {self.form!r}")
 
     def final(self, plant: AbstractPlant, memory: PyTree, params: Params) -> Float[Array, ""]:
-        """What the estimate at the end is worth."""
+        """The reward of the estimate at the end."""
         return self.of_errors(self.relative_errors(plant, memory, params)[None])
 
     def of_errors(self, errors: Float[Array, "plant param"]) -> Float[Array, ""]:
-        """What errors on some plants are worth together."""
+        """The worth of the errors on some plants."""
         goals = jnp.ones(errors.shape[1]) if self.goals is None else self.goals
         if self.form == "goals":
             return -self.weight * toward_goals(errors, goals, self.targets)
@@ -134,17 +134,17 @@ class AbstractError(AbstractObjective):
     def outcome(
         self, plant: AbstractPlant, memory: PyTree, params: Params, worth: Float[Array, ""]
     ) -> Float[Array, " param"]:
-        """The errors alone, which are all that is rewarded."""
+        """The errors, which alone are rewarded."""
         del worth
         return self.relative_errors(plant, memory, params)
 
     def of_batch(self, outcomes: Float[Array, "plant param"]) -> Float[Array, ""]:
-        """Of the errors on all plants, whose means may have goals."""
+        """The worth of the errors on all plants, whose means may have goals."""
         return self.of_errors(outcomes)
 
 
 def bounded(errors: Float[Array, " param"]) -> Float[Array, " param"]:
-    """Relative errors, at most MAX_ERROR, which also stands for one that is not finite."""
+    """Relative errors, at most MAX_ERROR; an error that is not finite is MAX_ERROR."""
     return jnp.where(jnp.isfinite(errors), jnp.minimum(errors, MAX_ERROR), MAX_ERROR)
 
 
@@ -168,7 +168,7 @@ def next_knowledge(
 ) -> tuple[
     Float[Array, "state param"], Float[Array, "param param"], Float[Array, "output param"], Array
 ]:
-    """Sensitivity and information one step on.
+    """Sensitivity and information after one step.
 
     Returns:
         Both; sensitivities of the outputs over their standard deviation; the true outputs.
@@ -184,7 +184,7 @@ def sensitivities(
     sample: StepData,
     limit: Float[Array, ""],
 ) -> tuple[Float[Array, "state param"], Float[Array, "output param"], Float[Array, " output"]]:
-    """Relative sensitivities of state and outputs one step on, and the true outputs."""
+    """Relative sensitivities of state and outputs after one step, and the true outputs."""
     theta, size = jnp.stack(sample.params), relative_size(plant, sample.params)
 
     def response(state: Array, change: Array) -> tuple[Array, Array]:
@@ -207,7 +207,7 @@ def sensitivities(
 
 
 def target_mask(description: PlantDescription, targets: Sequence[str] | None) -> tuple[bool, ...]:
-    """Which parameters count: those named, or the plant's own targets.
+    """Mask of the target parameters: those named, or the plant's targets.
 
     Raises:
         ValueError: for an unknown name, or none at all.
@@ -227,5 +227,5 @@ def target_mask(description: PlantDescription, targets: Sequence[str] | None) ->
 
 def prior_sd_of(spread: float) -> float:
     """Standard deviation of a relative parameter that is uniform within ± `spread`."""
-    # A plant that is not drawn at random is still not known better than to one percent.
+    # Without a spread, the prior standard deviation is one percent.
     return max(spread, 0.01) / 3**0.5

@@ -1,10 +1,10 @@
-"""The decision process: an experiment as a game whose reward is what it tells.
+"""The decision process: an experiment that is rewarded for its information and safety.
 
 `Env` is two pure functions, `reset` and `step`, over one explicit state, for any plant.
-An episode is one experiment of T steps on a plant drawn anew. Every step costs the safety
-penalty (Eq. 3 of Langschwert et al.); what the experiment was worth is an objective:
-the estimation error at its end (Eq. 4), or the information gained at every step. The
-defaults are the paper's.
+An episode is one experiment of T steps on a newly drawn plant. Every step has the safety
+penalty (Eq. 3 of Langschwert et al.). An objective adds the reward of the experiment: the
+estimation error at its end (Eq. 4), or the information gained at every step. The defaults
+are the paper's.
 
 T is part of the process and k / T is observed, so the last step is `terminated`; nothing
 is ever truncated. The memory of an objective does not grow with T.
@@ -43,11 +43,11 @@ class EnvState(eqx.Module):
         params: true parameters of this episode's plant.
         constants: its true constants.
         plant_state: true state.
-        window: what the policy remembers.
+        window: last measurements and inputs, for the policy.
         memory: of the objective.
         k: steps done.
         max_abs_output: largest magnitude of each true output so far.
-        is_finite: False since the state could not be computed; it then stands still.
+        is_finite: False once the state could not be computed; it is then kept constant.
         key: of this episode.
     """
 
@@ -85,13 +85,13 @@ class Env(eqx.Module):
 
     Attributes:
         plant: its constants and sensor; its parameters are drawn for every episode.
-        objective: what the experiment is worth.
+        objective: what the experiment is rewarded for.
         layout: what is observed, and T.
         spread: parameters are uniform in nominal value ± spread times their scale.
         penalty_weight: factor of the safety penalty; 1 / T normalises it by length.
-        constants: of the plant, from where to where each is drawn for every episode, which
-            makes what is learnt robust against what identification holds to be known; by
-            default they are the plant's own.
+        constants: lowest and highest constants of the plant; they are drawn for every
+            episode, so that a policy is robust against errors of constants that
+            identification takes as known. Default the plant's constants.
     """
 
     plant: AbstractPlant
@@ -112,7 +112,7 @@ class Env(eqx.Module):
         penalty_weight: float | Float[Array, ""] = 1.0,
         constants: tuple[PyTree, PyTree] | None = None,
     ) -> Env:
-        """The paper's process for a plant, but for what is chosen."""
+        """The paper's process for a plant, except for the given choices."""
         return cls(
             plant,
             default_objective(plant, float(spread)) if objective is None else objective,
@@ -152,7 +152,7 @@ class Env(eqx.Module):
     def advance(
         self, state: EnvState, action: Float[Array, " input"]
     ) -> tuple[EnvState, Float[Array, " output"], Float[Array, ""]]:
-        """The experiment one sampling time on: state, true output, and gain of the objective."""
+        """The experiment after one sampling time: state, true output, gain of the objective."""
         plant, k = self.plant.changed(**state.constants._asdict()), state.k + 1
         action = jnp.where(jnp.isfinite(action), jnp.clip(action, -1, 1), 0.0)
         input = scaled_action(jnp, self.layout, action.astype(float))
@@ -179,7 +179,7 @@ class Env(eqx.Module):
         return new, output, jnp.where(is_finite, gain, 0.0)
 
     def _draw_constants(self, key: PRNGKeyArray) -> PyTree:
-        """Constants of one episode's plant, each uniform between its ends."""
+        """Constants of one episode's plant, each uniform in its range."""
         if self.constants is None:
             return self.plant.constants
         low, high = self.constants
@@ -202,7 +202,7 @@ class Env(eqx.Module):
         cost = penalty(output[np.array(watched, int)], warning, critical)
         terminated = state.k >= self.layout.num_steps
         final = self.objective.final(plant, state.memory, state.params)
-        # A run that cannot be computed costs a breach a step; no step of it gains anything.
+        # A run that cannot be computed has the penalty of a violation at every step, and no gain.
         cost = jnp.where(state.is_finite, cost, -1.0)
         worth = gain + jnp.where(terminated, final, 0.0)
         is_over = jnp.any(state.max_abs_output >= critical_levels(plant.definition))
@@ -216,7 +216,7 @@ class Env(eqx.Module):
 
 
 def default_objective(plant: AbstractPlant, spread: float) -> AbstractObjective:
-    """The paper's for a plant with a mapping from ARX, else the information gained."""
+    """The paper's objective for a plant with a mapping from ARX, else the information gained."""
     targets = target_mask(plant.definition, None)
     if isinstance(plant, AbstractARXPlant):
         return EstimationError(targets)
@@ -224,7 +224,7 @@ def default_objective(plant: AbstractPlant, spread: float) -> AbstractObjective:
 
 
 class Batch(eqx.Module):
-    """Many episodes side by side, each followed at once by another.
+    """Many parallel episodes, each followed at once by another.
 
     Attributes:
         states: of all episodes.

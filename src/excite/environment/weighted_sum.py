@@ -11,60 +11,60 @@ from .objective import AbstractObjective, StepData
 
 
 class SumMemory(eqx.Module):
-    """Memories of the terms, and what each was rewarded so far."""
+    """Memories of the terms, and the reward of each so far."""
 
     terms: tuple[PyTree, ...]
     gained: Float[Array, " term"]
 
 
 class WeightedSum(AbstractObjective):
-    """Information and errors, several criteria or several estimators: each by its weight.
+    """Weighted sum of objectives: information, errors, several criteria or estimators.
 
     Attributes:
-        terms: objectives; the weight of each is its own.
+        terms: objectives, each with its weight.
     """
 
     terms: tuple[AbstractObjective, ...] = eqx.field(converter=tuple)
 
     def __check_init__(self) -> None:
-        """Raises ValueError where there is nothing to add."""
+        """Raises ValueError without terms."""
         if not self.terms:
             raise ValueError("a sum of objectives needs at least one")
 
     def init(self, plant: AbstractPlant, measured: Float[Array, " output"]) -> SumMemory:
-        """Of every term."""
+        """Memory of every term."""
         memories = tuple(term.init(plant, measured) for term in self.terms)
         return SumMemory(memories, jnp.zeros(len(memories)))
 
     def update(
         self, plant: AbstractPlant, memory: SumMemory, sample: StepData, k: Int[Array, ""]
     ) -> tuple[SumMemory, Float[Array, ""]]:
-        """Every term one step on, and the sum of their gains."""
+        """Memory of every term after one step, and the sum of their gains."""
         pairs = zip(self.terms, memory.terms, strict=True)
         memories, gains = zip(*(t.update(plant, own, sample, k) for t, own in pairs), strict=True)
         return SumMemory(memories, memory.gained + jnp.stack(gains)), sum(gains, jnp.zeros(()))
 
     def final(self, plant: AbstractPlant, memory: SumMemory, params: Params) -> Float[Array, ""]:
-        """The sum of what the terms add at the end."""
+        """The sum of the terms' rewards at the end."""
         return jnp.sum(self._finals(plant, memory, params))
 
     def relative_errors(
         self, plant: AbstractPlant, memory: SumMemory, params: Params
     ) -> Float[Array, " param"]:
-        """As the first term knows them."""
+        """Errors as the first term knows them."""
         return self.terms[0].relative_errors(plant, memory.terms[0], params)
 
     def outcome(
         self, plant: AbstractPlant, memory: SumMemory, params: Params, worth: Float[Array, ""]
     ) -> tuple[PyTree, ...]:
-        """Of every term, which got its own part of the rewards."""
+        """Outcome of every term from its part of the rewards."""
         del worth
         parts = memory.gained + self._finals(plant, memory, params)
         of_terms = zip(self.terms, memory.terms, parts, strict=True)
         return tuple(term.outcome(plant, own, params, part) for term, own, part in of_terms)
 
     def of_batch(self, outcomes: tuple[PyTree, ...]) -> Float[Array, ""]:
-        """The sum of what the terms make of the batch."""
+        """The sum of the terms' worth of the batch."""
         values = [term.of_batch(own) for term, own in zip(self.terms, outcomes, strict=True)]
         return sum(values, jnp.zeros(()))
 

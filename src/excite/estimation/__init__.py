@@ -1,4 +1,4 @@
-"""Estimators: the contract (`base`), `ARX`, `NLS` and `Decrement`."""
+"""Estimators: the contract (`contract`), `ARX`, `NLS` and `Decrement`."""
 
 from .arx import ARX as ARX
 from .contract import AbstractEstimator as AbstractEstimator

@@ -1,4 +1,4 @@
-"""ARX model of order 2 by least squares, and its way back to physical parameters.
+"""ARX model of order 2 by least squares, and its mapping to physical parameters.
 
 The estimator of the paper: y_k = -a_1 y_{k-1} - a_2 y_{k-2} + b_1 u_{k-1} + b_2 u_{k-2},
 fitted by recursive least squares (Ljung, System Identification, sec. 11.2), its poles
@@ -147,7 +147,7 @@ class ARX(AbstractEstimator):
 def _regression(
     experiments: Experiments,
 ) -> tuple[Float[Array, "sample 4"], Float[Array, " sample"], Bool[Array, " sample"]]:
-    """Regressors and outputs of all experiments; none straddles two of them."""
+    """Regressors and outputs of all experiments; each regressor is from one experiment."""
     y, u = experiments.measured[..., 0], experiments.inputs[..., 0]
     rows = regressor(y[:, 1:-1], y[:, :-2], u[:, 1:], u[:, :-1])
     valid = experiments.valid[:, 2:]
@@ -155,7 +155,7 @@ def _regression(
 
 
 def _is_ill_conditioned(regressors: Array, valid: Array) -> Array:
-    """Whether a regressor is zero, or all but a combination of the others."""
+    """Whether a regressor is zero, or nearly a combination of the others."""
     rows = jnp.where(valid[:, None], regressors, 0.0)
     size = jnp.sqrt(jnp.sum(rows**2, axis=0))
     values = jnp.linalg.svd(rows / jnp.where(size > 0, size, 1.0)[None], compute_uv=False)
@@ -201,7 +201,7 @@ def running_params(
     inputs: Float[Array, "time input"],
     measured: Float[Array, "sample output"],
 ) -> Float[Array, "sample param"]:
-    """Estimates after every sample of one experiment; not numbers where there is none yet."""
+    """Estimates after every sample of one experiment; NaN before the first."""
     y, u = measured[:, 0], inputs[:, 0]
     rows = regressor(y[1:-1], y[:-2], u[1:], u[:-1])
 

@@ -34,7 +34,7 @@ def estimators() -> Listing:
 def estimator_from(
     given: str | AbstractEstimator | type[AbstractEstimator],
 ) -> AbstractEstimator:
-    """An estimator by name, of a class, or as it is.
+    """An estimator from a name, a class or an estimator.
 
     Raises:
         ValueError: for an unknown name.

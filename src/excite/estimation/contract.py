@@ -1,7 +1,7 @@
 """The contract of an estimator: from experiments to parameters with a covariance.
 
-Estimators are pure: failure is a `Status`, counted by a benchmark and turned into a
-sentence at the door.
+Estimators are pure. A failure is a `Status`: a study counts it, and the entry points report
+it as a sentence.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ class Experiments(eqx.Module):
         inputs: row k is held from sample k to k + 1.
         measured: measured outputs.
         valid: False where an experiment was padded.
-        initial_state: known, or where the search for it begins.
-        initial_state_known: False where it is estimated along.
+        initial_state: known, or the start of its search.
+        initial_state_known: False where it is estimated too.
     """
 
     inputs: Float[Array, "experiment time input"]
@@ -112,7 +112,7 @@ class Estimate(eqx.Module):
 
 
 class AbstractEstimator(eqx.Module):
-    """Base of all estimators; `name` is its word on the command line."""
+    """Base of all estimators; `name` is used on the command line."""
 
     name: eqx.AbstractVar[str]
 
@@ -154,7 +154,7 @@ def residual_of(
 
 
 def status_of(plant: AbstractPlant, params: Params, status: Int[Array, ""]) -> Int[Array, ""]:
-    """The status of an estimate, of its parameters' signs and finiteness too."""
+    """The status of an estimate, after a check that its parameters are finite and valid."""
     values = jnp.stack(params)
     positive = np.array([p.positive for p in plant.definition.parameters])
     status = jnp.where(jnp.any(positive & (values <= 0)), Status.UNPHYSICAL, status)
@@ -165,7 +165,7 @@ def status_of(plant: AbstractPlant, params: Params, status: Int[Array, ""]) -> I
 def relative_information(
     plant: AbstractPlant, params: Params, covariance: Float[Array, "param param"]
 ) -> Float[Array, "param param"]:
-    """Information of relative changes, as an estimate has it, from a covariance of `params`."""
+    """Information of relative changes, as in an estimate, from a covariance of `params`."""
     size = relative_size(plant, params)
     return jnp.linalg.inv(covariance / jnp.outer(size, size))
 
@@ -233,7 +233,7 @@ def from_search(description: PlantDescription, z: Float[Array, " param"]) -> Arr
 
 
 def bound_reached(description: PlantDescription, params: Params) -> tuple[int, float] | None:
-    """Index and bound of the first parameter that ended at one; None where none did."""
+    """Index and bound of the first parameter at a bound; None where there is none."""
     b = _Bounds(description)
     c = b.relative(np.array([float(p) for p in params]))
     for i, p in enumerate(description.parameters):

@@ -1,4 +1,4 @@
-"""Logarithmic decrement: poles from a free decay, the classical way to a damping.
+"""Logarithmic decrement: poles and damping from a free decay.
 
 After the input has come to rest a plant of order 2 swings with y = A exp(-sigma t) cos(...).
 The times at which it passes zero give the damped frequency, the logarithms of its peaks the
@@ -26,10 +26,10 @@ from .contract import (
 )
 
 MIN_SWINGS = 3
-"""Half swings that a decay must show."""
+"""Smallest number of half swings of a decay."""
 
 MIN_PEAK = 8.0
-"""Standard deviations of the sensor that a peak of the decay must have; below is its noise."""
+"""Smallest peak of the decay, in standard deviations of the sensor."""
 
 SMALL = 1e-6
 
@@ -78,7 +78,7 @@ class Decrement(AbstractEstimator):
             [frequency.variance * (jnp.pi / frequency.slope**2) ** 2, rate.variance]
         )
         gain, response = _gain(plant, experiments, poles)
-        # What the poles' errors do to the gain; the gain's own error comes on top.
+        # Effect of the poles' errors on the gain; the error of the gain alone is added.
         slope = jax.jacfwd(lambda poles: _gain(plant, experiments, poles)[0].slope)(poles)
         mixing = jnp.concatenate([jnp.eye(2), slope[None]])
         own = jnp.zeros((3, 3)).at[2, 2].set(gain.variance)
@@ -109,11 +109,11 @@ def _gain(
 ) -> tuple[Line, Float[Array, "1 sample output"]]:
     """The gain that fits the whole response best, and the response.
 
-    Where the initial state is not known, the free response to it is fitted along.
+    Where the initial state is not known, the free response to it is fitted too.
     """
     omega, sigma = poles
     c_0, c_1 = omega**2 + sigma**2, 2 * sigma
-    # So small a gain keeps the response linear, and that is all it is for.
+    # The gain is small only to keep the response linear.
     unit = plant.from_transfer_function(c_0, c_1, jnp.asarray(SMALL))
     columns = [simulate_experiments(plant, unit, experiments, experiments.initial_state)]
     if not experiments.initial_state_known:
@@ -134,14 +134,14 @@ def _gain(
 
 
 def _decay(plant: AbstractPlant, experiments: Experiments) -> tuple[Line, Line, Array]:
-    """Log of peaks over time, time of zero crossings over their number, and whole half swings."""
+    """Log of peaks over time, time of zero crossings over their number, complete half swings."""
     inputs, y = experiments.inputs[0], experiments.measured[0, :, 0]
     valid = experiments.valid[0]
     num_inputs = jnp.sum(valid) - 1
     index = jnp.arange(len(y))
     last = inputs[num_inputs - 1]
     moving = jnp.any(inputs != last[None], axis=1) & (index[:-1] < num_inputs)
-    begin = jnp.max(jnp.where(moving, index[:-1] + 1, 0))  # the input rests from here on
+    begin = jnp.max(jnp.where(moving, index[:-1] + 1, 0))  # the input is constant from here on
     is_free = valid & (index >= begin)
     crossing = is_free[1:] & is_free[:-1] & ((y[1:] >= 0) != (y[:-1] >= 0))
     fraction = y[:-1] / jnp.where(crossing, y[:-1] - y[1:], 1.0)
@@ -149,7 +149,7 @@ def _decay(plant: AbstractPlant, experiments: Experiments) -> tuple[Line, Line, 
     number = jnp.cumsum(crossing)
     swing = jnp.concatenate([jnp.zeros(1, number.dtype), number])  # of every sample
     peaks = jax.ops.segment_max(jnp.where(is_free, jnp.abs(y), 0.0), swing, len(y))
-    # The decay ends with the last half swing before the first that sinks into the noise.
+    # The decay ends with the last half swing before the first one below the noise.
     is_low = (peaks < MIN_PEAK * plant.sensor.sd[0]) & (jnp.arange(len(y)) >= 1)
     last_swing = jnp.minimum(jnp.argmax(is_low), number[-1])
     is_whole = is_free & (swing >= 1) & (swing < last_swing)

@@ -1,4 +1,4 @@
-"""What an estimate is worth: fit, whiteness of the residual, what is not identifiable.
+"""Quality of an estimate: fit, and tests of the residual.
 
 Everything here runs once, after a fit, on NumPy arrays; nothing is differentiated.
 """
@@ -15,7 +15,7 @@ from jaxtyping import Float
 def fit_percent(
     measured: Float[np.ndarray, " sample"], simulated: Float[np.ndarray, " sample"]
 ) -> float:
-    """100 (1 - |y - y_s| / |y - mean y|); not a number for an output that never moves."""
+    """100 (1 - |y - y_s| / |y - mean y|); NaN for a constant output."""
     spread = np.linalg.norm(measured - measured.mean())
     if spread == 0:
         return float("nan")
@@ -49,10 +49,10 @@ def input_dependence(
 ) -> float:
     """p-value of the hypothesis that the residuals of some records do not follow past inputs.
 
-    What follows the input is not noise: the structure of the model is wrong (cross-correlation
-    test, L. Ljung, System Identification, 2nd ed. 1999, section 16.6). An autoregression is
-    fitted to each residual first, and takes the residual's own memory from it and from the
-    inputs, so that coloured noise alone is no reason. Not a number for residuals of zeros.
+    A residual that follows the input is not noise: the structure of the model is wrong
+    (cross-correlation test, L. Ljung, System Identification, 2nd ed. 1999, section 16.6).
+    Residual and inputs are first filtered by an autoregression fitted to the residual, so
+    that coloured noise alone does not fail the test. NaN for residuals of zeros.
     """
     statistic, degrees = 0.0, 0
     for residual, record in zip(residuals, inputs, strict=True):
@@ -86,7 +86,7 @@ def _lagged(
 def chance_of_fit(
     measured: Float[np.ndarray, " sample"], residual: Float[np.ndarray, " sample"], unknowns: int
 ) -> float:
-    """Probability that a fit this good is chance: an F-test against a constant output."""
+    """Probability of a fit this good by chance: an F-test against a constant output."""
     total = float(np.sum((measured - measured.mean()) ** 2))
     left, degrees = float(np.sum(residual**2)), measured.size - unknowns
     if total <= left:
@@ -96,7 +96,7 @@ def chance_of_fit(
     return incomplete_beta(degrees / 2, unknowns / 2, left / total)
 
 
-# Tails of distributions, written here because SciPy's take a fifth of a second to load.
+# Tails of distributions; SciPy's would take a fifth of a second to load.
 
 
 def chi2_tail(degrees: int, statistic: float) -> float:
@@ -129,7 +129,7 @@ def incomplete_beta(a: float, b: float, x: float) -> float:
 
 
 def correlation(covariance: Float[np.ndarray, "param param"]) -> Float[np.ndarray, "param param"]:
-    """Correlation of the estimates; not a number for a parameter without variance."""
+    """Correlation of the estimates; NaN for a parameter without variance."""
     sd = np.sqrt(np.diag(covariance))
     with np.errstate(divide="ignore", invalid="ignore"):
         return covariance / np.outer(sd, sd)
@@ -145,7 +145,7 @@ def robust_covariance(
     Bartlett's window with the bandwidth of D. Andrews ("Heteroskedasticity and
     autocorrelation consistent covariance matrix estimation", Econometrica 59, 1991) for
     the autocorrelation of the residual. Both arguments are over the noise's standard
-    deviation. Directions that are not seen get zero.
+    deviation. Undetermined directions get zero.
     """
     H = np.einsum("etou,etov->uv", sensitivity, sensitivity)
     size = np.sqrt(np.diag(H))

@@ -1,4 +1,4 @@
-"""From recorded experiments to parameters with confidence: the everyday job."""
+"""`identify`: parameters and confidence intervals from recorded experiments."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _NOTHING_SEEN = (
     "input move the plant beyond the noise? or did the search begin too far from the truth "
     "(--start)?"
 )
-_BY_CHANCE = 1e-3  # a fit that chance would reach more often explains nothing
+_BY_CHANCE = 1e-3  # a fit with a larger p-value explains nothing
 
 
 RecordLike: TypeAlias = Record | str | Path
@@ -75,12 +75,12 @@ def identify(
     Args:
         records: a record or the path of an experiment file, or several, with one sampling time.
         plant: a name, `path/to/file.py:ClassName`, a plant or its class; its constants and
-            sensor are taken as known, its dt gives way to the records'. Default the plant that
-            the first record's sidecar names.
+            sensor are taken as known, its dt is replaced by that of the records. Default the
+            plant that the first record's sidecar names.
         estimator: a name (`ex.estimators()` lists them), an estimator or its class.
         start: where the search begins, by name; default the nominal parameters.
         hold: values of parameters that are known and not estimated, by name.
-        initial_state: "known" (the plant's), "free" (estimated along), or "auto": known
+        initial_state: "known" (the plant's), "free" (estimated too), or "auto": known
             where every sidecar says so.
         validate: records for which only the initial state is fitted.
         columns: names in the files where they are not the plant's: {"pitch": "qm"}.
@@ -198,7 +198,7 @@ def _chosen(
     start: Mapping[str, float] | Params | None,
     hold: Mapping[str, float] | None,
 ) -> tuple[AbstractEstimator, Params]:
-    """The estimator, and where its search begins."""
+    """The estimator, and the start of its search."""
     method = estimator_from(estimator)
     for word, values in (("start", start), ("hold", hold)):
         if values and not isinstance(method, NLS):
@@ -222,7 +222,7 @@ def _starts_at(record: Record, plant: AbstractPlant) -> bool:
 
 
 def _other_plant(record: Record, plant: AbstractPlant) -> tuple[str, ...]:
-    """A sentence where the sidecar says that the record is of a plant with other constants."""
+    """A warning where the sidecar has a plant with other constants."""
     made_with, own = record.metadata.get("plant", {}), json_ready(plant.description.to_dict())
     if all(made_with.get(key, own[key]) == own[key] for key in ("name", "constants")):
         return ()
@@ -245,7 +245,7 @@ def _check_lengths(plant: AbstractPlant, records: Sequence[Record], known: bool)
 
 
 def _common_dt(plant: AbstractPlant, records: Sequence[Record]) -> float:
-    """The records' sampling time [s], freed of rounding: it enters the plant's hash."""
+    """The records' sampling time [s], rounded, because it enters the plant's hash."""
     first, own = records[0], float(plant.dt)
     for record in records[1:]:
         if abs(record.dt - first.dt) > 1e-3 * first.dt:
@@ -266,13 +266,13 @@ def _known(plant: AbstractPlant, estimator: AbstractEstimator) -> np.ndarray:
     names = names_of(plant.definition.parameters)
     held = estimator.held(plant) if isinstance(estimator, NLS) else (False,) * len(names)
     if all(held):
-        raise ValueError("every parameter is held; nothing is left to estimate")
+        raise ValueError("all parameters are held; none is left to estimate")
     return np.array(held)
 
 
 @dataclass(frozen=True)
 class _Fit:
-    """An estimate, which parameters were free or known, and a sentence for each held one."""
+    """An estimate, its free and known parameters, and a sentence for each held one."""
 
     estimate: Estimate
     free: np.ndarray
@@ -299,9 +299,9 @@ def _fit(
     estimator: AbstractEstimator,
     start: Params,
 ) -> _Fit:
-    """Fits; what could not be seen on the way is looked at again from where the search ended.
+    """Fits, then tests parameters that were held again from the end of the search.
 
-    Far from the truth a search can get stuck where the data seem to say nothing.
+    Far from the true values, a search can stop where the data seem to determine nothing.
     """
     fit = _fit_seen(plant, experiments, estimator, start)
     if not (fit.reasons and fit.is_successful):
@@ -316,7 +316,7 @@ def _fit_seen(
     estimator: AbstractEstimator,
     start: Params,
 ) -> _Fit:
-    """Fits; holds what ends at a bound or cannot be seen, and fits again."""
+    """Fits; holds a parameter that ends at a bound or is not identifiable, and fits again."""
     names = names_of(plant.definition.parameters)
     known = _known(plant, estimator)
     free, reasons = ~known, ()
@@ -338,7 +338,7 @@ def _fit_seen(
 
 
 def _to_hold(plant: AbstractPlant, fit: _Fit, start: Params) -> tuple[int, float, str] | None:
-    """The parameter to hold next, its value, and why in words; None where all is well."""
+    """The parameter to hold next, its value, and the reason; None where there is none."""
     names = names_of(plant.definition.parameters)
     reached = bound_reached(plant.definition, fit.estimate.params)
     if reached is not None and fit.free[reached[0]]:
@@ -359,10 +359,10 @@ def _residuals(
     estimator: AbstractEstimator,
     fit: _Fit,
 ) -> list[Float[np.ndarray, "sample output"]]:
-    """Measured minus simulated outputs of each record, at its own length."""
+    """Measured minus simulated outputs of each record, at its length."""
     estimate = fit.estimate
     knows_state = experiments.initial_state_known or isinstance(estimator, NLS)
-    if fit.is_successful and not knows_state:  # judge ARX fairly, too
+    if fit.is_successful and not knows_state:  # ARX does not estimate the state
         estimate = _with_initial_state(plant, experiments, estimate.params)
     residual = np.asarray(estimate.residual)
     return [residual[i, : len(record.time)] for i, record in enumerate(records)]
@@ -381,7 +381,7 @@ def _confidence(
     fit: _Fit,
     whiteness: Mapping[str, float],
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Covariance of the estimates, and the verdict in words."""
+    """Covariance of the estimates, and the sentences of the verdict."""
     covariance = np.asarray(fit.estimate.covariance)
     if not fit.is_successful:
         return covariance, (*fit.reasons, Status(int(fit.estimate.status)).sentence)
@@ -416,7 +416,7 @@ def _fitted(description: PlantDescription, record: Record, residual: np.ndarray)
 
 
 def _whiteness(residuals: list[np.ndarray], scale: float) -> float:
-    """p-value of white residuals; not a number where only rounding is left of them."""
+    """p-value of white residuals; NaN where only rounding errors are left."""
     return ljung_box(*(r for r in residuals if _is_more_than_rounding(r, scale)))
 
 
@@ -443,15 +443,15 @@ def _wrong_structure(
     or_biased = "" if isinstance(estimator, NLS) else "; or the estimator is biased: try nls"
     return (
         f"the residual of {' and '.join(wrong)} follows the input: the structure of this plant is "
-        "wrong for these data, or time, input or sensor are not what it takes them for; no "
-        f"interval covers that{or_biased}",
+        "wrong for these data, or time, input or sensor differ from its description; the "
+        f"intervals do not include this error{or_biased}",
     )
 
 
 def _require_explanation(
     records: Sequence[Record], residual: Sequence[np.ndarray], unknowns: int
 ) -> None:
-    """Raises where the best simulation follows the outputs no better than chance does."""
+    """Raises ValueError where the best simulation fits the outputs no better than chance."""
     chances = [
         chance_of_fit(record.outputs[:, i], r[:, i], unknowns)
         for record, r in zip(records, residual, strict=True)
@@ -462,6 +462,6 @@ def _require_explanation(
 
 
 def _validated(plant: AbstractPlant, record: Record, params: Params) -> Fitted:
-    """A record beside its simulation; only its initial state is fitted."""
+    """A record and its simulation; only its initial state is fitted."""
     estimate = _with_initial_state(plant, _experiments(plant, [record], False), params)
     return _fitted(plant.definition, record, np.asarray(estimate.residual[0]))

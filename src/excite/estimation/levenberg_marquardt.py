@@ -3,7 +3,7 @@
 Each step solves the damped linear least-squares problem |J d + r|^2 + |d|^2 / radius by an
 orthogonal factorisation; the radius grows after good steps and shrinks after steps that are
 refused (N. Gould et al., "Sensitivity of trust-region algorithms to their parameters", 4OR 3,
-2005). Written here because a general library's loop takes several times as long to trace.
+2005). A general library's loop would take several times as long to trace.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _GROWTH, _SHRINKAGE = 3.5, 0.25  # of the radius after a good and after a refuse
 
 
 class _Search(NamedTuple):
-    """The best point so far with residual and Jacobian, and the next point to look at."""
+    """The best point so far with residual and Jacobian, and the next point to evaluate."""
 
     point: Float[Array, " unknown"]
     residual: Float[Array, " residual"]
@@ -47,7 +47,7 @@ def least_squares(
     """
 
     def advance(s: _Search) -> _Search:
-        # The residual itself rides along as the auxiliary output of its derivative.
+        # The residual is the auxiliary output of its derivative.
         def twice(z: Array) -> tuple[Array, Array]:
             return (r := residual(z)), r
 

@@ -4,9 +4,9 @@ The parameters whose simulated outputs come closest to the measured ones, in the
 the sensor's noise, are found by Levenberg-Marquardt on exact sensitivities. For Gaussian
 noise that is the maximum-likelihood estimate (Ljung, System Identification, ch. 7).
 
-After many periods a wrong resonance frequency has slipped in phase, and the sum of
-squares has other minima. The search therefore sees a growing part of the experiment:
-the first samples pin the frequency down well enough for the next, longer part.
+With a wrong resonance frequency, simulation and measurement are out of phase after many
+periods, and the sum of squares has other minima. The search therefore uses a growing part
+of the experiment: each part determines the frequency well enough for the next, longer one.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class NLS(AbstractEstimator):
     """Output-error nonlinear least squares with a growing horizon.
 
     Attributes:
-        horizons: parts of the experiment that the search sees one after the other.
+        horizons: parts of the experiment that the search uses one after the other.
         tolerance: of the last search, in search coordinates and relative to the residual;
             the first searches stop at 0.1.
         max_steps: of each search.
@@ -57,7 +57,7 @@ class NLS(AbstractEstimator):
         start: Params | None = None,
         free: Bool[Array, " param"] | None = None,
     ) -> Estimate:
-        """Estimate; the initial states are estimated along unless they are known."""
+        """Estimate; the initial states are estimated too unless they are known."""
         require_double_precision()
         others = ~jnp.asarray(self.held(plant))
         free = others if free is None else free & others
@@ -109,7 +109,7 @@ class NLS(AbstractEstimator):
             def weighted(unknowns: Array) -> Array:
                 return jnp.where(seen, problem.residual(unknowns) / sd[None, None], 0.0)
 
-            # Relative to its size at the start, so that damping means the same for any data.
+            # Relative to its size at the start, so that the damping does not depend on the data.
             size = jnp.maximum(jnp.linalg.norm(weighted(unknowns)), 1e-6) / boldness
             unknowns, converged = least_squares(
                 lambda z: (weighted(z) / size).ravel(),
@@ -129,17 +129,17 @@ class NLS(AbstractEstimator):
 
 
 def _stages(nls: NLS, samples: int, reweighted: bool) -> tuple[Array, Array, Array]:
-    """Horizon [samples], tolerance and boldness of each search.
+    """Horizon [samples], tolerance and boldness (inverse damping) of each search.
 
-    The first searches start far away and step carefully. The last starts close by and
-    steps boldly, that is with damping 1 / boldness^2 of the misfit it starts from: a
-    careful search would creep along the valleys that friction makes.
+    The first searches start far away and take small steps. The last starts close to the
+    minimum and takes large ones, with damping 1 / boldness^2 of its initial misfit: small
+    steps would be slow in the narrow valleys that friction causes.
     """
     horizons = [max(part * samples, min(samples, 40)) for part in nls.horizons]
     early = len(horizons) - 1
     tolerances, boldness = [0.1] * early + [nls.tolerance], [1.0] * early + [100.0]
     if reweighted:
-        # Once more with each output weighted by the noise that it turned out to have.
+        # Again, with each output weighted by its estimated noise.
         horizons, tolerances = [*horizons, horizons[-1]], [*tolerances, nls.tolerance]
         boldness = [*boldness, boldness[-1]]
     return jnp.asarray(horizons), jnp.asarray(tolerances), jnp.asarray(boldness)
@@ -176,7 +176,7 @@ class _Problem(eqx.Module):
 
     @property
     def assumed_sd(self) -> Array:
-        """The sensor's; a thousandth of an output's scale where no noise is described."""
+        """The sensor's sd; a thousandth of an output's scale where there is no noise."""
         scales = jnp.asarray([o.scale for o in self.plant.definition.outputs])
         return jnp.where(self.plant.sensor.sd > 0, self.plant.sensor.sd, 1e-3 * scales)
 
@@ -198,7 +198,7 @@ class _Problem(eqx.Module):
         return residual_of(self.experiments, simulated)
 
     def noise_sd(self, residual: Array) -> Array:
-        """Standard deviation of each output's residual, for the unknowns spent on it."""
+        """Standard deviation of each output's residual, corrected for the number of unknowns."""
         num_states = 0 if self.experiments.initial_state_known else self._state_scales.size
         spent = jnp.sum(self.free) + num_states * residual.shape[0]
         count = jnp.sum(self.experiments.valid) - spent / self.num_outputs
@@ -207,7 +207,7 @@ class _Problem(eqx.Module):
         return jnp.maximum(sd, 1e-9 * scales)  # noise-free data keep a finite weight
 
     def sensitivity(self, params: Params, initial_state: Array) -> Array:
-        """Derivative of the outputs by relative changes of parameters, then initial states."""
+        """Derivative of the outputs with respect to relative parameters, then initial states."""
         size = jnp.where(self.free, relative_size(self.plant, params), 0.0)
         states = initial_state.size if not self.experiments.initial_state_known else 0
 
@@ -225,7 +225,7 @@ class _Problem(eqx.Module):
         return jax.jacfwd(response)(jnp.zeros(len(size) + states))
 
     def estimate(self, unknowns: Array, converged: Array) -> Estimate:
-        """The estimate at the end of the search, its covariance from the noise found."""
+        """The estimate at the end of the search, with its covariance from the estimated noise."""
         params = self.plant.Params(*self.params(unknowns))
         initial_state, residual = self.initial_state(unknowns), self.residual(unknowns)
         S = self.sensitivity(params, initial_state)

@@ -1,4 +1,4 @@
-"""What an identification is, and the run folder it leaves."""
+"""The result of an identification, and its run folder."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Fitted:
-    """One record beside its simulation.
+    """One record and its simulation.
 
     Attributes:
-        record: what was measured.
+        record: the measurements.
         simulated: noise-free outputs of the estimated plant.
         fit_percent: by output, 100 (1 - |y - y_s| / |y - mean y|).
     """
@@ -40,7 +40,7 @@ class Fitted:
 
 @dataclass(frozen=True, repr=False)
 class Identification:
-    """The result of `identify`; it shows itself as the table of `excite identify`.
+    """The result of `identify`; its `repr` is the table of `excite identify`.
 
         >>> import excite as ex
         >>> result = ex.identify(ex.simulate("aero2", "chirp"))
@@ -54,13 +54,13 @@ class Identification:
         status: in a few words; docs/reference/machine-readable.md lists them.
         params, std_error: by parameter, in its unit, as attribute or item; the error of a held
             one is nan.
-        held: parameters not estimated: unseen by the data and held where the search started,
-            or held at a bound that they reached.
+        held: parameters not estimated: not identifiable and held at their start value, or
+            held at a bound that they reached.
         covariance, information: of the estimates; see `excite.estimation.Estimate`.
         whiteness: by output, p-value of the residual being white (Ljung-Box).
         structure: by output, p-value of the residual not following past inputs.
-        verdict: sentences on what is identifiable and how far to trust the intervals.
-        fitted, validation: records beside their simulation.
+        verdict: sentences on identifiability and on the validity of the intervals.
+        fitted, validation: records and their simulation.
         initial_state_known: whether initial states were taken as known.
     """
 
@@ -81,7 +81,7 @@ class Identification:
 
     @property
     def is_usable(self) -> bool:
-        """Whether there is an estimate at all."""
+        """Whether there is an estimate."""
         return self.status in ("successful", "partly identifiable")
 
     def ci95(self, name: str) -> tuple[float, float]:
@@ -90,7 +90,7 @@ class Identification:
         return self.params[name] - half, self.params[name] + half
 
     def fit(self) -> dict[str, float]:
-        """Fit in percent by output; over several records, of all of them together."""
+        """Fit in percent by output, over all records together."""
         outputs = names_of(self.plant.outputs)
         measured = np.concatenate(
             [f.record.outputs - f.record.outputs.mean(axis=0) for f in self.fitted]
@@ -117,7 +117,7 @@ class Identification:
         return identification_figure(self.plant, self.summary(), first.record, first.simulated)
 
     def to_pandas(self) -> DataFrame:
-        """One row a parameter: estimate, standard error, 95 % interval, unit.
+        """One row per parameter: estimate, standard error, 95 % interval, unit.
 
         Raises:
             ValueError: where pandas is not installed.
@@ -172,13 +172,13 @@ class Identification:
 def write_run(
     result: Identification, path: Path, overwrite: bool = False, command: str = ""
 ) -> None:
-    """Leaves a run folder: records, simulated outputs, residuals, estimate, information.
+    """Writes a run folder: records, simulated outputs, residuals, estimate, information.
 
     Args:
-        command: that made it, for those who want to do it again.
+        command: that made it.
 
     Raises:
-        ValueError: where `path` holds something else, or a run and not `overwrite`.
+        ValueError: where `path` is not a run folder, or is one and `overwrite` is False.
     """
     d = result.plant
     outputs = names_of(d.outputs)

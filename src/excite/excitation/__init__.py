@@ -1,4 +1,4 @@
-"""Excitations: the contract (`base`), signals, and those that look at the measurements."""
+"""Excitations: the contract (`contract`), signals, and excitations with feedback."""
 
 from .contract import AbstractExcitation as AbstractExcitation
 from .contract import AbstractShape as AbstractShape

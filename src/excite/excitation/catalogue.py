@@ -1,4 +1,4 @@
-"""Excitations by name, their options checked against the plant; nothing is evaluated as code."""
+"""Excitations by name, with options checked against the plant; no text is run as code."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ EXCITATIONS: Mapping[str, type[AbstractShape]] = {
     "decay": Decay,
 }
 LOOP = "loop-"
-"""Before the name of an excitation: it is the reference of a position loop."""
+"""Prefix of an excitation's name: it becomes the reference of a position loop."""
 
 
 def excitations() -> Listing:
@@ -60,7 +60,7 @@ class HasInputs(Protocol):
 ExcitationLike: TypeAlias = (
     str | Path | AbstractExcitation | type[AbstractExcitation] | Policy | HasInputs | Inputs
 )
-"""An excitation, its class or name; a policy, a record or design to replay, or its file; inputs."""
+"""An excitation, its class or name; a policy, a record or a design, or its file; inputs."""
 
 
 def excitation_named(
@@ -77,10 +77,10 @@ def excitation_named(
 def excitation_and_origin(
     given: ExcitationLike, options: Mapping[str, Any], plant: AbstractPlant
 ) -> tuple[AbstractExcitation, dict[str, str]]:
-    """An excitation, and what a record must say of the policy that it is.
+    """An excitation, and the entries of a record about its policy.
 
-    That is `policy_hash`, and a `warning` where the policy was trained on another plant;
-    nothing for other excitations.
+    These are `policy_hash`, and a `warning` where the policy was trained on another plant.
+    Other excitations have none.
 
     Raises:
         ValueError: for an unknown name or option, a value that is not allowed, or a policy
@@ -111,7 +111,7 @@ def excitation_and_origin(
 
 
 def name_of(given: object) -> str:
-    """The word for an excitation that is an object: a record's or a command's."""
+    """The name of an excitation that is an object, for records and commands."""
     kind = given if isinstance(given, type) else type(given)
     if isinstance(given, PositionLoop):
         return LOOP + name_of(given.signal)
@@ -124,7 +124,7 @@ def name_of(given: object) -> str:
 def _object(
     given: object, name: str, options: Mapping[str, Any], plant: AbstractPlant
 ) -> AbstractExcitation:
-    """An excitation from anything that is no name and no policy."""
+    """An excitation from an object that is neither a name nor a policy."""
     if isinstance(given, type) and issubclass(given, AbstractExcitation):
         given = given()
     if isinstance(given, AbstractExcitation):
@@ -168,7 +168,7 @@ def _classical(name: str, options: Mapping[str, Any], plant: AbstractPlant) -> A
 
 
 def _check_excitation(excitation: Any, plant: AbstractPlant) -> None:
-    """Values of an excitation that the plant does not allow."""
+    """Raises ValueError for values of an excitation that the plant does not allow."""
     if isinstance(excitation, PositionLoop):
         _check_loop(excitation)
     else:

@@ -1,10 +1,10 @@
-"""Excitations: what turns the measurements so far into the next input.
+"""Excitations: they compute the next input from the measurements so far.
 
 An excitation is `init` (before the experiment), `__call__` (at every sample) and, where an
 input may be changed by a supervisor, `applied`. Signals ignore the measurement: `init`
 computes their whole sequence. With several inputs, no input is a multiple of another,
-because their effects could not be separated. On a rig an excitation is played by
-`excite.rig.excitation.ExcitationPlayer`.
+because their effects could not be separated. On a rig,
+`excite.rig.excitation.ExcitationPlayer` plays an excitation.
 
 All values are bounded by the plant's input limits, and reproducible from a key.
 """
@@ -69,7 +69,7 @@ class AbstractShape(AbstractSignal):
 
     Attributes:
         amplitude: largest distance from that middle [input unit], one for all inputs or one
-            each; by default that of the plant's description for classical signals.
+            for each; by default the plant's amplitude for classical signals.
     """
 
     amplitude: Float[Array, "..."] | None = eqx.field(converter=optional_floats, default=None)

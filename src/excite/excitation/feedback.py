@@ -1,4 +1,4 @@
-"""Excitations that look at the measurements: a position loop, and learned policies."""
+"""Excitations that use the measurements: a position loop, and learned policies."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Signals laid down beforehand: random, PRBS, chirp, multisine, square, decay, and replay."""
+"""Open-loop signals: random, PRBS, chirp, multisine, square, decay, and replay."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class PRBS(AbstractShape):
     """Pseudo-random binary sequence: the input switches between two values.
 
     Attributes:
-        clock: samples between two chances to switch.
+        clock: samples between two possible switches.
         register: bits of a maximum-length shift register (2 to 16), started at random;
             0 draws every value independently. A second input gets the sequence delayed by
             a fraction of its period (K. Godfrey, Perturbation Signals for System
@@ -65,7 +65,7 @@ class PRBS(AbstractShape):
     register: int = eqx.field(static=True, default=0)
 
     def shape(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> Sequence:
-        """Two values for every input; the key draws them, or where the register starts."""
+        """Two values for every input; the key draws them, or the start of the register."""
         blocks = _blocks(num_steps, self.clock, "clock")
         num_inputs = len(plant.definition.inputs)
         if self.register == 0:
@@ -98,7 +98,7 @@ def maximum_length_sequence(bits: int) -> Float[np.ndarray, " period"]:
 
 
 def _band(plant: AbstractPlant, low: Array | None, high: Array | None) -> tuple[Array, Array]:
-    """The plant's frequency band [Hz] where a signal states none of its own."""
+    """The frequency band of a signal [Hz], by default the plant's."""
     default = plant.definition.band
     nyquist = 0.5 / plant.dt
     low = jnp.minimum(default[0], 0.5 * nyquist) if low is None else low
@@ -142,7 +142,7 @@ class Multisine(AbstractShape):
 
     Schroeder's phases, -pi j (j - 1) / J for the j-th of J harmonics, keep the crest factor
     low (M. R. Schroeder, IEEE Trans. Information Theory 16, 1970). The sum is scaled to its
-    peak. Several inputs take turns with the harmonics, so that they are orthogonal.
+    peak. Several inputs get alternate harmonics, so that they are orthogonal.
 
     Attributes:
         start_frequency, stop_frequency: band [Hz], default the plant's.
@@ -197,7 +197,7 @@ class Square(AbstractShape):
 class Decay(AbstractShape):
     """Pump and free decay: a square wave near resonance, then the input rests.
 
-    The classical way to the damping of an oscillator, to be evaluated by the logarithmic
+    The classical experiment for the damping of an oscillator, evaluated by the logarithmic
     decrement.
 
     Attributes:

@@ -65,7 +65,7 @@ class Aero2(AbstractARXPlant):
 class Aero2Lag(AbstractPlant):
     """`Aero2` whose thrust follows the voltage with a first-order lag, tau v' = u - v.
 
-    The rotor's time constant tau is estimated along; 0.162 s by Quanser's data.
+    The rotor's time constant tau is a parameter; 0.162 s by Quanser's data.
     """
 
     definition = dataclasses.replace(
@@ -91,7 +91,7 @@ class Aero2Lag(AbstractPlant):
 
 
 class Aero2Detailed(AbstractPlant):
-    """The Aero 2 as it behaves: lag, thrust curve, dead zone, asymmetry, stops, encoder.
+    """The Aero 2 in detail: lag, thrust curve, dead zone, asymmetry, stops, encoder.
 
     The rotor's speed, in volts, follows the voltage with the lag tau. Its thrust is
     quadratic beyond the dead zone d and equals that of the ideal plant at V_0 = 7.2 V,
@@ -100,7 +100,7 @@ class Aero2Detailed(AbstractPlant):
 
     mixed with the linear v by `curvature` (1: all quadratic), and stronger by half the
     asymmetry for v > 0, weaker for v < 0. Edges are smooth within 0.1 V; stops are springs.
-    Numbers: docs/reference/real-time.md. Here they are known; a rig's own may differ.
+    Numbers: docs/reference/real-time.md. Here they are known; those of a rig may differ.
     """
 
     definition = dataclasses.replace(

@@ -1,4 +1,4 @@
-"""Plants by name: those that are shipped, and those of a user's file."""
+"""Plants by name: shipped plants, and those in a user's file."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ PlantLike: TypeAlias = str | AbstractPlant | type[AbstractPlant]
 
 
 def plant_from(given: PlantLike) -> AbstractPlant:
-    """A plant in double precision: by name, of a class, or as it is.
+    """A plant in double precision, from a name, a class or a plant.
 
     Raises:
         ValueError: as `plant_named`, and for functions that do not fit the description.
@@ -60,17 +60,17 @@ def plant_from(given: PlantLike) -> AbstractPlant:
     if not isinstance(given, AbstractPlant):
         allowed = "a name, path/to/file.py:ClassName, a plant or its class"
         raise wrong_type("plant", given, allowed)
-    if given.dt.dtype != float:  # made in single precision: the numbers that were written down
+    if given.dt.dtype != float:  # made in single precision: use the definition's numbers
         return jax.tree.map(lambda x: floats(np.asarray(x).astype(str).astype(float)), given)
     _check_plant(given, where)
     return given
 
 
 def plant_named(name: str) -> AbstractPlant:
-    """A shipped plant by name, or that of a user's file as `path/to/file.py:ClassName`.
+    """A shipped plant by name, or one in a user's file as `path/to/file.py:ClassName`.
 
-    The user's file is imported, that is run: a name of this kind is only ever taken from
-    the user's command line, script or study file.
+    The user's file is imported, so its code runs. Take such a name only from the user's
+    command line, script or study file.
 
     Raises:
         ValueError: for an unknown name, or a file without such a class.
@@ -87,7 +87,7 @@ def plant_named(name: str) -> AbstractPlant:
 
 
 def _complete(plant_class: type[AbstractPlant], where: str) -> AbstractPlant:
-    """A plant of a class, with its default numbers."""
+    """A plant of a class with its default numbers."""
     try:
         return plant_class()
     except (TypeError, AttributeError) as error:  # a method or the definition is missing
@@ -95,7 +95,7 @@ def _complete(plant_class: type[AbstractPlant], where: str) -> AbstractPlant:
 
 
 def _check_plant(plant: AbstractPlant, where: str) -> None:
-    """Raises ValueError where the functions of a user's plant do not fit its description."""
+    """Raises ValueError where the functions of a plant do not fit its description."""
     d = plant.definition
     state, inputs = plant.initial_state, jnp.zeros(len(d.inputs))
     for name, arguments, count in (
@@ -106,7 +106,7 @@ def _check_plant(plant: AbstractPlant, where: str) -> None:
             shape = jnp.shape(jax.eval_shape(getattr(plant, name), *arguments))
         except jax.errors.ConcretizationTypeError as error:
             raise ValueError(
-                f"{name} of {where} decides by the value of a state, an input or a parameter "
+                f"{name} of {where} branches on the value of a state, an input or a parameter "
                 "(if, while, and, or, float, int): use jnp.where(condition, value, otherwise)"
             ) from error
         except jax.errors.TracerArrayConversionError as error:
@@ -124,7 +124,7 @@ def with_sensor(
     noise_sd: Mapping[str, float] | None,
     resolution: Mapping[str, float] | None = None,
 ) -> AbstractPlant:
-    """The plant with another noise or resolution of the outputs named, in their units.
+    """The plant with another noise or resolution of the named outputs, in their units.
 
     Raises:
         ValueError: for an unknown output, or a value that is negative or not finite.

@@ -4,10 +4,9 @@ A new plant is one class with a `definition` (plain data) and two pure functions
 
     x'(t) = derivative(x, u, params)        y(t) = output(x, params)
 
-Everything else (simulation, sensitivities, estimation, training) follows from those.
-Numbers of a plant are leaves of the pytree, names and limits are static: two plants of a
-class that differ in a constant, in sensor noise or in the initial state share one
-compilation.
+Simulation, sensitivities, estimation and training need nothing else. Numbers of a plant
+are leaves of the pytree, names and limits are static. Two plants of a class that differ
+in a constant, in sensor noise or in the initial state share one compilation.
 """
 
 from __future__ import annotations
@@ -31,8 +30,8 @@ from ..description import PlantDescription, names_of, wrong_type
 from ..report.results import plant_text
 from .fields import floats
 
-# Estimation and information are of no value in single precision. Everything that computes
-# starts with a plant, so this is the one place where the process is switched.
+# Estimation and information need double precision. Every computation imports this module,
+# so JAX is switched here and nowhere else.
 jax.config.update("jax_enable_x64", True)
 
 
@@ -51,7 +50,7 @@ Params: TypeAlias = Any
 
 @cache
 def _tuple_type(title: str, names: tuple[str, ...]) -> type:
-    # One class for one set of names: a pytree of another class would compile anew.
+    # One class for one set of names: a pytree of another class would compile again.
     return namedtuple(title, names)  # pyright: ignore[reportUntypedNamedTuple]
 
 
@@ -68,8 +67,8 @@ class Sensor(eqx.Module):
 
 
 if TYPE_CHECKING:
-    # Equinox tells type checkers that every class has a dataclass's constructor of its own;
-    # all plants inherit the one below.
+    # For type checkers Equinox gives every class a dataclass constructor; all plants inherit
+    # the one below.
     class _Module: ...
 else:
     _Module = eqx.Module
@@ -120,7 +119,7 @@ class AbstractPlant(_Module):
         dt: float | Float[Array, ""] | None = None,
         **constants: float | Float[Array, ""],
     ) -> None:
-        """A plant with the numbers of its definition, but for those given.
+        """A plant with the numbers of its definition, except those given.
 
         Args:
             dt: sampling time [s]; it is integrated no more coarsely than in the definition.
@@ -143,7 +142,7 @@ class AbstractPlant(_Module):
         at_rest = [s.initial for s in d.states]
         self.initial_state = floats(at_rest if initial_state is None else initial_state)
         self.dt = floats(d.dt if dt is None else dt)
-        # Without a dt of its own a plant can be built of traced numbers.
+        # Without a given dt a plant can be built from traced numbers.
         self.substeps = (
             d.substeps if dt is None else math.ceil(float(dt) * d.substeps / d.dt - 1e-3)
         )
@@ -151,7 +150,7 @@ class AbstractPlant(_Module):
     def __repr__(self) -> str:
         try:
             return plant_text(self.description)
-        except TypeError:  # numbers that JAX traces cannot be shown
+        except TypeError:  # traced numbers cannot be shown
             return plant_text(self.definition)
 
     @abc.abstractmethod
@@ -176,7 +175,7 @@ class AbstractPlant(_Module):
 
     @property
     def description(self) -> PlantDescription:
-        """The definition with this plant's own numbers; not for use inside jit."""
+        """The definition with this plant's numbers; not for use inside jit."""
         d, dt = self.definition, float(self.dt)
         return dataclasses.replace(
             d,
@@ -224,7 +223,7 @@ class AbstractARXPlant(AbstractPlant):
     """A plant of one input and one output whose parameters follow from an ARX model.
 
     The ARX model of order 2 is mapped to the differential equation
-    y'' + c_1 y' + c_0 y = d_0 u by `excite.estimation.arx`; the plant knows the rest.
+    y'' + c_1 y' + c_0 y = d_0 u by `excite.estimation.arx`; the plant does the rest.
     """
 
     @abc.abstractmethod
@@ -235,7 +234,7 @@ class AbstractARXPlant(AbstractPlant):
 
 
 def params_from(plant: AbstractPlant, values: Mapping[str, float] | Params | None = None) -> Params:
-    """Nominal parameters, but for those given, by name or as the plant's named tuple.
+    """Nominal parameters, except those given by name or as the plant's named tuple.
 
     Raises:
         ValueError: for an unknown name or a value outside the parameter's bounds.

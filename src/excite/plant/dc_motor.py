@@ -9,8 +9,8 @@ from .contract import AbstractPlant
 class DCMotor(AbstractPlant):
     """Armature circuit and rotor: L i' = u - R i - K w, J w' = K i - b w.
 
-    One constant K serves torque and back-EMF (equal in SI units). The numbers are those
-    of a typical 24 V laboratory motor; the critical level of the current is 5 A.
+    The constant K is that of torque and back-EMF (equal in SI units). The numbers are those
+    of a typical 24 V laboratory motor. The critical level of the current is 5 A.
     """
 
     definition = PlantDescription(

@@ -1,4 +1,4 @@
-"""Fields that people set by name: numbers become arrays, options are checked by their types.
+"""Fields that users set by name: numbers become arrays, options are checked by their types.
 
 Excitations, estimators and objectives are dataclasses. A field whose type is `bool`, `int`,
 `float` or an array of numbers is an option of its class; a field of another type is not.
@@ -25,14 +25,14 @@ _Module = TypeVar("_Module", bound=eqx.Module)
 
 
 def floats(value: object) -> Array:
-    """An array in double precision, also from whole numbers; what is traced stays traced."""
+    """An array in double precision, also from whole numbers; traced values stay traced."""
     if isinstance(value, jax.core.Tracer):
         return jnp.asarray(value, float)
-    return jax.device_put(np.asarray(value, float))  # compiles nothing, as jnp.asarray would
+    return jax.device_put(np.asarray(value, float))  # unlike jnp.asarray, compiles nothing
 
 
 def optional_floats(value: object) -> Array | None:
-    """As `floats`, and None as it is; converts fields."""
+    """As `floats`, but None stays None."""
     return None if value is None else floats(value)
 
 
@@ -56,14 +56,14 @@ def with_options(default: _Module, name: str, options: Mapping[str, object]) -> 
 
 @cache
 def options_of(kind: type[eqx.Module]) -> dict[str, str]:
-    """Options of a class, and what each may be."""
+    """Options of a class, and the allowed type of each in words."""
     types = get_type_hints(kind)
     options = {f.name: _allowed(types[f.name]) for f in dataclasses.fields(kind)}
     return {name: allowed for name, allowed in options.items() if allowed}
 
 
 def _allowed(field: object) -> str:
-    """What a field of this type may be; empty for a type that is no option."""
+    """The allowed values of a field of this type in words; empty for a type that is no option."""
     if isinstance(field, UnionType):  # with None, where the default depends on the plant
         field = get_args(field)[0]
     if field in (bool, int):

@@ -3,8 +3,8 @@
 A policy is a feed-forward network and the layout of what it observes, in one safetensors
 file: the weights as tensors, the contract (plant, layout, provenance) as JSON in the
 header. It is read and run with NumPy alone. One step of a policy, from window and
-measurement to the input, is written once, in `respond`: `xp` is NumPy on a rig, and
-`jax.numpy` in training and simulation. Nothing is ever unpickled.
+measurement to the input, is `respond`: `xp` is NumPy on a rig, and `jax.numpy` in
+training and simulation. Nothing is unpickled.
 """
 
 from __future__ import annotations
@@ -38,16 +38,16 @@ class Layout:
     """What a policy observes: Eq. 2 of Langschwert et al., for any plant.
 
     The last `window` measurements over `output_scale`, the last `window` inputs over the
-    input limits, oldest first, and k / num_steps. The newest input is the one of the step
-    before: the next is what the policy is asked for. Samples before the first are zero.
-    Beyond Eq. 2, sine and cosine of clocks that run with k may follow.
+    input limits, oldest first, and k / num_steps. The newest input is that of the previous
+    step. Samples before the first are zero. Beyond Eq. 2, sine and cosine of clocks that
+    run with k may follow.
 
     Attributes:
-        window: samples remembered.
+        window: number of samples.
         num_steps: T, steps of the experiment the policy was made for.
         output_scale: y_max of each output, in its unit.
-        input_middle, input_half: middle of each input's limits, and how far from it the
-            policy may go: half their width, or less.
+        input_middle, input_half: middle of each input's limits, and the largest distance
+            from it: half their width, or less.
         clocks: frequencies of the clocks, in cycles a step, at most one half.
     """
 
@@ -133,7 +133,7 @@ def network(xp: ModuleType, weights: Weights, observation: AnyArray) -> AnyArray
 def forward(
     xp: ModuleType, weights: Weights, observation: AnyArray, if_not_finite: float = 0.0
 ) -> AnyArray:
-    """Action in [-1, 1]: the network's output, clipped; `if_not_finite` where it is no number."""
+    """Action in [-1, 1]: the network's output, clipped; `if_not_finite` for NaN or infinity."""
     action = network(xp, weights, observation)
     return xp.where(xp.isfinite(action), xp.clip(action, -1.0, 1.0), if_not_finite)
 
@@ -166,7 +166,7 @@ def respond(
 ) -> tuple[Window, AnyArray]:
     """One step of a policy: the window with this measurement, and the input to apply.
 
-    Which input was applied is told afterwards by `with_input`.
+    Call `with_input` afterwards with the input that was applied.
 
     Args:
         layout: what the policy observes.

@@ -1,4 +1,4 @@
-"""Policy files: reading one, and those that come with the package."""
+"""Policy files: reading one, and the shipped ones."""
 
 from __future__ import annotations
 
@@ -52,5 +52,5 @@ def policies() -> Listing:
 
 
 def policy_path(name: str) -> Path | None:
-    """File of the policy a user names: a path, or a shipped policy; None for other words."""
+    """File of a policy, from a path or a shipped name; None for another word."""
     return Path(name) if name.endswith(POLICY_ENDING) else shipped_policies().get(name)

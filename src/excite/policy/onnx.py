@@ -1,8 +1,8 @@
-"""A policy as ONNX: one file that other tools run, without Python and without this package.
+"""A policy as ONNX: one file that other tools can run without Python and this package.
 
 The graph holds the network alone, from the observation of Eq. 2 to an action in [-1, 1];
-the window of measurements and inputs is kept by the program that runs it. The contract says
-how; it is in the model's metadata as JSON, as in the policy's file.
+the program that runs it keeps the window of measurements and inputs. The contract defines
+the window; it is in the model's metadata as JSON, as in the policy's file.
 """
 
 from __future__ import annotations
@@ -62,14 +62,14 @@ def to_onnx(policy: Policy) -> bytes:
 
 
 def require_onnx_path(path: Path, overwrite: bool) -> None:
-    """Raises ValueError where no ONNX file may be written."""
+    """Raises ValueError where an ONNX file may not be written."""
     if path.suffix.lower() != ONNX_ENDING:
         raise ValueError(f"{path}: an ONNX file ends in {ONNX_ENDING}")
     require_new_file(path, overwrite)
 
 
 def write_onnx(policy: Policy, path: Path, overwrite: bool = False) -> None:
-    """Writes the ONNX file of a policy, whole or not at all.
+    """Writes the ONNX file of a policy, completely or not at all.
 
     Raises:
         ValueError: one sentence where it may not or cannot be written.

@@ -1,6 +1,6 @@
-"""Experiment files: `record` is the noun and its file, `read` reads them, `prepare` checks them.
+"""Experiment files: `record` defines and writes them, `read` reads and `prepare` checks them.
 
-What `table` reads is text of anybody's; nothing here needs JAX.
+`table` reads CSV text from any source. Nothing here needs JAX.
 """
 
 from .prepare import require_playable as require_playable

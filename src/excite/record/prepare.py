@@ -9,14 +9,14 @@ import numpy as np
 from ..description import Input, Output, PlantDescription
 from .record import Record
 
-_UNEVEN = 0.05  # of the sampling time: more than printing it with few digits explains
+_UNEVEN = 0.05  # of the sampling time: more than rounding in the file explains
 _TIMES_LIMIT = 2.0  # inputs beyond this many times the limits are in another unit
 TIMES_DT = 50.0  # likewise sampling times this many times the plant's
 _TIMES_SCALE = 10.0  # likewise outputs beyond this many times their typical size
 
 
 def require_playable(record: Record, description: PlantDescription) -> None:
-    """Raises ValueError for inputs beyond the limits: they would be clipped into others."""
+    """Raises ValueError for inputs beyond the limits, which would be clipped."""
     for part, values in zip(description.inputs, record.inputs.T, strict=True):
         if values.min() < part.lower - 1e-9 or values.max() > part.upper + 1e-9:
             raise ValueError(
@@ -36,14 +36,14 @@ def check_finite(values: np.ndarray, name: str, path: Path) -> None:
 
 
 def check_time(time: np.ndarray, path: Path) -> None:
-    """Raises ValueError for sampling instants that do not grow evenly."""
+    """Raises ValueError for sampling instants that do not increase evenly."""
     if time.size < 2:
         raise ValueError(f"{path}: {time.size} samples; at least two are needed")
     check_finite(time, "time", path)
     steps = np.diff(time)
     usual = float(np.median(steps))
     if usual <= 0:
-        raise ValueError(f"{path}: 'time' does not grow")
+        raise ValueError(f"{path}: 'time' does not increase")
     bad = np.flatnonzero(np.abs(steps - usual) > _UNEVEN * usual)
     if bad.size:
         k, gap = bad[0], steps[bad[0]]
@@ -55,7 +55,7 @@ def check_time(time: np.ndarray, path: Path) -> None:
 
 
 def check_size(values: np.ndarray, part: Input | Output, path: Path) -> None:
-    """Values that only another unit can explain are refused."""
+    """Raises ValueError for values so large that their unit must be wrong."""
     if isinstance(part, Input):
         middle, half = (part.upper + part.lower) / 2, (part.upper - part.lower) / 2
         worst = values[np.argmax(np.abs(values - middle))]
@@ -68,6 +68,6 @@ def check_size(values: np.ndarray, part: Input | Output, path: Path) -> None:
     if excess > allowed:
         raise ValueError(
             f"{path}: {part.name!r} reaches {worst:g} {part.unit}, {expected}; "
-            f"is it in another unit? Give a scale, {part.name}=FACTOR (1 says that the unit is "
+            f"is it in another unit? Give a scale, {part.name}=FACTOR (1 confirms that the unit is "
             "right)"
         )

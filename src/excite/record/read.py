@@ -1,9 +1,9 @@
-"""Experiment files and run folders: the only things that cross from computing to showing.
+"""Reads experiment files.
 
 An experiment file is CSV or MAT with the columns `time`, the plant's inputs and its
 outputs, in SI units: row k holds the outputs measured at time[k] and the inputs held from
-time[k] to time[k + 1]. A JSON file of the same name beside it (the sidecar) says which
-plant it was, which parameters, and how the experiment began.
+time[k] to time[k + 1]. A JSON file of the same name beside it (the sidecar) gives the
+plant, its parameters if known, and how the experiment began.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def read_record(
 
     Args:
         path: the file; its ending tells its kind.
-        description: the plant; default the one that the sidecar names.
+        description: the plant; default that of the sidecar.
         columns: names in the file where they are not the plant's: {"pitch": "qm"}.
         scales: factors from the file's unit to the plant's: {"pitch": 0.01745}.
         inputs_only: whether the file is a designed input without outputs; the record
@@ -84,7 +84,7 @@ def read_record(
         raise ValueError(
             f"{path}: sampled every {dt:g} s, where {description.name!r} is every "
             f"{description.dt:g} s; is 'time' in another unit? Give a scale, "
-            "time=FACTOR (1 says that the unit is right)"
+            "time=FACTOR (1 confirms that the unit is right)"
         )
     parts = {part.name: read(part.name) for part in quantities}
     for part in quantities:
@@ -93,7 +93,7 @@ def read_record(
                 f"{path}: {part.name!r} has {len(parts[part.name])} samples, 'time' {len(time)}"
             )
         check_finite(parts[part.name], part.name, path)
-        if scales.get(part.name) != 1:  # a factor of one says that the unit is right
+        if scales.get(part.name) != 1:  # a factor of one confirms the unit
             check_size(parts[part.name], part, path)
     chosen = [parts[n] for n in names_of(outputs)]
     return Record(
@@ -106,7 +106,7 @@ def read_record(
 
 
 def read_signal(path: Path, description: PlantDescription) -> Record:
-    """The designed input in a file, to be played on a plant as it is.
+    """The designed input in a file, to be played on a plant unchanged.
 
     Raises:
         ValueError: as `read_record`, and for another sampling time or inputs beyond the limits.
@@ -143,7 +143,7 @@ def _read_mat(path: Path) -> dict[str, np.ndarray | list[str]]:
         raise ValueError(
             f"{path}: MAT files of version 7.3 are HDF5; save it with -v7 or as CSV"
         ) from None
-    except Exception as error:  # a damaged file makes the reader fail in any way
+    except Exception as error:  # for a damaged file the reader raises any type
         raise ValueError(f"{path}: not a readable MAT file ({error})") from None
     if not is_small:
         sizes = f"{size / 2**20:.0f} MiB unpacked, more than {_MAX_UNPACKED >> 20}"
@@ -151,7 +151,7 @@ def _read_mat(path: Path) -> dict[str, np.ndarray | list[str]]:
     if not names:
         found = [f"{name} ({'x'.join(map(str, shape))} {kind})" for name, shape, kind in listed]
         raise ValueError(
-            f"{path}: columns are vectors of numbers, each a variable of its own, and it holds "
+            f"{path}: each column must be a variable that is a vector of numbers; the file holds "
             f"{', '.join(found) or 'nothing'}"
         )
     vectors = {name: content[name] for name in names if name in content}

@@ -38,7 +38,7 @@ class Record:
         time: sampling instants [s].
         inputs: by sample and input; row k is held from time[k] on, the last acts after the end.
         outputs: measured, by sample and output.
-        metadata: what the sidecar says; empty without one.
+        metadata: content of the sidecar; empty without one.
         source: where the record came from, for messages.
     """
 
@@ -57,7 +57,7 @@ class Record:
         metadata: Mapping[str, Any] | None = None,
         source: str = "",
     ) -> Record:
-        """A record of T + 1 samples from T inputs; its last row goes on holding the last."""
+        """A record of T + 1 samples from T inputs; its last row repeats the last input."""
         inputs = np.asarray(inputs)
         held = np.concatenate([inputs, inputs[-1:]])
         return cls(np.asarray(time), held, np.asarray(outputs), metadata or {}, source)
@@ -90,7 +90,7 @@ class Record:
         return PlantDescription.from_dict(self.metadata["plant"])
 
     def save(self, path: str | os.PathLike[str], overwrite: bool = False) -> None:
-        """Writes the record as CSV or MAT, as the ending says, and its sidecar.
+        """Writes the record as CSV or MAT, by the file's ending, and its sidecar.
 
         Raises:
             ValueError: for another ending, a folder that does not exist, a file that exists
@@ -130,7 +130,7 @@ def require_record_ending(path: Path) -> None:
 
 
 def require_record_path(path: Path, overwrite: bool) -> None:
-    """Raises ValueError, before anything is computed, where no record may be written."""
+    """Raises ValueError, before anything is computed, where a record may not be written."""
     require_record_ending(path)
     sidecar = path.with_suffix(".json")
     if sidecar.is_file() and not read_sidecar(path):
@@ -150,7 +150,7 @@ def require_matlab(path: Path) -> ModuleType:
 
 
 def read_sidecar(path: Path) -> Mapping[str, Any]:
-    """The sidecar's content; empty where there is none, or where it is not ours."""
+    """The sidecar's content; empty where there is none, or for another kind of file."""
     sidecar = path.with_suffix(".json")
     if not sidecar.is_file():
         return {}
@@ -182,7 +182,7 @@ def described_in(path: Path) -> PlantDescription:
 def write_record(
     path: str | os.PathLike[str], record: Record, description: PlantDescription
 ) -> None:
-    """Writes a record as CSV or MAT, as the ending says, and its sidecar.
+    """Writes a record as CSV or MAT, by the file's ending, and its sidecar.
 
     Raises:
         ValueError: for another ending, or a folder that does not exist.
@@ -196,7 +196,7 @@ def write_record(
         require_matlab(path).savemat(buffer, {n: v[:, None] for n, v in columns.items()})
     else:
         buffer.write(csv_text(columns).encode())
-    # What an earlier sidecar says of the record's origin outlives later uses of it.
+    # The origin in an earlier sidecar is kept.
     sidecar = {
         "plant": description.to_dict(),
         "plant_hash": description.hash,
@@ -204,6 +204,6 @@ def write_record(
         "kind": RECORD_KIND,
         "dt": record.dt,
     }
-    # The sidecar first: a record without one would be read as one of unknown start.
+    # The sidecar first: without it the record's initial state would be read as unknown.
     write_json(path.with_suffix(".json"), sidecar)
     write_bytes(path, buffer.getvalue())

@@ -1,4 +1,4 @@
-"""What studies and identifications leave on disk, as types: rows, differences, estimates.
+"""Types of the files of studies and identifications: rows, differences, estimates.
 
 They are computed in `study` and `estimation`, kept as JSON (docs/machine-readable.md lists the
 keys) and shown by `report`. A number that does not exist is NaN here and `null` in a file.
@@ -30,13 +30,13 @@ def _or_nan(value: object) -> object:
 Count = Annotated[int, Strict()]
 Number = Annotated[float, Strict(), BeforeValidator(_or_nan)]
 MaybeNumber = Annotated[float | None, BeforeValidator(_or_nan)]
-"""NaN for a number that does not exist; None, its default, where it was not asked for."""
+"""NaN for a number that does not exist; None, its default, where it was not computed."""
 Interval = tuple[Number, Number]
 Options = dict[str, object]
 
 
 class Saved(BaseModel):
-    """Part of a file of a run folder."""
+    """Part of a file in a run folder."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -68,7 +68,7 @@ class MeanSd(Saved):
 
 
 class ErrorStatistics(MeanSd):
-    """Of the relative errors of one parameter [%]; `all_seeds` includes those not viable."""
+    """Relative errors of one parameter [%]; `all_seeds` includes seeds that are not viable."""
 
     median: Number
     rms: Number
@@ -83,7 +83,7 @@ class Rate(Saved):
 
 
 class LargestOutput(MeanSd):
-    """Largest magnitude of the watched output, in the unit in which people read it."""
+    """Largest magnitude of the supervised output, in the unit in which it is shown."""
 
     output: str
     unit: str
@@ -150,7 +150,7 @@ class Row(Saved):
 
 
 class Rows(Saved):
-    """`methods.json`, and `clairvoyant.json` with how far the starts of the search differ."""
+    """`methods.json`, and `clairvoyant.json` with the spread between starts of the search."""
 
     rows: tuple[Row, ...]
     log_det_spread_of_starts: tuple[Number, ...] = ()
@@ -208,7 +208,7 @@ class PublishedRow(Saved):
 
 
 class AgentFacts(Saved):
-    """What a study says of one agent."""
+    """Settings of one agent in a study."""
 
     method: str
     targets: list[str] | None = None
@@ -217,7 +217,7 @@ class AgentFacts(Saved):
 
 
 class ClairvoyantFacts(Saved):
-    """What a study says of its clairvoyant signals."""
+    """Settings of a study's clairvoyant signals."""
 
     plants: int
     starts: int
@@ -272,7 +272,7 @@ class EstimatedParameter(Saved):
 
 
 class HeldOut(Saved):
-    """Fit of a record that was not used, by output [%]."""
+    """Fit of a record that was not used in the estimation, by output [%]."""
 
     file: str
     fit_percent: dict[str, Number]

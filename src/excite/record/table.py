@@ -1,4 +1,4 @@
-"""Tables of text: CSV files that anybody may have written."""
+"""CSV files from any source, as columns of text."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from pathlib import Path
 
 
 def text_columns(path: Path) -> dict[str, list[str]]:
-    """Columns of a CSV file that anybody may have written, by name, still as text.
+    """Columns of a CSV file from any source, by name, as text.
 
     Raises:
-        ValueError: one sentence for a file that is no such table, or may be truncated.
+        ValueError: one sentence for a file that is not such a table, or may be truncated.
     """
     delimiter, (first, *rest) = _rows(path)
     header = [name.strip() or f"column {i}" for i, name in enumerate(first, 1)]
@@ -32,7 +32,7 @@ def text_columns(path: Path) -> dict[str, list[str]]:
 
 
 def _rows(path: Path) -> tuple[str, list[list[str]]]:
-    """The delimiter of a CSV file, and its rows, one or more, as they are written."""
+    """The delimiter of a CSV file, and its rows, one or more, as text."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (UnicodeDecodeError, OSError) as error:
@@ -48,7 +48,7 @@ def _rows(path: Path) -> tuple[str, list[list[str]]]:
     except csv.Error as error:
         raise ValueError(f"{path}: cannot be read as CSV text ({error})") from None
     if not text.endswith(("\n", "\r")):
-        # A number cut in half is still a number: only the line's end shows that it is whole.
+        # A truncated number is still a number: only the line's end shows that it is complete.
         raise ValueError(
             f"{path}: line {len(lines)} does not end with a line break; is the file truncated? "
             "(add one if it is complete)"
@@ -57,7 +57,7 @@ def _rows(path: Path) -> tuple[str, list[list[str]]]:
 
 
 def _delimiter(first: list[str]) -> str:
-    """What splits the first two lines alike; names and numbers may hold commas."""
+    """The character that splits the first two lines alike; names and numbers may hold commas."""
     for delimiter in (";", "\t", ","):
         counts = {len(row) for row in csv.reader(first, delimiter=delimiter)}
         if len(counts) == 1 and counts != {1}:

@@ -1,5 +1,5 @@
-"""From plain data (records, descriptions, rows) to tables, figures and pages that people read.
+"""Tables, figures and HTML pages from plain data (records, descriptions, rows).
 
-Nothing here computes an experiment or loads JAX. Modules are imported by name: those of
-numbers and tables load at once, those of figures and pages load Matplotlib.
+Nothing here computes an experiment or loads JAX. Import modules by name: those of numbers
+and tables are fast to load, those of figures and pages load Matplotlib.
 """

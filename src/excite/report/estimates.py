@@ -43,7 +43,7 @@ def residual_cells(result: EstimateSummary, output: str) -> list[str]:
 
 
 def residual_in_words(result: EstimateSummary, output: str) -> str:
-    """The same tests as a part of a sentence."""
+    """The same tests as part of a sentence."""
     white, p_white, follows, p_follows = residual_cells(result, output)
     parts = []
     if white != "–":

@@ -1,4 +1,4 @@
-"""What tables and figures share: numbers as text, axes, levels, files.
+"""Functions for all figures: axes, levels, colours, files.
 
 Here and in the command line angles are in degrees and fractions in percent; elsewhere in SI units.
 """
@@ -34,33 +34,33 @@ _COLOURS = (BLUE, ORANGE, GREEN, RED, "#CC79A7", "#56B4E9")
 PLOT_ENDINGS = (".png", ".svg", ".pdf")
 _MIN_WIDTH = 6.4  # inches; a narrower figure cuts its title and its legend
 MAX_POINTS = 4000
-"""Of one line: more cannot be told apart on paper and make files slow to open."""
+"""Points of a line; more cannot be seen on paper and make files slow to open."""
 _POINTS = ContextVar("points", default=MAX_POINTS)
 
 
 def require_plot_path(path: Path) -> None:
-    """Raises ValueError, before anything is computed, where a figure cannot be written."""
+    """Raises ValueError, before anything is computed, where a figure may not be written."""
     if path.suffix.lower() not in PLOT_ENDINGS:
         raise ValueError(f"{path}: figures end in {', '.join(PLOT_ENDINGS)}")
     require_folder(path)
 
 
 def save(figure: matplotlib.figure.Figure, path: Path) -> None:
-    """Writes a figure, whole or not at all."""
+    """Writes a figure, completely or not at all."""
     write_bytes(path, image(figure, path.suffix[1:].lower()))
 
 
 def image(figure: matplotlib.figure.Figure, kind: str) -> bytes:
-    """A figure as the content of a file of this kind: png, svg or pdf."""
+    """A figure as the content of a png, svg or pdf file."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format=kind, dpi=150)
     return buffer.getvalue()
 
 
 PAGE_STYLE: dict[Any, Any] = {
-    "svg.fonttype": "none",  # text stays text: it can be searched, and the file is smaller
-    "svg.hashsalt": "excite",  # the same figure is the same file
-    "text.parse_math": False,  # a name with $ is a name
+    "svg.fonttype": "none",  # keep text searchable and the file small
+    "svg.hashsalt": "excite",  # the same figure gives the same file
+    "text.parse_math": False,  # names may contain $
     "legend.frameon": False,
 }
 """Matplotlib's settings under which a figure for `inline_svg` is drawn."""
@@ -72,19 +72,19 @@ _PAGE_COLOURS["#000000"] = "currentColor"
 
 
 class _PlainLog(matplotlib.ticker.LogFormatter):
-    """Powers of ten as numbers, without mathematics that a page would have to set."""
+    """Powers of ten as plain text, without mathematics."""
 
     def _num_to_string(self, x: float, *_: object) -> str:
         return f"{x:g}"
 
 
 def inline_svg(figure: matplotlib.figure.Figure, prefix: str) -> str:
-    """A figure as an element of a page, whose style says what its colours are.
+    """A figure as an SVG element of a page; the page's style sets its colours.
 
-    It has no title: a page has headings and captions.
+    It has no title, because a page has headings and captions.
 
     Args:
-        prefix: of the figure's ids, which no other figure of the page may have.
+        prefix: of the figure's ids; unique on the page.
     """
     if figure.get_suptitle():
         figure.suptitle("")
@@ -113,16 +113,16 @@ def inline_svg(figure: matplotlib.figure.Figure, prefix: str) -> str:
 
 
 def _set_plain(axis: matplotlib.axis.Axis) -> None:
-    """Marks of a logarithmic axis as plain numbers, and few of them: a page has many axes."""
+    """Few ticks of a logarithmic axis, as plain numbers."""
     axis.set_major_formatter(_PlainLog())
     axis.set_minor_formatter(_PlainLog())
     low, high = sorted(axis.get_view_interval())
-    if low <= 0 or high / low > 100:  # its powers of ten are enough
+    if low <= 0 or high / low > 100:  # powers of ten are enough
         axis.set_minor_locator(matplotlib.ticker.NullLocator())
 
 
 def _of_page(name: str, value: str, prefix: str) -> str:
-    """An attribute's value on a page: unique ids, the page's colours and font, shorter numbers."""
+    """The value of an attribute with unique ids, the page's colours and font, short numbers."""
     if name == "id":
         return f"{prefix}-{value}"
     if name == "href":
@@ -133,14 +133,14 @@ def _of_page(name: str, value: str, prefix: str) -> str:
 
 
 class _Figure(matplotlib.figure.Figure):
-    """A figure that a notebook shows; pyplot, whose state is the user's, is not involved."""
+    """A figure for a notebook; pyplot is not used, because its state is the user's."""
 
     def _repr_png_(self) -> bytes:
         return image(self, "png")
 
 
 def colour_of(i: int) -> str:
-    """Colour of the i-th thing in a picture."""
+    """Colour of the i-th line of a figure."""
     return _COLOURS[i % len(_COLOURS)]
 
 
@@ -162,12 +162,12 @@ def new_figure(
 
 
 def add_title(figure: matplotlib.figure.Figure, title: str) -> None:
-    """A title above all axes, broken where the figure ends."""
+    """A title above all axes, broken into lines of the figure's width."""
     figure.suptitle(textwrap.fill(title, int(9 * figure.get_figwidth())))
 
 
 def add_legend(figure: matplotlib.figure.Figure, *axes: matplotlib.axes.Axes) -> None:
-    """One legend below all axes, where it hides nothing."""
+    """One legend below all axes."""
     entries = {}
     for axis in axes:
         handles, labels = axis.get_legend_handles_labels()
@@ -179,13 +179,13 @@ def add_legend(figure: matplotlib.figure.Figure, *axes: matplotlib.axes.Axes) ->
 
 
 def axis_label(part: Input | Output) -> str:
-    """Name and unit as people read it."""
+    """Name and display unit."""
     return f"{part.name} [{display_unit(part.unit)[0]}]"
 
 
 @contextlib.contextmanager
 def at_most(points: int) -> Iterator[None]:
-    """Figures drawn inside have no longer lines than this."""
+    """Limits the number of points of the lines in figures drawn inside."""
     token = _POINTS.set(points)
     try:
         yield
@@ -194,16 +194,16 @@ def at_most(points: int) -> Iterator[None]:
 
 
 def thin(time: np.ndarray, *values: np.ndarray) -> list[np.ndarray]:
-    """Long arrays as they look in a picture: every peak of them is kept."""
+    """Long arrays thinned for a figure; every peak is kept."""
     kept = kept_samples(values, _POINTS.get())
     return [a[kept] for a in (time, *values)]
 
 
 def kept_samples(values: Sequence[np.ndarray], points: int) -> np.ndarray:
-    """At most so many indices: ends, and the smallest and largest of every stretch of samples.
+    """Indices for a figure: both ends, and the smallest and largest value of each section.
 
     Args:
-        values: arrays of one length, which share the indices; what is no number is no peak.
+        values: arrays of one length, which share the indices; NaN is no peak.
     """
     length = len(values[0])
     if length <= points:
@@ -220,7 +220,7 @@ def kept_samples(values: Sequence[np.ndarray], points: int) -> np.ndarray:
 
 
 def draw_levels(axis: matplotlib.axes.Axes, part: Output, largest: float) -> None:
-    """Both safety levels, where the output comes near enough for them to fit the picture."""
+    """Both safety levels, if the output comes near them."""
     factor = display_unit(part.unit)[1]
     words = ((part.warning_level, ORANGE, "warning"), (part.critical_level, RED, "critical"))
     levels = [(level, *shown) for level, *shown in words if level is not None]
@@ -233,7 +233,7 @@ def draw_levels(axis: matplotlib.axes.Axes, part: Output, largest: float) -> Non
 
 
 def draw_episodes(axes: Axes, description: PlantDescription, records: Sequence[Record]) -> None:
-    """One column an experiment; one row an input, then one row an output."""
+    """One column per experiment; one row per input, then one per output."""
     for i, part in enumerate(description.inputs):
         axes[i, 0].set(ylabel=axis_label(part))
         for axis, record in zip(axes[i], records, strict=True):

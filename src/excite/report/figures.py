@@ -77,7 +77,7 @@ def _draw_intervals(axis: matplotlib.axes.Axes, params: Mapping[str, EstimatedPa
 def autocorrelation_figure(
     description: PlantDescription, residuals: Sequence[Float[np.ndarray, "sample output"]]
 ) -> matplotlib.figure.Figure:
-    """Autocorrelation of the residuals of all records, and where 95 % of it lies if white."""
+    """Autocorrelation of the residuals of all records, and its 95 % band for white noise."""
     outputs = description.outputs
     figure, axes = new_figure(1, len(outputs), width=4.0 * len(outputs), sharey="row")
     count = sum(len(r) for r in residuals)
@@ -152,7 +152,7 @@ def episodes_figure(
 def information_figure(
     description: PlantDescription, record: Record, percent: Mapping[str, float | None]
 ) -> matplotlib.figure.Figure:
-    """The input, and the least standard deviation of each parameter in percent."""
+    """The input, and the smallest possible standard deviation of each parameter in percent."""
     inputs = description.inputs
     figure, axes = new_figure(len(inputs) + 1)
     for i, part in enumerate(inputs):
@@ -190,12 +190,12 @@ def benchmark_figure(rows: Sequence[Row], title: str) -> matplotlib.figure.Figur
             means = [r.relative_error_percent[name].mean for r in chosen]
             axis.plot(place, means, "o", color=colour_of(e), ms=6, label=estimator)
         for m, method in enumerate(methods):
-            # What an efficient estimator's mean error would be: sqrt(2 / pi) of the bound.
+            # Mean error of an efficient estimator: sqrt(2 / pi) of the bound.
             bound = next(r for r in rows if r.method == method).cramer_rao_percent[name]
             label = "attainable (0.80 of the bound)" if m == 0 else None
             axis.hlines(0.798 * bound, m - 0.35, m + 0.35, color=GREY, lw=2, label=label)
         ticks = [method + _absent(rows, method, name) for method in methods]
-        is_tight = len("".join(ticks)) > 24  # or they overlap
+        is_tight = len("".join(ticks)) > 24  # otherwise they overlap
         slant = {"rotation": 40, "ha": "right", "rotation_mode": "anchor"} if is_tight else {}
         axis.set_xticks(range(len(methods)), ticks, **slant)
         axis.set(yscale="log", title=name, xlim=(-0.5, len(methods) - 0.5))
@@ -206,7 +206,7 @@ def benchmark_figure(rows: Sequence[Row], title: str) -> matplotlib.figure.Figur
 
 
 def _absent(rows: Sequence[Row], method: str, name: str) -> str:
-    """Why a method, or one of its estimators, has no error to be drawn."""
+    """The reason why a method, or one of its estimators, has no error to draw."""
     absent = [
         row
         for row in rows

@@ -1,4 +1,4 @@
-"""Figures of what information costs: violations, and samples."""
+"""Figures of information against violations and against the number of samples."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def frontier_figure(rows: Sequence[Row], title: str) -> matplotlib.figure.Figure
 
 
 def lengths_figure(rows: Sequence[Row], title: str) -> matplotlib.figure.Figure:
-    """Least standard deviation of each parameter against the length of the experiment."""
+    """Cramér-Rao bound of each parameter against the length of the experiment."""
     first = [row for row in rows if row.estimator == rows[0].estimator]
     chosen = [(row.method, row.bound_by_length) for row in first if row.bound_by_length]
     names = rows[0].parameters

@@ -1,4 +1,4 @@
-"""Runs as one page that needs nothing else: to read, to print, to send to a colleague."""
+"""Runs as one self-contained HTML page."""
 
 from __future__ import annotations
 
@@ -17,17 +17,15 @@ from .sections.record import read_recorded
 from .sections.study import StudyRun, common_methods, read_study_run
 
 MAX_BYTES = 3_000_000
-"""Size above which a page is drawn again with shorter lines: it is to be sent by mail."""
+"""Size above which a page is drawn again with fewer points, so that it can be mailed."""
 _NUM_POINTS = (MAX_POINTS, 1000, 250)
-_TOO_LARGE = (
-    f"This page is larger than {MAX_BYTES / 1e6:g} MB: its runs are easier to send on several."
-)
+_TOO_LARGE = f"This page is larger than {MAX_BYTES / 1e6:g} MB: several pages are easier to send."
 _STYLE = Path(__file__).with_name("page.css")
 _KINDS: dict[str, Callable[[Marker], Run]] = {
     "excite identification": read_experiment,
     "excite study": read_study_run,
 }
-_DRAWING = threading.Lock()  # Matplotlib's settings are those of the whole process
+_DRAWING = threading.Lock()  # Matplotlib's settings are global
 
 
 def report_html(
@@ -35,17 +33,17 @@ def report_html(
 ) -> str:
     """A report of run folders and records as one HTML document.
 
-    Of long records, its lines show the extremes of every stretch, fewer where the page gets large.
+    Lines of long records are thinned to their extremes, more so where the page gets large.
 
     Args:
         runs: folders of `excite identify` and `excite study run`, and records
              (.csv, .mat) with their sidecar.
-        progress: called with what is drawn, how many are done, and how many there are.
+        progress: called with what is drawn, how many are done, and the total.
 
     Raises:
-        ValueError: for what cannot be read as one of them.
+        ValueError: for a path that cannot be read as one of them.
     """
-    every = [_read(path) for path in runs]  # whatever is damaged is said before anything is drawn
+    every = [_read(path) for path in runs]  # reports damaged files before drawing starts
     page = ""
     for points in _NUM_POINTS:
         with _DRAWING, matplotlib.rc_context(PAGE_STYLE), at_most(points):
@@ -56,7 +54,7 @@ def report_html(
 
 
 def report(runs: str | Path | Sequence[str | Path], out: str | Path | None = None) -> str:
-    """A report of run folders and records as one HTML page; needs nothing else to be read.
+    """A report of run folders and records as one self-contained HTML page.
 
         >>> import excite as ex
         >>> ex.simulate("aero2", steps=60).save("report_of_this.csv")
@@ -73,7 +71,8 @@ def report(runs: str | Path | Sequence[str | Path], out: str | Path | None = Non
         The page's text.
 
     Raises:
-        ValueError: for what cannot be read as one of them, or an `out` that is no .html file.
+        ValueError: for a path that cannot be read as one of them, or an `out` that is no
+            .html file.
     """
     if out is not None and Path(out).suffix.lower() != ".html":
         raise ValueError(f"{out}: reports end in .html")
@@ -89,7 +88,7 @@ def _drawn(
     runs: Sequence[Path],
     progress: Callable[[str, int, int], None],
 ) -> str:
-    """The page, its lines as long as they may be now."""
+    """The page, with the present limit on the points of a line."""
     sections = []
     for i, run in enumerate(every):
         progress(runs[i].name, i, len(runs))
@@ -99,7 +98,7 @@ def _drawn(
 
 
 def _beside(runs: Sequence[Run]) -> str:
-    """What several experiments, and several studies, have in common; numbers as in the contents."""
+    """Comparisons of several experiments and of several studies, numbered as in the contents."""
     experiments: dict[str, Experiment] = {}
     studies: dict[str, StudyRun] = {}
     for i, run in enumerate(runs, 1):
@@ -116,7 +115,7 @@ def _beside(runs: Sequence[Run]) -> str:
 
 
 def _read(path: Path) -> Run:
-    """A run folder or a record, whatever kind it is of."""
+    """A run folder or a record of any kind."""
     if path.is_file():
         return read_recorded(path)
     if not path.exists():
@@ -126,7 +125,7 @@ def _read(path: Path) -> Run:
 
 
 def _document(sections: Sequence[Section], beside: str) -> str:
-    """The page: of several runs with a list of contents, and what they have in common."""
+    """The page; for several runs with a list of contents and a comparison."""
     numbered = {f"{i}. {s.title}": s for i, s in enumerate(sections, 1)}
     title, contents = f"{len(sections)} runs", _contents(list(numbered.items()))
     if len(sections) == 1:

@@ -1,4 +1,4 @@
-"""Numbers as people read them, with the digits that their uncertainty allows."""
+"""Numbers as text, with the digits that their uncertainty allows."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """A number with so many significant digits; a dash for none."""
+    """A number with this number of significant digits; a dash for None."""
     if value is None or not math.isfinite(value):
         return "–"
     if value != 0 and not 1e-3 <= abs(value) < 1e5:
@@ -16,7 +16,7 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def digits_for(value: float, error: float | None) -> int:
-    """Significant digits of a value that show two digits of its error."""
+    """Number of significant digits of a value so that two digits of its error are shown."""
     if error is None or not math.isfinite(error) or not 0 < error < abs(value):
         return 5
     return min(12, 2 + math.ceil(math.log10(abs(value) / error)))

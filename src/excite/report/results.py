@@ -1,7 +1,7 @@
-"""How a record, an identification and an information result show themselves.
+"""Text and HTML of a record, an identification and an information result.
 
-The same text is the command line's answer and the `repr` in Python; a notebook gets the table
-as HTML. Data are those of the results' `to_dict`.
+The command line prints the same text as `repr` in Python; a notebook gets the table as HTML.
+The data are those of the results' `to_dict`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 _WIDTH = 80
 Data = Mapping[str, Any]
-"""A result as its `to_dict` has it."""
+"""A result as returned by its `to_dict`."""
 
 
 def data_frame(columns: Mapping[str, object], index: object = None) -> pandas.DataFrame:
@@ -40,7 +40,7 @@ def data_frame(columns: Mapping[str, object], index: object = None) -> pandas.Da
 
 
 def wrapped(text: str) -> str:
-    """Text whose sentences are broken where a screen ends."""
+    """Text with its sentences broken into lines."""
     return "\n".join(
         textwrap.fill(line, _WIDTH) if len(line) > _WIDTH else line for line in text.split("\n")
     )
@@ -75,7 +75,7 @@ def _judgement(result: EstimateSummary) -> list[str]:
 
 
 def identification_text(result: EstimateSummary) -> str:
-    """Parameters with their intervals, and how far to trust them, as plain text."""
+    """Parameters with their intervals, tests and verdict, as plain text."""
     title, (header, rows) = _estimates(result)
     return "\n".join([text_table(title, header, rows), "", *_judgement(result)])
 
@@ -136,7 +136,7 @@ def information_html(result: Data) -> str:
 
 
 def record_text(record: Record) -> str:
-    """What a record is, in a few lines."""
+    """A record in a few lines."""
     about = record.metadata.get("provenance") or {}
     made_with: Data = record.metadata.get("plant") or {}
     lines = [

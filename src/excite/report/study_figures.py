@@ -1,4 +1,4 @@
-"""Figures of trained agents: how they learnt, and what they do."""
+"""Figures of trained agents: learning curves and episodes."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ def curves_figure(
     """Learning curves of the deterministic policies: median and band over the seeds.
 
     Args:
-        curves: by agent, one a seed.
-        bounds: agents rewarded with information, whose curves hold no errors but the least
-            standard deviations (Cramér-Rao).
+        curves: by agent, one per seed.
+        bounds: agents rewarded with information, whose curves hold the smallest standard
+            deviations (Cramér-Rao) instead of errors.
     """
     names = [p.name for p in description.parameters]
     figure, axes = new_figure(
@@ -76,8 +76,8 @@ def agents_figure(
 
     Args:
         episodes: by agent, the record, its metadata with the `seed` and the `estimator`; and
-            the estimates over the true parameters, one row a sample (not numbers where there
-            are none).
+            the estimates over the true parameters, one row per sample (NaN where there is
+            none).
     """
     records = [record for record, _ in episodes.values()]
     running = [estimates for _, estimates in episodes.values()]
@@ -105,7 +105,7 @@ def _draw_running(
     records: Sequence[Record],
     running: Sequence[np.ndarray],
 ) -> None:
-    """Estimates over true parameters, one axis an experiment."""
+    """Estimates over true parameters, one axis per experiment."""
     for axis, record, estimates in zip(axes, records, running, strict=True):
         for i, part in enumerate(description.parameters):
             time, values = thin(record.time, estimates[:, i])

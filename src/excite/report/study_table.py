@@ -1,4 +1,4 @@
-"""The table of a study: rows as computed, shown as text, HTML, Markdown, CSV, LaTeX or figure."""
+"""The table of a study: its rows as text, HTML, Markdown, CSV, LaTeX or figure."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ DIFFERENCES = (
 
 
 class StudyTable(Saved):
-    """What a study found: one row a method and estimator, and differences between methods.
+    """Results of a study: one row per method and estimator, and differences between methods.
 
     Attributes:
         rows: in the order of the study.
         differences: of every agent to every other method.
         best_seeds: by agent, the seed that was best in the validation episodes.
         bound_curves: agents whose learning curves hold Cramér-Rao bounds in place of errors.
-        study: its settings; they are kept in a file of their own.
+        study: its settings, which are in a separate file.
     """
 
     rows: tuple[Row, ...] = Field(min_length=1)
@@ -69,7 +69,7 @@ class StudyTable(Saved):
         return self.text()
 
     def text(self, width: int = 80) -> str:
-        """The table with its footnotes, no line wider than `width` where that can be."""
+        """The table with its footnotes, no line wider than `width` where possible."""
         header, cells = self.cells()
         table = text_table(self.study.heading, header, cells, width, NUM_LABELS)
         notes = "\n".join(textwrap.fill(note, width) for note in footnotes(self.study))
@@ -115,7 +115,7 @@ class StudyTable(Saved):
         return self.model_copy(update={"rows": tuple(self.rows[i] for i in order)})
 
     def cells(self) -> Table:
-        """Column titles and rows as people read them, after each method its published row."""
+        """Column titles and rows as text, after each method its published row."""
         cells = []
         for i, row in enumerate(self.rows):
             cells.append(_cells(self.rows, row))
@@ -234,7 +234,7 @@ def _cells(rows: Sequence[Row], row: Row) -> list[str]:
 
 
 def _rig_cells(seen: RigCounts | None, count: int) -> dict[str, str]:
-    """What happened on a simulated rig, by the column's title; nothing without one."""
+    """Counts of a simulated rig by column title; empty without a rig."""
     if seen is None:
         return {}
     cells = {"trips": f"{seen.trips}/{count}"}
@@ -267,7 +267,7 @@ def _published_cells(rows: Sequence[Row], row: Row, published: PublishedRow) -> 
 
 
 def footnotes(study: StudyFacts) -> list[str]:
-    """What a reader of the table must know."""
+    """The footnotes of the table."""
     notes = [
         "Errors are relative errors in percent, mean ± standard deviation over the estimates "
         "that did not fail. The bound is the mean Cramér-Rao bound of the same data, a standard "
@@ -286,7 +286,7 @@ def footnotes(study: StudyFacts) -> list[str]:
         notes.append(
             "log det is that of the relative Fisher information. The D-efficiency compares it, on "
             f"the first {count} plants, with signals designed for each plant as if its parameters "
-            "were known: 1 is what no experiment can beat."
+            "were known (local search)."
         )
     if study.rig:
         notes.append(
@@ -339,7 +339,7 @@ def _gap(gap: Gap) -> str:
 
 
 def common_table(tables: Mapping[str, StudyTable]) -> Table | None:
-    """Methods that stand in several studies beside each other; None where there are none.
+    """Methods of several studies beside each other; None where there are none.
 
     Args:
         tables: by the title of the study.

@@ -1,4 +1,4 @@
-"""Tables as plain text, HTML and Markdown, for any module: they need the standard library only."""
+"""Tables as plain text, HTML and Markdown, with the standard library alone."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def text_table(
     width: int = 80,
     labels: int = 1,
 ) -> str:
-    """A table as plain text, no line of it wider than `width` where that can be.
+    """A table as plain text, no line wider than `width` where possible.
 
     A table that is too wide continues below, its first columns repeated. Lines are broken
     between words only, never inside an interval such as `0.0249998 ± 2.8e-7`.
@@ -64,7 +64,7 @@ def _lines(
 
 
 def _words(cell: str) -> str:
-    """A cell whose intervals are glued: `3 ± 1` and `3 to 4` are one word."""
+    """A cell whose intervals cannot be broken: `3 ± 1` and `3 to 4` are one word."""
     return re.sub(r"(?<=[\d–]) (±|to) (?=[-\d–])", "\N{NO-BREAK SPACE}\\1\N{NO-BREAK SPACE}", cell)
 
 
@@ -88,7 +88,7 @@ def _least_width(column: Sequence[str]) -> int:
 def fitting_tables(
     header: Sequence[str], rows: Sequence[Sequence[str]], width: int, labels: int = 2
 ) -> list[Table]:
-    """A table as several below each other, none wider than `width` where that can be.
+    """A table as several below each other, none wider than `width` where possible.
 
     Each begins with the first `labels` columns; a bound stays beside its error.
     """

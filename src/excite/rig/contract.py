@@ -1,9 +1,9 @@
-"""The contract of a rig, and what is seen of an experiment on it; NumPy alone.
+"""The contract of a rig, and the samples shown during an experiment; NumPy alone.
 
 A rig is opened, read, written and closed. `read` returns when the next reading is due, so
-that a rig with its own clock sets the pace of the loop; one without has a `Pacer`. A rig is
-a context manager that ends with the safe input and released hardware, whatever happens in
-between; a new rig is one class with those four methods.
+that a rig with a clock sets the pace of the loop; one without a clock uses a `Pacer`. A rig
+is a context manager that always ends with the safe input and released hardware. A new rig
+is one class with those four methods.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Interval(NamedTuple):
 
 @dataclass(frozen=True)
 class Sample:
-    """What is shown of one sampling instant while the experiment runs.
+    """One sampling instant, for display while the experiment runs.
 
     Attributes:
         description: of the plant.
@@ -68,7 +68,7 @@ class Sample:
 
 
 class AbstractRig(abc.ABC):
-    """A plant that can be excited: hardware, or what behaves like it.
+    """A plant that can be excited: hardware or a simulation.
 
     Attributes:
         description: of the plant: units, limits, levels, sampling time.
@@ -111,7 +111,7 @@ class AbstractRig(abc.ABC):
         return safe_input(self.description)
 
     def facts(self) -> Mapping[str, Any]:
-        """What the record says about the rig, JSON-ready; asked after the experiment."""
+        """Facts about the rig for the record, JSON-ready; called after the experiment."""
         return {}
 
     def __enter__(self) -> Self:
@@ -148,6 +148,6 @@ class Pacer:
             self._start = time.perf_counter()
         due = self._count * self.interval
         while (left := self._start + due - time.perf_counter()) > 0:
-            # A sleep ends up to 0.1 ms late: the last part is waited without sleeping.
+            # A sleep ends up to 0.1 ms late: the last part is a busy wait.
             time.sleep(left - 2e-4 if left > 4e-4 else 0)
         return time.perf_counter() - self._start

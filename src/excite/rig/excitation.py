@@ -13,7 +13,7 @@ from .player import AbstractPlayer
 
 
 class ExcitationPlayer(AbstractPlayer):
-    """An excitation before its first sample: a position loop, a classical signal, or a user's."""
+    """A player for any excitation, before its first sample."""
 
     def __init__(
         self,
@@ -30,18 +30,18 @@ class ExcitationPlayer(AbstractPlayer):
         self.num_steps, self._excitation = num_steps, excitation
         self._state = start = _start(excitation, plant, num_steps, key)
         measured = jnp.zeros(len(plant.definition.outputs))
-        for _ in range(2):  # a state that has moved may be of another type to the compiler
+        for _ in range(2):  # after a step, the state may have another type for the compiler
             self.applied(self(0, np.asarray(measured)))
         self._state = start
 
     def __call__(self, k: int, measured: np.ndarray) -> np.ndarray:
-        """The excitation's answer to this measurement."""
+        """The excitation's input after this measurement."""
         del k
         self._state, input = _step(self._excitation, self._state, jnp.asarray(measured, float))
         return np.array(input, float)
 
     def applied(self, input: np.ndarray) -> None:
-        """Tells the excitation, if it wants to know."""
+        """Passes the applied input to the excitation."""
         if type(self._excitation).applied is not AbstractExcitation.applied:
             self._state = _applied(self._excitation, self._state, jnp.asarray(input, float))
 

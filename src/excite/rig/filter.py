@@ -57,10 +57,10 @@ class SafetyFilter(eqx.Module):
         feedback: of the backup law u = rest - K (x - x_rest).
         observer: gain of the observers.
         rest: input at rest.
-        slew: largest change of an input from sample to sample, infinite for any.
+        slew: largest change of an input from sample to sample; infinite for no limit.
         level: outputs beyond this fraction of their critical levels are not allowed.
-        horizon: samples in which the backup law must have turned every plant around.
-        num_candidates: inputs tried between the proposed one and the backup law's.
+        horizon: number of predicted samples under the backup law.
+        num_candidates: number of inputs tried between the proposed one and the backup law's.
     """
 
     plant: AbstractPlant
@@ -109,7 +109,7 @@ class SafetyFilter(eqx.Module):
         share = jnp.linspace(0.0, 1.0, self.num_candidates)[:, None]
         candidates = wanted[None] + share * (backup - wanted)[None]
         is_safe = jax.vmap(self._reach, (0, None))(candidates, states) < self.level
-        # The first that is safe; where none is, what the backup law does.
+        # The first safe input; where there is none, that of the backup law.
         best = jnp.where(jnp.any(is_safe), jnp.argmax(is_safe), self.num_candidates - 1)
         input = candidates[best]
         states = jax.vmap(self._next, (0, 0, None))(states, self.params, input)
@@ -118,7 +118,7 @@ class SafetyFilter(eqx.Module):
         return memory, jnp.where(is_finite, input, proposed), is_finite & (best > 0)
 
     def _within(self, input: Array, before: Array) -> Array:
-        """The nearest input that limits and slew allow."""
+        """The nearest input within limits and slew."""
         return jnp.clip(
             jnp.clip(input, before - self.slew, before + self.slew), *self.plant.input_limits
         )
@@ -183,8 +183,8 @@ def _linear_quadratic(plant: AbstractPlant) -> tuple[Array, Array]:
     C = secant(lambda move: plant.output(rest + move, params), states)
     try:
         P = scipy.linalg.solve_discrete_are(A, B, np.diag(states**-2.0), np.diag(inputs**-2.0))
-        # Disturbed by half a usual input, which moves the states as inputs do, and a hundredth
-        # of each state's size a sample, against the sensor's noise.
+        # Process noise per sample: half a usual input, through the input matrix, and a
+        # hundredth of each state's size. Measurement noise: the sensor's.
         noise = np.maximum(
             np.asarray(plant.sensor.sd), 1e-4 * np.array([o.scale for o in d.outputs])
         )
@@ -224,15 +224,15 @@ class FilteredPlayer(AbstractPlayer):
         return np.array(input)
 
     def applied(self, input: np.ndarray) -> None:
-        """Passes it on to the player."""
+        """Passes the applied input to the player."""
         self._player.applied(input)
 
     def origin(self) -> Mapping[str, object]:
-        """As of the player without filter."""
+        """As for the player without filter."""
         return self._player.origin()
 
     def facts(self) -> Mapping[str, object]:
-        """Also how often the filter intervened, and at how many samples no input was safe."""
+        """Also the number of interventions, and of samples at which no input was safe."""
         return {
             **self._player.facts(),
             "filter_interventions": self.num_interventions,

@@ -1,11 +1,11 @@
-"""A functional mock-up unit as a rig: what other tools export as FMI 2 or 3, by FMPy.
+"""A functional mock-up unit (FMI 2 or 3) as a rig, by FMPy.
 
 The unit contains its integrator (co-simulation). Its inputs and outputs are found by the
 plant's names, or by `names` where they differ; experiment, supervisor and record are then
-the same as on any other rig. A wrong file or name is a ValueError before anything is
-started; a unit that fails while it runs is a `RigError`.
+the same as on any other rig. A wrong file or name raises ValueError before anything is
+started; a unit that fails while it runs raises `RigError`.
 
-A unit contains native code, which is run: open only units that you trust.
+A unit contains native code, which is run. Open only units that you trust.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class FMURig(AbstractRig):
             names: the unit's names of inputs and outputs, where they are not the plant's.
             start: values of the unit's parameters, by the unit's names.
             num_readings: in one sampling time.
-            is_real_time: whether readings wait for the wall's clock.
+            is_real_time: whether readings come in real time.
 
         Raises:
             ValueError: one sentence for a missing FMPy, a file that is no such unit, or a
@@ -80,7 +80,7 @@ class FMURig(AbstractRig):
         with self._failing("could not be started"):
             self._folder = tempfile.mkdtemp(prefix="excite-fmu-")
             fmpy.extract(self._path, self._folder)
-            # FMPy changes the working directory to load a library, and leaves it so on failure.
+            # FMPy changes the working directory to load a library, and keeps it on failure.
             with contextlib.chdir("."):
                 self._unit = fmi.instantiate_fmu(
                     self._folder, self._model, "CoSimulation", logger=self._log
@@ -100,7 +100,7 @@ class FMURig(AbstractRig):
         return Reading(now, outputs)
 
     def write(self, input: np.ndarray) -> None:
-        """Sets the inputs; nothing where the unit failed: the standard forbids it then."""
+        """Sets the inputs; does nothing after a failure, as the standard requires."""
         if self._is_running:
             with self._failing("refused an input"):
                 self._set(input)
@@ -149,8 +149,8 @@ class FMURig(AbstractRig):
 
     def _step(self, time: float) -> None:
         done = self._unit.doStep(time, self._interval)
-        if done is not None and done[1]:  # FMI 3 tells more: event, terminate, early, until when
-            raise RigError("it asked to end the simulation")
+        if done is not None and done[1]:  # FMI 3 returns more: event, terminate, early, last time
+            raise RigError("the unit requested the end of the simulation")
 
     def _log(self, *message: bytes | int | None) -> None:
         """Keeps the unit's last message, which FMPy would print."""
@@ -158,7 +158,7 @@ class FMURig(AbstractRig):
 
     @contextlib.contextmanager
     def _failing(self, what: str) -> Iterator[None]:
-        """Any error becomes one sentence, with the last thing that the unit said."""
+        """Turns any error into one sentence with the unit's last message."""
         self._said = ""
         try:
             yield
@@ -193,7 +193,7 @@ def simulate_fmu(
 
 
 def _read(path: Path) -> tuple[ModelDescription, str]:
-    """FMPy's description of a co-simulation unit that runs on this machine, the file's hash."""
+    """FMPy's description of a co-simulation unit that runs on this machine, and the file's hash."""
     if fmpy is None:
         raise ValueError("an FMU needs FMPy: pip install 'excite[fmu]'")
     try:
@@ -203,7 +203,7 @@ def _read(path: Path) -> tuple[ModelDescription, str]:
             files = [name.split("/") for name in zipfile.ZipFile(file).namelist()]
     except OSError as error:
         raise ValueError(f"{path}: cannot be read ({error.strerror})") from None
-    except Exception as error:  # of the ZIP file, of its XML, of the standard's rules
+    except Exception as error:  # from the ZIP file, its XML, or the standard's rules
         raise ValueError(f"{path}: truncated, or no FMU ({_one_line(error)})") from None
     if model.fmiVersion == "1.0":
         raise ValueError(f"{path}: FMI 1.0; FMI 2 and 3 are supported")
@@ -257,7 +257,7 @@ def _require_settable(model: ModelDescription, path: Path, start: Mapping[str, f
 
 
 def _unknown(what: str, name: str, there: Iterable[str]) -> ValueError:
-    """A sentence with the nearest names, or a few where none is near."""
+    """An error with the nearest names, or the first few."""
     there = list(there)
     near = difflib.get_close_matches(name, there, cutoff=0.5) or there[:5]
     return ValueError(f"{what} {name!r} (there is {_listed(near)})")

@@ -26,7 +26,7 @@ class LiveEstimate:
     """Estimates during one experiment."""
 
     def __init__(self, plant: AbstractPlant, num_steps: int, starts_at_rest: bool) -> None:
-        """Compiles the estimator, which takes seconds: before the experiment.
+        """Compiles the estimator before the experiment; this takes seconds.
 
         Args:
             plant: whose parameters are estimated.
@@ -79,5 +79,5 @@ class LiveEstimate:
             initial_state=self._plant.initial_state[None],
             initial_state_known=self._starts_at_rest,
         )
-        # Without this the loop would wait for the result when it looks at it.
+        # Otherwise the loop would wait for the result when it reads it.
         return jax.block_until_ready(NLS()(self._plant, experiments))

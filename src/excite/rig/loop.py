@@ -4,7 +4,7 @@ At every sampling instant: read, check the reading, ask the player for an input,
 apply it, record the sample. Every reading in between is checked too. An experiment ends
 when it is complete, by a trip of the supervisor, by a signal (Ctrl-C), or by an error of
 the player, the rig or the disk. In each case the safe input is applied, the hardware is
-released (the rig is a context manager), and the record is readable and says the reason.
+released (the rig is a context manager), and the record is readable and has the reason.
 """
 
 from __future__ import annotations
@@ -102,9 +102,9 @@ class Stop:
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[Stop]:
-    """Signals (Ctrl-C, a closed terminal) end the experiment at its next reading.
+    """A signal (Ctrl-C, a closed terminal) ends the experiment at its next reading.
 
-    A second signal interrupts at once. Outside the main thread signals are left as they are.
+    A second signal interrupts at once. Outside the main thread, signals are not handled.
     """
     stop, before = Stop(), {}
     if threading.current_thread() is not threading.main_thread():
@@ -165,7 +165,7 @@ class _Run:
 
     @property
     def time(self) -> float:
-        """Of the last reading, since the first [s]."""
+        """Time of the last reading since the first [s]."""
         return self.last.time - self.first.time
 
     def look(self, reading: Reading) -> None:
@@ -201,12 +201,12 @@ class _Run:
         self.outcome.late.append(late)
         self.num_late = self.num_late + 1 if late > interval else 0
         self.outcome.num_missed += late > interval
-        # A whole sample late, or late for a whole sample's readings in a row.
+        # A reading late by dt, or consecutive late readings for more than dt.
         if late > self.rules.dt or self.num_late > max(self.rig.num_readings, 2):
             self.trip(Trip.DEADLINES)
 
     def look_at_player(self) -> None:
-        """Trips where the player took so long that its input is outdated."""
+        """Trips where the player took so long that its input is too late."""
         if self.rig.is_real_time and self.lateness() > self.rules.dt:
             self.trip(Trip.DEADLINES)
 
@@ -217,7 +217,7 @@ class _Run:
         k: int,
         input: np.ndarray,
     ) -> None:
-        """Records the sample whose input takes effect now, unless its reading is false."""
+        """Records the sample whose input takes effect now, unless its reading is invalid."""
         if recorder.num_samples == k and self.watch.trip not in _FALSE_MEASUREMENTS:
             recorder.append(input, self.last.outputs, self.last.time)
             if k < self.num_steps:
@@ -257,13 +257,13 @@ def run_loop(
 ) -> Outcome:
     """One experiment on an open rig, from its first reading to the safe input.
 
-    Nothing is raised when an experiment ends early: the outcome says why.
+    An experiment that ends early raises nothing; the outcome has the reason.
 
     Args:
         rig: open.
         player: proposes the inputs.
         rules: of the supervisor.
-        recorder: open; its sidecar says how the experiment ended.
+        recorder: open; it writes to the sidecar how the experiment ended.
         stop: a request to end.
         on_sample: called at every sampling instant, after the input was applied.
     """
@@ -287,7 +287,7 @@ def run_loop(
 
 
 def _facts(part: AbstractRig | AbstractPlayer) -> Mapping[str, object]:
-    """Its facts, or the error in asking for them, which must not lose the record's end."""
+    """The facts, or the error in calling for them, so that the end is recorded in any case."""
     try:
         return json.loads(json_text(part.facts()))
     except (Exception, KeyboardInterrupt) as error:

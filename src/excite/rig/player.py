@@ -1,4 +1,4 @@
-"""What proposes the inputs of an experiment on a rig, sample by sample; NumPy alone.
+"""Players propose the inputs of an experiment on a rig, sample by sample; NumPy alone.
 
 A signal or a policy is played with NumPy. Any other excitation (`excite.excitation`) is
 played by `rig.excitation`, which needs JAX.
@@ -17,7 +17,7 @@ from ..policy import Policy, empty_window, respond, with_input
 
 
 class AbstractPlayer(abc.ABC):
-    """What proposes the inputs of one experiment: an excitation before its first sample.
+    """A player proposes the inputs of one experiment.
 
     Attributes:
         num_steps: number of sampling instants.
@@ -30,15 +30,15 @@ class AbstractPlayer(abc.ABC):
         """Proposed input at sampling instant k, in the plant's units."""
 
     def applied(self, input: np.ndarray) -> None:
-        """Told the input that was applied, after limits and supervision."""
+        """Called with the input that was applied, after limits and supervision."""
         del input
 
     def origin(self) -> Mapping[str, object]:
-        """Where the inputs come from, JSON-ready; asked before the experiment."""
+        """Origin of the inputs, JSON-ready; called before the experiment."""
         return {}
 
     def facts(self) -> Mapping[str, object]:
-        """What the record says about the player, JSON-ready; asked after the experiment."""
+        """Facts about the player for the record, JSON-ready; called after the experiment."""
         return {}
 
 
@@ -68,14 +68,14 @@ class PolicyPlayer(AbstractPlayer):
         """The network's input for the window that ends with this measurement."""
         weights, window = self._policy.weights, self._window
         with np.errstate(over="ignore", invalid="ignore"):
-            # Not zero, as in training: the supervisor ends an experiment where the input is NaN.
+            # NaN, not zero as in training: the supervisor then ends the experiment.
             self._window, input = respond(
                 np, self._layout, weights, window, k, measured, if_not_finite=math.nan
             )
         return input
 
     def applied(self, input: np.ndarray) -> None:
-        """The window remembers what was applied."""
+        """Puts the applied input into the window."""
         self._window = with_input(np, self._layout, self._window, input)
 
     def origin(self) -> Mapping[str, object]:

@@ -1,6 +1,6 @@
 """The Quanser Aero 2, yaw locked: its pitch, over Quanser's HIL interface; NumPy alone.
 
-The interface comes with Quanser's SDK; the rest of the package does not need it. The card's
+The interface comes with Quanser's SDK; only this module needs it. The card's
 clock sets the pace: a task on the card reads the encoder at 500 Hz, and `read` waits for its
 next sample. The card's watchdog stops the motors even if this process is killed.
 """
@@ -43,7 +43,7 @@ COUNTS = 2880
 WATCHDOG_TIMEOUT = 0.5
 """The card stops the motors after this time without a reading [s].
 
-The loop ends by itself when it is late by one sampling time, 0.1 s; the watchdog is for a
+The loop ends itself when it is late by one sampling time, 0.1 s. The watchdog is for a
 process that was killed or hangs. In this time full voltage moves a body at rest by 0.075 rad.
 """
 
@@ -116,7 +116,7 @@ class QuanserAero2(AbstractRig):
         self._require_rest()
         room = int(READING_RATE)
         self._task = self._call("task_create_encoder_reader", room, _PITCH, len(_PITCH))
-        # Hardware does not wait. Where samples were lost the loop sees that it is late.
+        # Lost samples are not fetched; the loop detects that it is late.
         modes = BufferOverflowMode
         mode = modes.WAIT_ON_OVERFLOW if self._is_virtual else modes.OVERWRITE_ON_OVERFLOW
         self._call("task_set_buffer_overflow_mode", self._task, mode)

@@ -1,7 +1,7 @@
-"""The record of an experiment under way: every sample is on disk before the next.
+"""The record of a running experiment: every sample is on disk before the next.
 
-The sidecar of a record is written before its first sample, and again with the reason of the
-end. A process that is killed leaves a valid record of all samples so far.
+The sidecar is written before the first sample, and again at the end with the reason. A
+process that is killed leaves a valid record of all samples so far.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ class Recorder:
     def _line(self, words: list[str]) -> None:
         line, before = (",".join(words) + "\n").encode(), self._file.tell()
         if self._file.write(line) != len(line):
-            self._file.truncate(before)  # half a line would make the file unreadable
+            self._file.truncate(before)  # a partial line would make the file unreadable
             raise OSError(f"{self._path}: the disk is full")
 
     def _write_sidecar(self, more: Mapping[str, object], reserve: int = 0) -> None:

@@ -145,16 +145,16 @@ class DryRun:
 
     @property
     def title(self) -> str:
-        """What this is."""
+        """The title of the table."""
         return (
             f"{self.played}: {len(self.inputs)} samples of {self.description.dt:g} s; nothing is "
-            "sent.\nA policy or a loop reacts to measurements; this is for a plant at rest."
+            "sent.\nA policy or a loop reacts to measurements; here the plant stays at rest."
         )
 
     header = ("input", "smallest", "largest", "rms", "first")
 
     def rows(self) -> list[list[str]]:
-        """Rows of the table that `excite run --dry-run` prints: one an input."""
+        """Rows of the table that `excite run --dry-run` prints: one per input."""
         return [
             [i.name, *(f"{x:.4g}" for x in (u.min(), u.max(), np.sqrt(np.mean(u**2)))),
              ", ".join(f"{x:.3g}" for x in u[:5])]
@@ -200,7 +200,7 @@ def run(
         signal: file of a designed input (.csv, .mat).
         excitation: name ("chirp", "loop-multisine", ...) or object; needs JAX.
         options: of an excitation given by name: amplitude, frequencies and so on.
-        out: file of the record (.csv); only a dry run does without.
+        out: file of the record (.csv); required unless `dry_run`.
         overwrite: replaces an existing record.
         steps: number of samples; by default all of a policy or signal, else 500.
         slew: largest change of an input in one second, in its unit.
@@ -233,7 +233,7 @@ def run(
     if path is not None:
         require_record_path(path, overwrite)
     elif not dry_run:
-        raise ValueError("--out FILE.csv is missing: an experiment is always recorded")
+        raise ValueError("--out FILE.csv is missing: every experiment must be recorded")
     known = _plant(plant, rig)
     default = DEFAULT_POLICY if plant is None or known is None else known.definition.name
     source = _source(policy, signal, excitation, options or {}, default)
@@ -328,7 +328,7 @@ class _Source:
 
 
 def _key(seed: int) -> PRNGKeyArray:
-    """Not the key of a simulated rig, whose parameters are drawn from the seed itself."""
+    """A key other than that of a simulated rig, which uses the seed directly."""
     return jax.random.fold_in(jax.random.key(seed), 1)
 
 
@@ -345,7 +345,7 @@ def _source(
     options: Mapping[str, object],
     default_policy: str,
 ) -> _Source:
-    """What is to be played."""
+    """The source that is played."""
     if sum(given is not None for given in (policy, signal, excitation)) > 1:
         raise ValueError("--policy, --input and --excitation exclude each other: give one of them")
     if isinstance(excitation, Policy):
@@ -356,7 +356,7 @@ def _source(
         elif str(excitation).endswith(SIGNAL_ENDINGS):
             signal = excitation
     if options and (policy or signal or excitation is None):
-        raise ValueError("--set has the options of an --excitation such as chirp or loop-multisine")
+        raise ValueError("--set needs an --excitation with options, such as chirp")
     if signal is not None:
         return _Source(str(signal), signal=Path(signal))
     if excitation is not None and policy is None:
@@ -382,7 +382,7 @@ def _plant(plant: PlantLike | None, rig: str | AbstractRig) -> AbstractPlant | N
 
 
 def _described(policy: Policy | None) -> PlantDescription:
-    """Without JAX a plant is known from a policy: the one to be played, or a shipped one."""
+    """The plant of a policy, used without JAX: the played policy, or a shipped one."""
     return (policy or read_policy(DEFAULT_POLICY)).plant
 
 
@@ -459,7 +459,7 @@ class _Session:
         return LiveEstimate(self._plant, self._player.num_steps, self._rig.starts_at_rest)
 
     def _metadata(self, asked: Mapping[str, object]) -> dict[str, object]:
-        """What the sidecar says before the experiment."""
+        """Content of the sidecar before the experiment."""
         return {
             "starts_at_initial_state": self._rig.starts_at_rest,
             "provenance": {

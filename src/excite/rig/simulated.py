@@ -1,9 +1,9 @@
 """A simulated rig that behaves like a real one: detailed plant, latency, jitter, dropouts.
 
 `Body` is the physics between two readings, a pure function. `SimulatedRig` steps it in
-real time, or as fast as it can, behind the contract of a rig. `run_batch` steps thousands
-in parallel with the same rules of the supervisor, and continues after a trip, to see
-whether the safe input was enough. The true parameters are shown only at the end.
+real time, or as fast as it can, as a rig. `run_batch` steps thousands in parallel with the
+same rules of the supervisor. It continues after a trip, to test whether the safe input was
+enough. The true parameters are shown only at the end.
 """
 
 from __future__ import annotations
@@ -157,7 +157,7 @@ _write = eqx.filter_jit(Body.write)
 
 
 class SimulatedRig(AbstractRig):
-    """A body behind the contract of a rig."""
+    """A body as a rig."""
 
     starts_at_rest = True
 
@@ -189,7 +189,7 @@ class SimulatedRig(AbstractRig):
         """Starts at rest; compiles what a reading needs, so that the first is not late."""
         self._state = self._body.start()
         state, safe = self._state, jnp.asarray(self.safe_input)
-        for _ in range(2):  # a state that has moved is of another type to the compiler
+        for _ in range(2):  # after a step, the state has another type for the compiler
             state = _advance(self._body, _advance(self._body, _write(self._body, state, safe)))
         self._pacer, self._count = Pacer(self._interval), -1
 
@@ -210,7 +210,7 @@ class SimulatedRig(AbstractRig):
         """Nothing to release."""
 
     def facts(self) -> Mapping[str, Any]:
-        """What was hidden: true parameters, largest true outputs."""
+        """True parameters and largest true outputs."""
         names = names_of(self.description.parameters)
         return {
             "simulated": True,
@@ -243,12 +243,12 @@ class NoFilter(eqx.Module):
     """Lets every input pass, in place of a safety filter."""
 
     def start(self) -> None:
-        """Nothing to remember."""
+        """An empty memory."""
 
     def __call__(
         self, memory: None, measured: Float[Array, " output"], proposed: Float[Array, " input"]
     ) -> tuple[None, Float[Array, " input"], Bool[Array, ""]]:
-        """The input as it is."""
+        """The unchanged input."""
         del measured
         return memory, proposed, jnp.asarray(False)
 

@@ -1,4 +1,4 @@
-"""Agents: what a policy is trained for, on which decision process, and how."""
+"""Agents: objective, decision process and training of a policy."""
 
 from __future__ import annotations
 
@@ -34,19 +34,19 @@ METHODS = {"ppo": PPOSettings, "gradient": GradientSettings}
 
 
 class RewardSettings(Settings):
-    """What an agent is rewarded for.
+    """The reward of an agent.
 
     Attributes:
-        reward: of the experiment: `relative` errors (Eq. 4), `log` of them, the worst over
-            its goal (`goals`), or `information`; by default the plant's.
+        reward: of the experiment: `relative` errors (Eq. 4), `log` of them, the largest over
+            its goal (`goals`), or `information`; the default depends on the plant.
         dense: whether information is rewarded at every step, by default for PPO alone.
         weight: factor of that reward.
         criterion, max_sensitivity: of the information, see `InformationGain`.
-        goals: by parameter, the relative error that counts as one, default one.
-        estimator: in the reward, by the study's name or any; an ARX estimator, or `nls` to
-            first order in the noise, for any plant.
-        start_covariance: instead of that estimator's; a smaller one lets its bias, which is
-            a smooth function of the inputs, outweigh the sensor's noise.
+        goals: by parameter, the relative error that is scaled to one, default one.
+        estimator: in the reward, by its name in the study or a shipped name; an ARX estimator,
+            or `nls` to first order in the noise, for any plant.
+        start_covariance: replaces that of the estimator; with a smaller one its bias, which
+            is a smooth function of the inputs, is larger than the effect of sensor noise.
     """
 
     reward: Literal["relative", "log", "goals", "information"] | None = None
@@ -64,17 +64,17 @@ REWARD_TABLES: Mapping[str, type[Settings]] = {"terms": RewardSettings}
 
 
 class DecisionSettings(RewardSettings):
-    """The decision process an agent is trained on; the paper's, but for what is set.
+    """The decision process of an agent: the paper's, except for what is set.
 
     Attributes:
         terms: several rewards instead of one, which are added.
-        window: samples observed.
+        window: number of samples observed.
         clocks: frequencies [Hz] whose sine and cosine are observed too.
         output_scale: y_max by output, in its unit, where it differs from the output's scale.
         input_amplitude: by input, in its unit, how far from the middle of its limits the
             policy may go, where that is less than the limits allow.
         spread: of the plants it is trained on, where it differs from the study's.
-        constants: of these plants, drawn between two ends, [0.12, 0.21], for every one.
+        constants: of these plants, each drawn from a range such as [0.12, 0.21].
         normalise_penalty: whether the safety penalty is divided by the number of steps.
     """
 
@@ -89,12 +89,12 @@ class DecisionSettings(RewardSettings):
 
 
 class AgentSettings(Settings):
-    """An agent as a study file has it: where it differs from the study's other agents.
+    """An agent in a study file: its differences from the study's settings.
 
     Attributes:
         targets: parameters in its reward, default the plant's targets.
         method: how it is trained.
-        decision, training: instead of the study's.
+        decision, training: replace the study's.
     """
 
     targets: list[str] | None = None
@@ -105,14 +105,14 @@ class AgentSettings(Settings):
 
 @dataclass(frozen=True)
 class Agent:
-    """What a policy is trained for, on which decision process, and how.
+    """Objective, decision process and training of a policy.
 
     Attributes:
-        targets: parameters that count, default the plant's targets.
+        targets: parameters in the reward, default the plant's targets.
         method: of training.
         decision: settings of the process.
         training: hyper-parameters of the method.
-        estimators: those that the reward may name beside the usual ones.
+        estimators: those that the reward may name in addition to the shipped ones.
     """
 
     targets: Sequence[str] | None
@@ -129,7 +129,7 @@ class Agent:
         training: Mapping[str, object],
         estimators: Mapping[str, EstimatorSettings],
     ) -> Agent:
-        """An agent from its own settings and those it shares with others.
+        """An agent from its settings and those of the study.
 
         Raises:
             ValueError: for a setting that does not exist or is not allowed.
@@ -140,7 +140,7 @@ class Agent:
         shared = {name: value for name, value in decision.items() if name not in replaced}
         process = checked(DecisionSettings, {**shared, **own.decision}, "decision", REWARD_TABLES)
         _require_one_reward(process)
-        if process.reward is not None:  # another agent may use what all have in common
+        if process.reward is not None:  # common settings may be for another agent
             stated = own.decision if "reward" in own.decision else process.model_fields_set
             _require_used(_kind(process.reward, process, estimators), stated)
         targets = own.targets or []
@@ -208,7 +208,7 @@ class Agent:
                 chosen.weight,
                 criterion=chosen.criterion,
                 max_sensitivity=chosen.max_sensitivity,
-                # A gradient needs no reward on the way.
+                # A gradient needs no reward before the last step.
                 dense=self.method == "ppo" if chosen.dense is None else chosen.dense,
             )
         own = _estimator(chosen, self.estimators)
@@ -230,24 +230,24 @@ class Agent:
         return EstimationError(*common, estimator=estimator)
 
     def total_steps(self, num_steps: int) -> int:
-        """Sampling times of the whole training, for experiments of so many."""
+        """Sampling times of the whole training, for experiments of `num_steps`."""
         if isinstance(self.training, PPOSettings):
             return self.training.total_steps
         return self.training.num_updates * self.training.num_plants * num_steps
 
     def stage(self, steps: float, num_steps: int) -> str:
-        """How far a training is after so many sampling times, in its unit."""
+        """Progress of a training after `steps` sampling times, in its unit."""
         if isinstance(self.training, PPOSettings):
             return f"step {steps:,.0f} of {self.training.total_steps:,}"
         done = steps / (self.training.num_plants * num_steps)
         return f"updating {done:,.0f} of {self.training.num_updates:,}"
 
     def settings(self, plant: AbstractPlant) -> dict[str, Any]:
-        """All that decides what it becomes, defaults included, JSON-ready."""
+        """All settings that determine the policy, defaults included, JSON-ready."""
         names = names_of(plant.definition.parameters)
         mask = target_mask(plant.definition, self.targets)
         # Settings that were added later enter only where they are used, so that the
-        # fingerprints of seeds that were trained before stay valid.
+        # fingerprints of earlier trainings stay valid.
         later = {"clocks", "criterion", "max_sensitivity", "input_amplitude", "spread", "dense"}
         later |= {"constants", "terms"}
         return {
@@ -269,16 +269,16 @@ def _ends(
         if name not in names:
             raise unknown("constant in constants", name, names)
         if not low <= high:
-            raise ValueError(f"the range of the constant {name!r} must grow: got {low:g}, {high:g}")
+            raise ValueError(f"range of constant {name!r} must increase: got {low:g} to {high:g}")
     low, high = ({name: ends[i] for name, ends in ranges.items()} for i in (0, 1))
     return plant.changed(**low).constants, plant.changed(**high).constants
 
 
 def _require_one_reward(process: DecisionSettings) -> None:
-    """Raises ValueError for a reward beside terms, each of which states its own."""
+    """Raises ValueError for a reward together with terms, each of which has its reward."""
     beside = sorted(set(RewardSettings.model_fields) & process.model_fields_set)
     if process.terms and beside:
-        raise ValueError(f"decision: with terms, {beside[0]!r} belongs to one of them")
+        raise ValueError(f"decision: with terms, set {beside[0]!r} in one of them")
 
 
 _USED = {
@@ -286,7 +286,7 @@ _USED = {
     "errors of nls": {"goals", "estimator", "max_sensitivity"},
     "errors of an ARX estimator": {"goals", "estimator", "start_covariance"},
 }
-"""Settings that kinds of reward have beside `reward` and `weight`."""
+"""Settings of each kind of reward in addition to `reward` and `weight`."""
 
 
 def _kind(form: str, chosen: RewardSettings, estimators: Mapping[str, EstimatorSettings]) -> str:
@@ -299,7 +299,7 @@ def _kind(form: str, chosen: RewardSettings, estimators: Mapping[str, EstimatorS
 def _estimator(
     chosen: RewardSettings, estimators: Mapping[str, EstimatorSettings]
 ) -> EstimatorSettings:
-    """The estimator of a reward: the study's by that name, or the usual one."""
+    """The estimator of a reward: that of the study with this name, or the shipped one."""
     return estimators.get(chosen.estimator, EstimatorSettings(kind=chosen.estimator))
 
 
@@ -311,7 +311,7 @@ def _require_used(kind: str, names: Iterable[str]) -> None:
 
 
 def _cycles(clocks: Sequence[float], dt: float) -> tuple[float, ...]:
-    """Cycles a step of clocks given in Hz; ValueError beyond half the sampling frequency."""
+    """Cycles per step of clocks given in Hz; ValueError beyond half the sampling frequency."""
     for frequency in clocks:
         if frequency * dt > 0.5:
             raise ValueError(

@@ -1,4 +1,4 @@
-"""Studies by name: those that come with the package, and a user's own file."""
+"""Studies by name: shipped studies, and files."""
 
 from __future__ import annotations
 

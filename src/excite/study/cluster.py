@@ -23,13 +23,13 @@ except ImportError:
     distributed: Any = None
 
 CONNECT_TIMEOUT = 10.0
-"""Seconds in which a scheduler has to answer."""
+"""Timeout of a scheduler [s]."""
 
 
 def dask_engine(address: str, on_wait: Callable[[], object] = lambda: None) -> Engine:
     """The workers of a Dask cluster, by the address of its scheduler.
 
-    Opening it raises ValueError where no scheduler answers, and calls `on_wait` where the
+    Opening it raises ValueError if no scheduler answers, and calls `on_wait` if the
     scheduler has no workers yet.
 
     Raises:
@@ -38,7 +38,7 @@ def dask_engine(address: str, on_wait: Callable[[], object] = lambda: None) -> E
     if distributed is None:
         raise ValueError("the engine 'dask' needs the extra: pip install 'excite[dask]'")
     is_good, url = False, address if "://" in address else f"tcp://{address}"
-    with contextlib.suppress(ValueError):  # of a port that is no number, a host that is no name
+    with contextlib.suppress(ValueError):  # an invalid port or host
         parts = urlsplit(url)
         host = (parts.hostname or "").encode("idna")
         is_good = bool(host and parts.port and url == f"tcp://{parts.netloc}")
@@ -48,9 +48,9 @@ def dask_engine(address: str, on_wait: Callable[[], object] = lambda: None) -> E
 
 
 def call(target: str, version: str, arguments: Mapping[str, object]) -> Ending:
-    """What a worker of the cluster runs: the function `target`, and its last answer.
+    """Runs in a worker of the cluster: calls the function `target`, returns its last answer.
 
-    The function comes as a word and is imported here: sent as itself, unpickling it would
+    The function is given by name and imported here. Unpickling a function object would
     import JAX before its environment is set.
     """
     if version != __version__:
@@ -64,13 +64,13 @@ def call(target: str, version: str, arguments: Mapping[str, object]) -> Ending:
 class _Cluster:
     """A Dask client and its executor, closed together.
 
-    What runs on a cluster cannot be stopped: a task that is cancelled comes to its end there.
+    A running task cannot be stopped: after a cancellation it still runs to its end.
     """
 
     def __init__(self, address: str, on_wait: Callable[[], object], num_tasks: int) -> None:
         del num_tasks
         with contextlib.ExitStack() as stack:
-            # A lost scheduler is told by an error, not by lines all over our terminal.
+            # A lost scheduler is reported by an error; Dask's log messages are not needed.
             stack.enter_context(distributed.utils.silence_logging_cmgr("CRITICAL"))
             warnings.simplefilter("ignore", distributed.versions.VersionMismatchWarning)
             self._client = _connected(address)
@@ -87,17 +87,18 @@ class _Cluster:
         self._executor = self._client.get_executor(pure=False, retries=0)
 
     def num_slots(self) -> int:
-        """Threads of all workers, or one task that waits for the first; 0 where it cannot ask.
+        """Number of threads of all workers; 1 without workers; 0 where the scheduler is lost.
 
-        No task waits in a worker then, where it would be blamed for the death of another.
+            With this number no task waits in a worker. A waiting task would count as failed when
+        the worker dies.
         """
-        # What a client raises that loses its scheduler depends on how far it has come in closing.
+        # The exception of a client without scheduler depends on the state of its closing.
         with contextlib.suppress(OSError, RuntimeError, AttributeError):
             return max(1, sum(self._client.nthreads().values()))
         return 0
 
     def is_lost(self) -> bool:
-        """Whether the scheduler was away, which forgets every task; some futures never learn."""
+        """Whether the scheduler was lost, with every task; some futures do not report this."""
         return self._client.status != "running"
 
     def submit(self, target: str, arguments: Mapping[str, object]) -> Future[Ending]:
@@ -113,14 +114,14 @@ class _Cluster:
         return future
 
     def close(self, is_done: bool) -> None:
-        with self._quiet, contextlib.suppress(TimeoutError):  # of a scheduler that is gone
+        with self._quiet, contextlib.suppress(TimeoutError):  # the scheduler is lost
             if self._client.status == "running":
                 self._executor.shutdown(wait=is_done)
             self._client.close()
 
 
 def _pass_on(task: Future[Ending], future: Future[Ending]) -> None:
-    """What became of a task of the cluster, as an outcome."""
+    """The outcome of a task of the cluster."""
     if task.cancelled():
         _cancel(future)
         return
@@ -128,7 +129,7 @@ def _pass_on(task: Future[Ending], future: Future[Ending]) -> None:
     if error is None:
         future.set_result(task.result())
     elif isinstance(error, distributed.KilledWorker):
-        # The scheduler has tried that many other workers itself.
+        # The scheduler itself has tried this number of other workers.
         future.set_result(Failure(sentence_of(error), num_deaths=error.args[2] + 1))
     else:
         future.set_result(Failure(sentence_of(error)))
@@ -142,8 +143,8 @@ def _cancel(future: Future[Ending]) -> None:
 def _connected(address: str) -> Any:
     """A client of the scheduler.
 
-    It is made in a thread, for where something listens that never answers it waits without
-    end, whatever timeout it is given.
+    It is made in a thread, because it ignores its timeout where another program listens but
+    does not answer.
     """
     made: Future[object] = Future()
 

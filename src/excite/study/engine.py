@@ -1,7 +1,7 @@
-"""How the tasks of a study are done: by processes of this computer, or by a Dask cluster.
+"""Runs the tasks of a study in processes of this computer, or on a Dask cluster.
 
-A task is a function of a module and plain data; its result is plain data, too. What fails is
-tried again, unless it is the user's mistake.
+A task is a function of a module with plain data; its result is plain data too. A failed task
+is tried again, unless the failure is the user's mistake.
 """
 
 from __future__ import annotations
@@ -22,31 +22,31 @@ TICK = 1.0
 
 
 class Executor(Protocol):
-    """What runs tasks."""
+    """An executor of tasks."""
 
     def num_slots(self) -> int:
-        """How many tasks it takes at a time."""
+        """Number of tasks that it takes at a time."""
         ...
 
     def is_lost(self) -> bool:
-        """Whether it has forgotten its tasks, and another has to be opened."""
+        """Whether it has lost its tasks, so that another must be opened."""
         ...
 
     def submit(self, target: str, arguments: Mapping[str, object]) -> Future[Ending]:
-        """Hands a call over; cancelled where the executor is lost."""
+        """Submits a call; the future is cancelled where the executor is lost."""
         ...
 
     def close(self, is_done: bool) -> None:
-        """Ends it, and the tasks that it still has where not `is_done`."""
+        """Ends it, and unless `is_done` its unfinished tasks."""
         ...
 
 
 Engine = Callable[[int], Executor]
-"""Opens an executor for so many tasks."""
+"""Opens an executor for this number of tasks."""
 
 
 def local_engine(num_workers: int, cache: Path | None = None) -> Engine:
-    """As many processes on this computer.
+    """Worker processes on this computer.
 
     Args:
         cache: where they keep compiled programs.
@@ -55,12 +55,12 @@ def local_engine(num_workers: int, cache: Path | None = None) -> Engine:
         ValueError: for less than one.
     """
     if num_workers < 1:
-        raise ValueError(f"{num_workers} workers can do no work; ask for at least one")
+        raise ValueError(f"num_workers must be at least 1: got {num_workers}")
     return partial(_Local, num_workers, cache)
 
 
 class _Local:
-    """The pool of this computer: a worker that dies takes only its own task along."""
+    """The pool of this computer; a worker that dies affects only its task."""
 
     def __init__(self, num_workers: int, cache: Path | None, num_tasks: int) -> None:
         self._workers = Workers(min(num_workers, num_tasks), cache=cache)
@@ -96,21 +96,21 @@ def run(
     on_tick: Callable[[], object] = lambda: None,
     num_tries: int = 3,
 ) -> dict[str, Exception]:
-    """Calls a function once a task, with its arguments, and gives every result to `on_done`.
+    """Calls a function for each task with its arguments, and passes each result to `on_done`.
 
-    A task whose worker dies, or that raises, is tried again later; but for a ValueError,
-    which is a user's mistake and stays one. Where this function is left by an exception, by
-    one of `on_done` or `on_tick` for example, nothing of it runs on in this computer.
+    A task whose worker dies, or that raises, is tried again later, except for a ValueError,
+    which is a mistake of the user. If this function ends by an exception, for example one of
+    `on_done` or `on_tick`, none of its tasks continues on this computer.
 
     Args:
         function: of a module, which the workers import.
         tasks: keyword arguments by the name of the task: JSON-ready data or bytes.
-        on_done: takes the name of a task and its result, in the order in which they come.
+        on_done: called with the name of a task and its result, in the order of completion.
         on_tick: called about once a second.
         num_tries: how often a task is tried in all.
 
     Returns:
-        Why, by the name of each task that failed: ValueError is a mistake of the user's.
+        The error of each failed task by name; ValueError is a mistake of the user.
 
     Raises:
         ValueError: where the engine cannot be opened.
@@ -133,7 +133,7 @@ def run(
 
 
 class _Work:
-    """What is left of the tasks, and why some failed."""
+    """The unfinished tasks, and the errors of failed ones."""
 
     def __init__(
         self,
@@ -149,7 +149,7 @@ class _Work:
         self._executor: Executor | None = None
 
     def submit(self) -> None:
-        """Hands over what there is room for."""
+        """Submits tasks up to the capacity."""
         if self._executor is not None and self._executor.is_lost():
             self._lose()
         if not self.queue:
@@ -162,7 +162,7 @@ class _Work:
             self.running[self._executor.submit(self._target, self._tasks[name])] = name
 
     def finished(self, seconds: float) -> Iterator[tuple[str, object]]:
-        """Names and results of what is finished, after the first or after so many seconds."""
+        """Names and results of finished tasks, after the first one or the timeout."""
         done, _ = wait(self.running, seconds, FIRST_COMPLETED)
         lost = {future for future in done if future.cancelled()}
         for future in done - lost:
@@ -171,7 +171,7 @@ class _Work:
                 self._note(name, outcome)
             else:
                 yield name, outcome.value
-        if lost:  # we cancel nothing while we wait: it is the scheduler that has gone
+        if lost:  # nothing is cancelled while waiting, so the scheduler is lost
             self._lose()
 
     def close(self, is_done: bool) -> None:

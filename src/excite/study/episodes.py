@@ -1,4 +1,4 @@
-"""One episode of every method and agent: what a report shows of how they excite.
+"""One episode of every method and agent, for reports.
 
 All play on the same plant with the same noise, that of the first evaluation episode.
 """
@@ -34,14 +34,14 @@ def example_episodes(
     """The first evaluation episode of every method and agent, and its running estimates.
 
     The estimates are those of the study's first ARX estimator, over the true parameters;
-    not numbers where there is none.
+    NaN where there is none.
 
     Args:
         folder: of the run, where there are agents.
         seeds: by agent, the one to show.
     """
     plant, episodes = study.build_plant(), {}
-    keys = episode_keys(study)[:CHUNK]  # as the table has them: nothing compiles again
+    keys = episode_keys(study)[:CHUNK]  # as for the table: no new compilation
     for name, seed, excitation in _excitations(study, plant, folder, seeds):
         batch = run_episodes(plant, excitation, study.num_steps, study.spread, keys)
         run, params = jax.tree.map(lambda leaf: leaf[0], (batch.trajectory, batch.params))
@@ -55,7 +55,7 @@ def example_episodes(
 def _excitations(
     study: Study, plant: AbstractPlant, folder: Path, seeds: Mapping[str, int]
 ) -> Iterator[tuple[str, int | None, AbstractExcitation]]:
-    """Name, seed of an agent, and excitation of all that a study compares."""
+    """Name, seed of an agent, and excitation of each method and agent."""
     for name, excitation in study.build_methods(plant).items():
         yield name, None, excitation
     for agent, seed in seeds.items():

@@ -30,7 +30,7 @@ def evaluate(
     filter: bool = False,
     progress: Progress = lambda *_: None,
 ) -> StudyTable:
-    """Scores a policy on plants drawn at random.
+    """Evaluates a policy on plants drawn at random.
 
         >>> import excite as ex
         >>> table = ex.evaluate("aero2", episodes=4)
@@ -41,14 +41,14 @@ def evaluate(
         policy: the name of a shipped one, a file, or the policy.
         plant: its name, `path/to/file.py:ClassName`, the plant or its class; default the
             policy's plant.
-        episodes: experiments, each with a plant of its own.
+        episodes: number of experiments, each on another plant.
         seed: of the plants, the noise and the excitations.
         spread: parameters are uniform in nominal value ± spread times their scale.
         noise: standard deviation by output, in its unit, where it differs from the plant's.
         estimators: names, default `nls`, and `arx-rls` where the plant has a mapping from ARX.
         rig: whether experiments are made on the plant's simulated rig.
-        filter: whether they are made once more there, behind the predictive safety filter.
-        progress: called with a text, how much is done, and how much there is.
+        filter: whether they are also made there behind the predictive safety filter.
+        progress: called with a text, how much is done, and the total.
 
     Raises:
         ValueError: for an argument that is not allowed, or a policy that cannot excite the plant.

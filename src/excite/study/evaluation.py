@@ -57,16 +57,16 @@ def episode_keys(study: Study) -> Key[Array, " episode"]:
 
 Keys = Key[Array, " episode"]
 Play = Callable[[AbstractExcitation, Keys], tuple[Episodes, dict[str, np.ndarray]]]
-"""Plays an excitation once for every key; with what else happened on a rig."""
+"""Plays an excitation once for every key; also returns the events on a rig."""
 
 
 def num_chunks(study: Study) -> int:
-    """Calls in which the episodes of one method are computed."""
+    """Number of calls in which the episodes of one method are computed."""
     return -(-study.episodes // CHUNK)
 
 
 def player_of(study: Study, plant: AbstractPlant) -> Play:
-    """How the study's experiments are made: on the plant, or on its simulated rig."""
+    """A function that makes the study's experiments: on the plant, or on its simulated rig."""
     if study.rig is None:
         return lambda excitation, keys: (
             run_episodes(plant, excitation, study.num_steps, study.spread, keys),
@@ -97,9 +97,9 @@ def evaluate_method(
     excitation: AbstractExcitation,
     progress: Callable[[int], None] = lambda _: None,
 ) -> tuple[list[Row], Float[np.ndarray, " input"]]:
-    """One row an estimator for one method, and each input's root mean square.
+    """One row per estimator for one method, and each input's root mean square.
 
-    The latter counts from the middle of the input's limits.
+    The latter is relative to the middle of the input's limits.
 
     Raises:
         ValueError: for a sensor without noise, which has no Cramér-Rao bound.
@@ -128,7 +128,7 @@ def evaluate_method(
 def _bound_by_length(
     study: Study, plant: AbstractPlant, excitation: AbstractExcitation
 ) -> BoundByLength:
-    """Bounds of shorter experiments; signals are planned again for each length."""
+    """Bounds of shorter experiments; signals are designed again for each length."""
     keys = episode_keys(study)[:CHUNK]
     bounds = [
         np.asarray(run_episodes(plant, excitation, length, study.spread, keys).bound).mean(axis=0)
@@ -148,7 +148,7 @@ def scores(
     episodes: Episodes,
     on_rig: Mapping[str, np.ndarray] = MappingProxyType({}),
 ) -> Scores:
-    """What an estimator makes of a batch of episodes."""
+    """The results of an estimator for a batch of episodes."""
     estimated, std_error, status = estimate_all(plant, estimator, episodes.trajectory)
     return Scores(
         true=np.stack(episodes.params, axis=1),

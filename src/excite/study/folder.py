@@ -1,4 +1,4 @@
-"""The run folder of a study: where its files lie, and reading them."""
+"""The run folder of a study: paths and contents of its files."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from .spec import Study, study_from
 
 
 def seed_folder(folder: Path, agent: str, seed: int) -> Path:
-    """Where a seed of an agent keeps its files."""
+    """Folder of a seed of an agent."""
     return folder / "seeds" / folder_word(agent) / str(seed)
 
 
 def agent_settings(study: Study, plant: AbstractPlant, agent: str) -> dict[str, object]:
-    """All that decides what a seed of an agent becomes but the plant, JSON-ready."""
+    """All settings, except the plant, that determine the result of a seed, JSON-ready."""
     own = study.agent(agent).settings(plant)
     return {**own, "spread": study.spread, "num_steps": study.num_steps}
 
@@ -70,11 +70,11 @@ def read_columns(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
 
 
 def advice(path: Path) -> str:
-    """What helps where a file of a run folder is damaged."""
+    """Advice for a damaged file of a run folder."""
     of_seed = f"delete {path.parent}: 'excite study run' trains that seed from the beginning"
     return _REMEDIES.get(path.name, of_seed)
 
 
 def damaged(path: Path) -> ValueError:
-    """The error for a file of a run folder that is not as it was written, and what helps."""
+    """The error for a damaged file of a run folder, with advice."""
     return files.damaged(path, advice(path))

@@ -1,6 +1,6 @@
-"""Objectives of a training by the name that people type, and what each is in a study.
+"""Objectives of a training by name, and their settings in a study.
 
-Needs no JAX, so that the command line and the page name them at once.
+Needs no JAX, so that the command line and the page load it fast.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ def rewards_of(
     """Settings of the reward of each objective, by name.
 
     Args:
-        objectives: a name, names, each perhaps with a weight (`log=2`), or weights by name.
-        goals: by parameter; they belong to objectives that know errors.
+        objectives: a name; names, each with an optional weight (`log=2`); or weights by name.
+        goals: by parameter, for the objectives of errors.
 
     Raises:
         ValueError: for an unknown name, one that repeats, or a weight that is not a number.
@@ -66,6 +66,6 @@ def _weighted(word: str) -> tuple[str, float | None]:
 
 
 def decision_of(rewards: Iterable[Mapping[str, object]]) -> dict[str, object]:
-    """The part of a decision process that rewards: a single reward, or several that are added."""
+    """The reward in a decision process: a single one, or several that are added."""
     rewards = [dict(reward) for reward in rewards]
     return rewards[0] if len(rewards) == 1 else {"terms": rewards}

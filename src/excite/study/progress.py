@@ -1,7 +1,6 @@
-"""How far a training is: `progress.json` beside the checkpoint of every seed that runs.
+"""Progress of a training: `progress.json` beside the checkpoint of every running seed.
 
-The worker that trains writes it; the command line and the bench page, which do not load JAX
-for it, read it.
+The worker that trains writes it. The command line and the bench page read it without JAX.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ _NAME = "progress.json"
 
 
 def write_progress(seed_folder: Path, look: Mapping[str, float]) -> None:
-    """Keeps the newest row of a learning curve: `steps` so far, `return`, errors, violations."""
+    """Stores the newest row of a learning curve: `steps` so far, `return`, errors, violations."""
     write_json(seed_folder / _NAME, look)
 
 
@@ -39,5 +38,5 @@ def _is_number(value: object) -> bool:
 
 
 def remove_progress(seed_folder: Path) -> None:
-    """After the training."""
+    """Removes the file after the training."""
     (seed_folder / _NAME).unlink(missing_ok=True)

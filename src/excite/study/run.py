@@ -1,9 +1,9 @@
-"""A study as a job: what is missing is computed, what is finished is kept, tables are written.
+"""`run_study`: computes what is missing in a run folder and writes the tables.
 
-A run folder grows: `seeds/AGENT/N/` holds the policy, learning curve and metrics of one
-finished seed (while it runs, its checkpoint and logs), `methods.json` the rows of the
-methods. Everything is written whole or not at all, so that a study can be interrupted at
-any moment and started again. The table is made from those files alone.
+In the run folder, `seeds/AGENT/N/` holds the policy, learning curve and metrics of one
+finished seed (while it runs, its checkpoint and logs), and `methods.json` the rows of the
+methods. Every file is written completely or not at all, so that a study can be interrupted
+at any time and resumed. The table is made from these files alone.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ from .workers import num_cores
 KIND = "excite study"
 FREE = {"name", "title", "inferred", "ours", "reference", "source"}
 FREE |= {"agents", "decision", "training", "gradient", "seeds"}
-"""What may change in a study that goes on: words, and agents; every seed says what it was."""
+"""Settings that may change when a study is resumed; each seed stores its settings."""
 
 _Target = tuple[str, str, int]
 
@@ -62,7 +62,7 @@ _TASKS = {"methods": methods_task, "clairvoyant": clairvoyant_task, "seed": seed
 
 
 class StudyFailedError(RuntimeError):
-    """Tasks of a study failed in spite of all tries; the message says which and why."""
+    """Tasks of a study failed after all tries; the message lists them with the reasons."""
 
 
 def run_study(
@@ -91,21 +91,21 @@ def run_study(
     Args:
         study: a study, a file, or the name of a shipped study.
         out: run folder; a study without agents needs none.
-        episodes: in place of the study's.
-        seed: in place of the study's.
-        estimators: in place of the study's: their names, or these with commas between.
+        episodes: replaces the study's.
+        seed: replaces the study's.
+        estimators: replace the study's: their names, or these with commas between.
         engine: processes of this machine, or a Dask cluster.
-        workers: processes of the local engine; default one a core.
+        workers: processes of the local engine; default one per core.
         address: of the cluster's scheduler, tcp://HOST:PORT.
-        overwrite: whether a run in `out` is replaced and not resumed.
-        progress: called with what is being computed, how much is done, and how much there is.
+        overwrite: whether a run in `out` is replaced instead of resumed.
+        progress: called with what is being computed, how much is done, and the total.
         on_done: called with the name of every task that was finished.
         on_wait: called when the cluster has no worker yet.
-        command: kept in the run folder for those who want to do it again.
+        command: stored in the run folder, to repeat the run.
 
     Raises:
         ValueError: for a study, an option or a folder that cannot be used.
-        StudyFailedError: where tasks failed; what is finished is kept.
+        StudyFailedError: where tasks failed; finished tasks are kept.
     """
     chosen = study if isinstance(study, Study) else read_study(study_path(study))
     chosen = chosen.changed(episodes=episodes, seed=seed, estimators=estimators)
@@ -121,7 +121,7 @@ def run_study(
         require_free_run_folder(folder, overwrite)
     if not what and engine == "local":
         machine = None
-        if overwrite or not folder.exists():  # the folder appears when all of it is written
+        if overwrite or not folder.exists():  # the folder appears when it is complete
             place = new_run_folder(folder, overwrite)
     elif overwrite and folder.exists():
         shutil.rmtree(folder)
@@ -144,7 +144,7 @@ def _engine(
         if address is None:
             raise ValueError("--engine dask needs --address tcp://HOST:PORT of its scheduler")
         if workers is not None:
-            raise ValueError("--workers is for the local engine; a Dask cluster has its own")
+            raise ValueError("--workers is for the local engine, not for a Dask cluster")
         return dask_engine(address, on_wait)
     if address is not None:
         raise ValueError("--address is for --engine dask")
@@ -153,7 +153,7 @@ def _engine(
 
 
 def _require_trainer(study: Study, folder: Path) -> None:
-    """Raises ValueError where seeds are left to train and a library is missing."""
+    """Raises ValueError where seeds must be trained and a library is missing."""
     agents = [name for name, agent in study.agents.items() if agent.method == "ppo"]
     folders = [seed_folder(folder, a, seed) for a in agents for seed in range(study.seeds)]
     if all((folder / "metrics.json").is_file() for folder in folders):
@@ -168,7 +168,7 @@ def _require_trainer(study: Study, folder: Path) -> None:
 
 
 def _failed(failures: Mapping[str, Exception], folder: Path) -> Exception:
-    """One error for all tasks that failed; the user's mistake where every one of them is."""
+    """One error for all failed tasks; ValueError where all are mistakes of the user."""
     names: dict[str, list[str]] = {}
     for name, error in failures.items():
         names.setdefault(str(error), []).append(name)
@@ -213,12 +213,12 @@ def write_table(study: Study, folder: Path) -> StudyTable:
 
 @contextlib.contextmanager
 def opened(study: Study, folder: Path, command: str = "") -> Iterator[dict[str, dict[str, Any]]]:
-    """A run folder of this study, new or begun, for one process at a time.
+    """A new or existing run folder of this study, for one process at a time.
 
-    Yields the arguments of every task that is not finished, by its name.
+    Yields the arguments of each unfinished task by its name.
 
     Raises:
-        ValueError: where the folder holds something else, or another study, or is in use.
+        ValueError: where the folder is not a run folder, holds another study, or is in use.
     """
     every = _checkpoint_seconds()
     markers = {"study.json", "run.json"}
@@ -231,7 +231,7 @@ def opened(study: Study, folder: Path, command: str = "") -> Iterator[dict[str, 
         if is_begun:
             _require_same_study(study, marker, folder)
         tasks = _missing(study, plant, folder, every)
-        # Whatever is refused was refused by now.
+        # All checks are done.
         write_json(folder / "study.json", study.model_dump())
         write_json(folder / "run.json", marker)
         source = {"text": text, "hash": plant.description.hash}
@@ -244,7 +244,7 @@ def opened(study: Study, folder: Path, command: str = "") -> Iterator[dict[str, 
 
 @contextlib.contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """The folder, made where there is none, for one process at a time."""
+    """The folder, created if missing, for one process at a time."""
     if folder.is_file():
         raise ValueError(f"{folder} exists and is no run folder; choose another name")
     try:
@@ -268,7 +268,7 @@ def _checkpoint_seconds() -> float:
 
 
 def _marker(study: Study, plant: AbstractPlant, text: str | None) -> dict[str, Any]:
-    """What `run.json` says, by which the folder is known again."""
+    """Content of `run.json`, which identifies the run."""
     return {
         "kind": KIND,
         "excite": __version__,
@@ -283,14 +283,14 @@ def _marker(study: Study, plant: AbstractPlant, text: str | None) -> dict[str, A
 
 
 def _plant_text(study: Study) -> str | None:
-    """Source of a user's own plant."""
+    """Source of a user-defined plant."""
     if ":" not in study.plant:
         return None
     return Path(study.plant.rpartition(":")[0]).read_text(encoding="utf-8")
 
 
 def _require_same_study(study: Study, marker: Mapping[str, Any], folder: Path) -> None:
-    """Raises ValueError where the folder is of another study; a file that was deleted may be."""
+    """Raises ValueError where the folder is of another study; deleted files are allowed."""
     if (folder / "study.json").is_file():
         own, saved = _compared(study), _compared(study_of(folder))
         for key in own:
@@ -308,7 +308,7 @@ def _require_same_study(study: Study, marker: Mapping[str, Any], folder: Path) -
 
 
 def _compared(study: Study) -> dict[str, Any]:
-    """Settings that decide what is computed, but for where a plant or a policy lies."""
+    """Settings that determine the results, without the paths of plant and policies."""
     settings = json_ready(study.model_dump(exclude=FREE))
     settings["plant"] = study.plant.rpartition(":")[2]
     for method in settings["methods"].values():
@@ -318,7 +318,7 @@ def _compared(study: Study) -> dict[str, Any]:
 
 
 def _is_finished(study: Study, plant: AbstractPlant, target: _Target, folder: Path) -> bool:
-    """Whether a task's results are there; ValueError where they are of another training."""
+    """Whether a task's results exist; ValueError where they are of another training."""
     kind, agent, seed = target
     if kind != "seed":
         return (folder / f"{kind}.json").is_file()
@@ -334,7 +334,7 @@ def _is_finished(study: Study, plant: AbstractPlant, target: _Target, folder: Pa
 
 
 def _differing(study: Study, plant: AbstractPlant, agent: str, metrics: Path) -> str:
-    """Names of those settings, as far as the seed's policy tells them."""
+    """Names of the settings that differ, according to the seed's policy."""
 
     def flat(settings: Mapping[str, Any]) -> dict[str, Any]:
         parts = (settings, settings.get("decision", {}), settings.get("training", {}))
@@ -357,20 +357,20 @@ def run_tasks(
     on_done: Callable[[str], None] = lambda _: None,
     command: str = "",
 ) -> dict[str, Exception]:
-    """Computes what the run folder lacks.
+    """Computes what is missing in the run folder.
 
     Args:
         engine: None for this process, which can evaluate methods only.
         progress: called about once a second, in thousandths of a task.
         on_done: called with the name of every task that was finished.
-        command: that runs it, kept in `run.json` for those who want to do it again.
+        command: that runs it, stored in `run.json`.
 
     Returns:
-        Why, for every task that failed in spite of all tries.
+        The error of each task that failed after all tries.
     """
     with opened(study, folder, command) as tasks:
         targets = _names(study)
-        if tasks:  # a table of before is not that of this study
+        if tasks:  # an earlier table is outdated
             (folder / "table.json").unlink(missing_ok=True)
         before = len(targets) - len(tasks)
         if engine is None:
@@ -409,7 +409,7 @@ def _names(study: Study) -> dict[str, _Target]:
 def _missing(
     study: Study, plant: AbstractPlant, folder: Path, checkpoint_seconds: float
 ) -> dict[str, dict[str, Any]]:
-    """The tasks that are not finished, with the arguments that are each one's own."""
+    """The unfinished tasks, with the arguments of each."""
     tasks = {}
     for name, (kind, agent, seed) in _names(study).items():
         if _is_finished(study, plant, (kind, agent, seed), folder):
@@ -427,7 +427,7 @@ def _missing(
 
 
 def _keep(target: _Target, folder: Path, result: Any) -> None:
-    """Writes what a task returned; the file that marks it as finished last."""
+    """Writes the result of a task; the file that marks it as finished is the last."""
     kind, agent, seed = target
     if kind != "seed":
         write_json(folder / f"{kind}.json", result)
@@ -442,7 +442,7 @@ def _keep(target: _Target, folder: Path, result: Any) -> None:
 
 
 def _live(study: Study, target: _Target, folder: Path) -> tuple[float, str]:
-    """How far a task is, and what its newest look at the policy showed."""
+    """Progress of a task, and its newest validation of the policy."""
     kind, agent, seed = target
     if kind != "seed":
         return float((folder / f"{kind}.json").is_file()), ""
@@ -458,7 +458,7 @@ def _live(study: Study, target: _Target, folder: Path) -> tuple[float, str]:
 
 
 def _looks(row: Mapping[str, float | None]) -> str:
-    """What is known of the newest look; a number that is not finite is left out."""
+    """Numbers of the newest validation; those that are not finite are left out."""
     known = {name: value for name, value in row.items() if value is not None}
     parts = [f"return {known['return']:.3g}"] if "return" in known else []
     parts += [

@@ -1,4 +1,4 @@
-"""Tables of a study file: base models, and pydantic's complaints as sentences."""
+"""Tables of a study file: base models, and pydantic's errors as sentences."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def checked(
         if name not in fields:
             raise unknown(f"{where} setting", name, fields)
     try:
-        # As JSON, because a strict check of Python's own types would want tuples for lists.
+        # As JSON, because a strict check of Python types would require tuples for lists.
         content = json.dumps(dict(values), default=str)
         return pydantic.TypeAdapter(kind).validate_json(content, strict=True)
     except pydantic.ValidationError as error:
@@ -76,13 +76,13 @@ _ALLOWED = {
     "dict": "a table",
     "model": "a table",
 }
-"""What is allowed where pydantic misses a type, by the first word of its complaint."""
+"""The allowed type for an error of pydantic, by its first word."""
 
 
 def sentence(
     error: pydantic.ValidationError, tables: Mapping[str, type[BaseModel]] = MappingProxyType({})
 ) -> str:
-    """One of pydantic's complaints as a sentence: a mistyped key before the one it misses.
+    """One of pydantic's errors as a sentence: an unknown key before a missing one.
 
     Args:
         tables: the settings in each table of the file, those of the file itself under "".
@@ -96,7 +96,7 @@ def sentence(
         return f"{where}: " * bool(where) + str(unknown("key", key, model.model_fields))
     if first["type"] == "missing":
         return f"the key {location!r} is missing"
-    if first["type"] == "value_error" and "ctx" in first:  # our own sentence
+    if first["type"] == "value_error" and "ctx" in first:  # a message of this package
         return f"{location}: " * bool(location) + str(first["ctx"]["error"])
     got = json.dumps(first["input"], default=str)
     if isinstance(first["input"], float) and not math.isfinite(first["input"]):

@@ -1,4 +1,4 @@
-"""`Study`: every choice of a comparison, read from a TOML file and checked at the door."""
+"""`Study`: all settings of a comparison, read from a TOML file and checked."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from .settings import Choice, Count, EstimatorSettings, Magnitude, Settings, che
 
 
 class SensorSettings(Settings):
-    """Sensor of one output, in its unit; what is left out stays the plant's."""
+    """Sensor of one output, in its unit; a value left out is the plant's."""
 
     noise_sd: Magnitude | None = None
     resolution: Magnitude | None = None
@@ -46,7 +46,7 @@ class MethodSettings(Choice):
 
 
 class ClairvoyantSettings(Settings):
-    """Signals designed for known parameters, by which methods are measured.
+    """Signals designed for known parameters, as a reference for the methods.
 
     Attributes:
         plants: for how many of the evaluation episodes' plants.
@@ -63,7 +63,7 @@ class RigSettings(Settings):
     Attributes:
         latency, jitter: of an input's action [s], by default the rig's.
         dropout: probability that a reading repeats the one before it.
-        filter: whether every method runs once more, behind the predictive safety filter.
+        filter: whether every method is also run behind the predictive safety filter.
     """
 
     latency: Magnitude | None = None
@@ -72,7 +72,7 @@ class RigSettings(Settings):
     filter: Annotated[bool, Field(strict=True)] = False
 
     def numbers(self) -> dict[str, float]:
-        """Those of the rig that are set."""
+        """The settings of the rig that are given."""
         return self.model_dump(exclude={"filter"}, exclude_none=True)
 
 
@@ -95,7 +95,7 @@ class Study(Settings):
     Attributes:
         name, title: a word, and a line for tables.
         plant: name, or path/to/file.py:ClassName.
-        episodes: evaluation episodes of each method, each with a plant of its own.
+        episodes: evaluation episodes of each method, each on another plant.
         num_steps: T, steps of an episode.
         seed: of plants, noise and excitations.
         spread: parameters are uniform in nominal value ± spread times their scale (by
@@ -106,7 +106,7 @@ class Study(Settings):
         seeds: trainings of each agent, with the seeds 0, 1, ...
         decision: settings of all agents.
         training, gradient: hyper-parameters of all agents trained by PPO, and by gradient.
-        clairvoyant: signals to measure the methods by.
+        clairvoyant: signals as a reference for the methods.
         lengths: numbers of steps at which every method's Cramér-Rao bound is computed.
         rig: where experiments are made on a simulated rig.
         inferred: settings that the source of the study does not state, in words.
@@ -139,7 +139,7 @@ class Study(Settings):
     source: str = ""
 
     def build_plant(self) -> AbstractPlant:
-        """The plant behind the study's sensor.
+        """The plant with the study's sensor.
 
         Raises:
             ValueError: for an unknown plant or output.
@@ -175,7 +175,7 @@ class Study(Settings):
         return [f"{path}: {warning}" for path, warning in found.items()]
 
     def origins(self, plant: AbstractPlant) -> dict[str, dict[str, str]]:
-        """What a record must say of each method that is a policy, see `excitation_and_origin`."""
+        """Entries of a record about each method that is a policy, see `excitation_and_origin`."""
         own = {
             name: excitation_and_origin(m.excitation, m.options, plant)[1]
             for name, m in self.methods.items()
@@ -204,7 +204,7 @@ class Study(Settings):
         return Agent.of(own, self.decision, shared, self.estimators)
 
     def bound_curves(self) -> list[str]:
-        """Agents whose learning curves hold the Cramér-Rao bound in the place of errors."""
+        """Agents whose learning curves hold the Cramér-Rao bound instead of errors."""
         plant = self.build_plant()
         envs = {
             name: self.agent(name).env(plant, self.spread, self.num_steps) for name in self.agents
@@ -212,7 +212,7 @@ class Study(Settings):
         return [n for n, env in envs.items() if isinstance(env.objective, InformationGain)]
 
     def checked(self, where: str) -> Study:
-        """Itself, checked down to every option; ValueError, naming `where`, for a mistake."""
+        """Validates all settings; returns self. ValueError, naming `where`, for a mistake."""
         try:
             plant = self.build_plant()
             self.build_methods(plant)
@@ -235,7 +235,7 @@ class Study(Settings):
             other = words.setdefault(folder_word(name), name)
             if other != name or not folder_word(name):
                 raise ValueError(
-                    f"the agent {name!r} needs a name of its own in letters and digits"
+                    f"the agent {name!r} needs a unique name with letters or digits"
                     + (f"; {other!r} has the same" if other != name else "")
                 )
             try:
@@ -288,7 +288,7 @@ _TABLES = {
 
 
 def read_study(path: str | Path) -> Study:
-    """The study in a TOML file or of a shipped name, checked down to every option.
+    """The study in a TOML file or of a shipped name, fully validated.
 
         >>> import excite as ex
         >>> ex.read_study("baselines").plant
@@ -311,7 +311,7 @@ def read_study(path: str | Path) -> Study:
 
 
 def _beside(study: Study, folder: Path) -> Study:
-    """The study with the files it names, where they lie in its own folder."""
+    """The study with its file names relative to its folder resolved."""
     plant, methods = study.plant, study.model_dump()["methods"]
     if ":" in plant and (folder / plant.rpartition(":")[0]).is_file():
         plant = str(folder / plant)
@@ -338,7 +338,7 @@ def study_from(content: Mapping[str, object], where: str) -> Study:
 def plant_tables(
     plant: PlantLike, noise: Mapping[str, float] | None = None
 ) -> tuple[dict[str, object], AbstractPlant]:
-    """What a study file says of a plant and its sensor, and the plant it means.
+    """The settings of a study file for a plant and its sensor, and that plant.
 
     Args:
         noise: standard deviation by output, in its unit, where it differs from the plant's.
@@ -374,7 +374,7 @@ def _word(kind: type[AbstractPlant]) -> str:
         return shipped[0]
     try:
         return f"{inspect.getfile(kind)}:{kind.__name__}"
-    except (TypeError, OSError):  # typed into a notebook or a shell
+    except (TypeError, OSError):  # defined in a notebook or a shell
         raise ValueError(
             f"other processes cannot import the plant class {kind.__name__}: save it in a file (in "
             f"a notebook by %%writefile plant.py) and name it as 'plant.py:{kind.__name__}'"

@@ -20,7 +20,7 @@ class Scores(eqx.Module):
     """All episodes of one method and one estimator, on NumPy arrays.
 
     Attributes:
-        on_rig: what else happened on a simulated rig, by name; empty without one.
+        on_rig: events on a simulated rig by name; empty without one.
     """
 
     true: Float[np.ndarray, "episode param"]
@@ -94,7 +94,7 @@ def _rms(values: Float[np.ndarray, "episode param"]) -> Float[np.ndarray, " para
 
 
 def _fraction(values: np.ndarray) -> Float[np.ndarray, " param"]:
-    """Mean over episodes; not a number where no episode is left."""
+    """Mean over episodes; NaN where no episode is left."""
     return values.mean(axis=0) if len(values) else np.full(values.shape[1], np.nan)
 
 
@@ -107,7 +107,7 @@ def mean_sd(values: np.ndarray) -> MeanSd:
 
 
 def _error(values: np.ndarray) -> ErrorStatistics:
-    """Mean and standard deviation of errors, and the median, which a few large ones do not move."""
+    """Mean, standard deviation and median of errors."""
     size = mean_sd(values)
     return ErrorStatistics(
         mean=size.mean,

@@ -69,8 +69,7 @@ def _with_efficiency(study: Study, folder: Path, rows: Sequence[Row]) -> list[Ro
     """The rows and those of the clairvoyant signals, each with its D-efficiency.
 
     exp((log det - log det of the clairvoyant) / number of parameters), both of the same
-    plants: how much of the information a parameter that can be had (A. Atkinson, A. Donev,
-    R. Tobias, Optimum Experimental Designs, 2007).
+    plants (A. Atkinson, A. Donev, R. Tobias, Optimum Experimental Designs, 2007).
     """
     path, params = folder / "clairvoyant.json", _params(folder)
     best = _rows(path, [("clairvoyant", e) for e in study.estimators], params)
@@ -141,8 +140,8 @@ def across_seeds(metrics: Sequence[SeedMetrics], estimator: int) -> Row:
     """One row of an agent: means over its viable seeds, counts over all of them.
 
     The seed is the unit of replication: standard deviations are those between the means of
-    the seeds. A seed none of whose estimates succeeded has no mean, and is left out of it;
-    where no seed is viable, there are no means.
+    the seeds. A seed without a successful estimate has no mean and is left out. Without
+    viable seeds there are no means.
     """
     rows = [m.rows[estimator] for m in metrics]
     viable = [row for m, row in zip(metrics, rows, strict=True) if m.viable]
@@ -193,7 +192,7 @@ def across_seeds(metrics: Sequence[SeedMetrics], estimator: int) -> Row:
 def _where_asked_for(
     rows: Sequence[Row], viable: Sequence[Row]
 ) -> dict[str, RigCounts | BoundByLength | float]:
-    """What a row has beside the rest for some studies only."""
+    """Entries of a row that only some studies have."""
     found: dict[str, RigCounts | BoundByLength | float] = {}
     counts = [row.on_rig.model_dump(exclude_unset=True) for row in rows if row.on_rig is not None]
     if counts:
@@ -283,16 +282,16 @@ def finished_table(folder: Path) -> StudyTable:
     """
     study, path = facts(study_of(folder)), folder / "table.json"
     if not path.is_file():
-        study_table(folder)  # says what is missing
+        study_table(folder)  # reports what is missing
         raise ValueError(f"{folder}: the table is missing; rerun 'excite study run' to write it")
     return StudyTable.in_folder(folder, study, advice(path))
 
 
 def best_seeds(study: Study, folder: Path) -> dict[str, int]:
-    """By agent, the seed that was worth most in the validation episodes.
+    """By agent, the best seed in the validation episodes.
 
-    By the objective among those that are safe enough where training tells it, else by the
-    return, which counts safety.
+    By the objective among the seeds that are safe enough, if the training reports it; else
+    by the return, which includes safety.
     """
 
     def value(agent: str, seed: int) -> tuple[float, float]:
@@ -314,6 +313,6 @@ def learning_curves(study: Study, folder: Path) -> dict[str, list[dict[str, np.n
         paths = [seed_folder(folder, agent, seed) / "curve.csv" for seed in seeds]
         curves[agent] = [read_columns(path, names) for path in paths]
         lengths = [len(curve["steps"]) for curve in curves[agent]]
-        if min(lengths) < max(lengths):  # every seed is looked at as often
+        if min(lengths) < max(lengths):  # all seeds have the same number of validations
             raise damaged(paths[lengths.index(min(lengths))])
     return curves

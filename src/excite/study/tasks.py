@@ -1,7 +1,7 @@
-"""What a worker does for a study: evaluates methods, designs signals, trains a seed.
+"""The tasks of a study in a worker: evaluate methods, design signals, train a seed.
 
-Every task takes and returns plain data, so that it runs in any process on any machine. A seed
-that was interrupted resumes from its checkpoint; a seed repeated gives the same result.
+Every task takes and returns plain data, so that it runs in any process on any machine. An
+interrupted seed resumes from its checkpoint; a repeated seed gives the same result.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ from .spec import Study, study_from
 from .statistics import table_row
 
 Data = dict[str, object]
-"""JSON-ready: what a worker sends back."""
+"""JSON-ready result of a worker."""
 
 
 class SeedResult(TypedDict):
-    """What the training of a seed leaves: policy file, learning curve, `SeedMetrics` as data."""
+    """Result of the training of a seed: policy file, learning curve, `SeedMetrics` as data."""
 
     policy: bytes
     curve: list[dict[str, float]]
@@ -53,7 +53,7 @@ class SeedResult(TypedDict):
 def unpacked(
     settings: Mapping[str, object], source: Mapping[str, str | None]
 ) -> Iterator[tuple[Study, AbstractPlant]]:
-    """The study of a task and its plant; a user's plant file lies here while it is needed.
+    """The study of a task and its plant; a user's plant file is written for the time of the task.
 
     Args:
         settings: of the study.
@@ -70,15 +70,15 @@ def unpacked(
         plant = study.build_plant()
         if plant.description.hash != source["hash"]:
             raise ValueError(
-                f"the plant {plant.definition.name!r} of this worker is another one "
-                f"(hash {plant.description.hash[:8]}) than that of the study "
+                f"the plant {plant.definition.name!r} of this worker "
+                f"(hash {plant.description.hash[:8]}) differs from that of the study "
                 f"({str(source['hash'])[:8]})"
             )
         yield study, plant
 
 
 COLLAPSED = 0.01
-"""An agent whose RMS input over the evaluation is below this fraction of its limit."""
+"""An agent with an RMS input below this fraction of its limit has collapsed."""
 
 
 def seed_task(
@@ -89,13 +89,13 @@ def seed_task(
     folder: str | None,
     checkpoint_seconds: float,
 ) -> SeedResult:
-    """A trained policy, its learning curve, and how it does in the evaluation.
+    """A trained policy, its learning curve, and its evaluation.
 
     Args:
         study: its settings.
         plant: `text`, the source of a user's own plant or None, and the plant's `hash`.
         agent, seed: what to train.
-        folder: for checkpoints and logs, where this machine sees it.
+        folder: for checkpoints and logs, if this machine can access it.
         checkpoint_seconds: least time between two checkpoints.
     """
     with unpacked(study, plant) as (chosen, built):
@@ -130,14 +130,14 @@ def seed_task(
 
 
 def _trained(env: Env, agent: Agent, seed: int, keeper: _Keeper) -> Trained:
-    """By name, because the libraries of one trainer come with an extra."""
+    """The trainer; imported here, because one trainer needs an extra."""
     own = {"log_folder": keeper.log_folder} if agent.method == "ppo" else {}
     train = importlib.import_module(f"excite.training.{agent.method}").train
     return train(env, agent.training, seed, resume=keeper.saved(), on_boundary=keeper.keep, **own)
 
 
 class _Keeper:
-    """Writes checkpoints and progress of one seed into its folder, if there is one."""
+    """Writes checkpoints and progress of one seed into its folder, if it has one."""
 
     def __init__(self, folder: Path | None, fingerprint: str, every: float) -> None:
         self.folder, self.fingerprint, self.every = folder, fingerprint, every
@@ -151,7 +151,7 @@ class _Keeper:
         return self.before + time.monotonic() - self.start
 
     def saved(self) -> Checkpoint | None:
-        """The checkpoint to go on from."""
+        """The checkpoint from which to resume."""
         if self.path is None or not self.path.is_file():
             return None
         try:
@@ -166,7 +166,7 @@ class _Keeper:
         return checkpoint
 
     def keep(self, checkpoint: Callable[[], Checkpoint], row: dict[str, float] | None) -> None:
-        """At every boundary."""
+        """Called at every boundary."""
         if self.folder is None or self.path is None:
             return
         if row is not None:
@@ -189,7 +189,7 @@ METHOD = "clairvoyant"
 
 
 def clairvoyant_task(study: Mapping[str, object], plant: Mapping[str, str | None]) -> Data:
-    """Rows of the clairvoyant signals, and how well their starts agree."""
+    """Rows of the clairvoyant signals, and the spread of their starts."""
     with unpacked(study, plant) as (chosen, built):
         if chosen.clairvoyant is None:
             raise ValueError("the study has no clairvoyant signals")
@@ -212,7 +212,7 @@ def _played(
     spread: float,
     keys: Key[Array, " episode"],
 ) -> Episodes:
-    """Each signal on its own plant."""
+    """Each signal on the plant for which it was designed."""
 
     def one(own: Float[Array, "time input"], key: Key[Array, ""]) -> Episodes:
         episodes = run_episodes(plant, Replay(own), len(own), spread, key[None])

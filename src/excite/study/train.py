@@ -1,4 +1,4 @@
-"""`train`: a policy for a plant, as a study of one agent and a chirp to compare it with."""
+"""`train`: a policy for a plant, as a study of one agent and a chirp."""
 
 from __future__ import annotations
 
@@ -51,14 +51,14 @@ def train(
 
     Args:
         plant: its name, `path/to/file.py:ClassName`, the plant or its class.
-        out: run folder of the study; without one nothing is kept but the policy.
+        out: run folder of the study; without one only the policy is kept.
         method: `gradient` of the simulated experiment, or `ppo`.
         objective: criterion of the Fisher information (`D`, `A`, `E`), or errors of the ARX
             estimator (`relative`, `log`, `goals`) or of nonlinear least squares (`nls`);
             several are added, with weights (`["D", "log=0.1"]` or `{"D": 1, "log": 0.1}`).
-        target: parameters that count, default the plant's targets.
-        goal: relative error that counts as one, by parameter.
-        window: samples observed, default 80.
+        target: parameters in the objective, default the plant's targets.
+        goal: relative error that is scaled to one, by parameter.
+        window: number of samples observed, default 80.
         clock: frequencies [Hz] whose sine and cosine are observed too.
         training: hyper-parameters of the method (`excite.training.settings`).
         seeds: independent trainings; the best policy is returned.
@@ -66,15 +66,15 @@ def train(
         steps: samples of an experiment.
         noise: standard deviation by output, in its unit, where it differs from the plant's.
         episodes: experiments on which the policies are evaluated.
-        output_scale: what an output is divided by before it is observed, in its unit.
-        workers: processes that train side by side, None for one a core.
-        progress: called with a text, how much is done, and how much there is.
+        output_scale: scale by which an observed output is divided, in its unit.
+        workers: number of parallel processes, None for one per core.
+        progress: called with a text, how much is done, and the total.
         on_done: called with the name of every task that was finished.
-        command: kept in the run folder for those who want to do it again.
+        command: stored in the run folder, to repeat the run.
 
     Raises:
         ValueError: for an argument that is not allowed, or a training that cannot succeed.
-        StudyFailedError: where tasks failed; what is finished is kept in `out`.
+        StudyFailedError: where tasks failed; finished tasks are kept in `out`.
     """
     rewards = rewards_of(objective, goal or {})
     decision = {

@@ -1,9 +1,9 @@
 """A process that computes for another: `python -m excite.study.worker MEMORY NICENESS`.
 
-One line of JSON in is a call of a function, every line out is an answer to it, by its number:
-the events of a generator, then what the function returns or why it failed. The process ends
-with its input, so that it never outlives the one that started it. It takes no more data than
-MEMORY bytes (0: no limit): a file that unpacks to more than the computer holds is refused.
+One line of JSON in is a call of a function. Every line out is an answer to a call, by its
+number: the events of a generator, then the result or the error. The process ends when its
+input ends, so that it does not outlive the process that started it. Its data are limited to
+MEMORY bytes (0: no limit), which also limits the unpacked size of a file.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ READY = {"kind": "ready"}
 
 @dataclass(frozen=True)
 class Started:
-    """A worker has begun with a call."""
+    """A worker has started a call."""
 
 
 @dataclass(frozen=True)
@@ -52,18 +52,18 @@ class Event:
 
 @dataclass(frozen=True)
 class Result:
-    """The last of a call: what the function returned; None of a generator."""
+    """The last answer to a call: the result of the function; None of a generator."""
 
     value: object = None
 
 
 @dataclass(frozen=True)
 class Failure:
-    """The last of a call, in place of a result.
+    """The last answer to a call that failed.
 
     Attributes:
-        is_mistake: whether it is the caller's mistake, so that another try is in vain.
-        num_deaths: how many workers died at it.
+        is_mistake: whether it is the caller's mistake, so that another try is useless.
+        num_deaths: number of workers that died during the call.
     """
 
     sentence: str
@@ -78,11 +78,11 @@ _KINDS: dict[str, type[Answer]] = {"event": Event, "end": Result, "failed": Fail
 
 
 def main() -> None:
-    """Answers calls until the input ends, or nobody is left to read the answers."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for who started this
+    """Answers calls until the input or the reader of the answers ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent
     memory, niceness = map(int, sys.argv[1:])
     with os.fdopen(os.dup(1), "w", encoding="utf-8", errors="replace") as out:
-        os.dup2(2, 1)  # whatever a library prints is no answer
+        os.dup2(2, 1)  # output of a library is not an answer
         if niceness and hasattr(os, "nice"):
             os.nice(niceness)
         if memory and resource is not None:
@@ -109,7 +109,7 @@ def _answer_calls(out: IO[str]) -> None:
 
 
 class _Inbox:
-    """What comes in, read in a thread, so that the end of the input ends any computation."""
+    """The input, read in a thread, so that its end ends any computation."""
 
     def __init__(self) -> None:
         self.calls: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
@@ -128,7 +128,7 @@ class _Inbox:
 
 
 def answers(target: str, arguments: Mapping[str, object]) -> Generator[Answer, None, None]:
-    """What the function `target`, "package.module:function", says."""
+    """The answers of the function `target`, "package.module:function"."""
     module, _, name = target.partition(":")
     try:
         result = getattr(importlib.import_module(module), name)(**arguments)
@@ -141,14 +141,14 @@ def answers(target: str, arguments: Mapping[str, object]) -> Generator[Answer, N
         lack = f"the worker has no module {error.name!r}; training needs the extra 'ppo'"
         yield _failure(lack, is_mistake=True)
     except MemoryError:
-        yield _failure("this needs more memory than a worker may take")
+        yield _failure("this needs more memory than a worker may use")
     except (Exception, SystemExit) as error:  # subclasses of ValueError come from libraries
         is_mistake = type(error) is ValueError or type(error).__module__.startswith("excite.")
         yield _failure(str(error) if is_mistake else sentence_of(error), is_mistake)
 
 
 def _failure(sentence: str, is_mistake: bool = False) -> Failure:
-    """In one line of limited length."""
+    """A text as one line of limited length."""
     sentence = " ".join(sentence.split())
     if len(sentence) > _MAX_SENTENCE:
         sentence = f"{sentence[:_MAX_SENTENCE]}…"
@@ -170,7 +170,7 @@ def line_of(answer: Answer, number: int) -> str:
     [kind] = [kind for kind, of in _KINDS.items() if isinstance(answer, of)]
     try:
         return encoded({**vars(answer), "kind": kind, "number": number})
-    except (TypeError, ValueError, RecursionError) as error:  # it is no plain data
+    except (TypeError, ValueError, RecursionError) as error:  # not plain data
         return line_of(_failure(sentence_of(error)), number)
 
 
@@ -178,7 +178,7 @@ def message_of(line: bytes) -> tuple[int, Answer]:
     """The number of a call, and the answer that a line holds.
 
     Raises:
-        AttributeError, KeyError, TypeError, ValueError: where it holds none.
+        AttributeError, KeyError, TypeError, ValueError: for any other line.
     """
     content = decoded(line)
     return content.pop("number"), _KINDS[content.pop("kind")](**content)
@@ -190,7 +190,7 @@ def encoded(message: object) -> str:
 
 
 def decoded(line: bytes) -> Any:
-    """What `encoded` was given; arrays come as lists."""
+    """The inverse of `encoded`; arrays become lists."""
     return json.loads(line, object_hook=_bytes)
 
 
@@ -199,7 +199,7 @@ def _plain(value: object) -> object:
         return {_BYTES: base64.b64encode(value).decode()}
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
-    raise TypeError(f"{type(value).__name__} is no plain data")
+    raise TypeError(f"{type(value).__name__} is not plain data")
 
 
 def _bytes(found: dict[str, Any]) -> object:

@@ -1,9 +1,9 @@
-"""Processes of this computer that compute: one pool for studies and for the bench page.
+"""Worker processes of this computer: one pool for studies and the bench page.
 
-A worker does one thing at a time. What is asked to stop is told so; where it does not listen
-within half a second, for it is deep in a computation, its process is killed and another
-started. Nothing half-written is left, for files appear whole or not at all. A process that
-says anything but an answer to its call is replaced, too. JAX is not loaded here.
+A worker runs one call at a time. A call is stopped by a message. If it does not stop within
+half a second, its process is killed and replaced. Files are written completely or not at
+all, so no partial file is left. A process that sends anything except an answer to its call
+is also replaced. JAX is not loaded here.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from .worker import READY, Ending, Failure, Message, Started, decoded, encoded, 
 
 _LOG = logging.getLogger(__name__)
 GRACE = 0.5
-"""Seconds in which work stops by itself."""
+"""Time for a call to stop before its process is killed [s]."""
 MAX_FAILURES = 3
-"""Processes that end before they are ready, one after the other, until a lane gives up."""
+"""Number of successive processes that end before they are ready, until a lane gives up."""
 _LINE = 64 * 2**20  # bytes; a longer answer is a defect
 _ONE = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NPROC", "JAX_ENABLE_X64")
 _ONE_THREAD = "--xla_cpu_multi_thread_eigen=false"
 
 
 def num_cores() -> int:
-    """Processors that this process may use."""
+    """Number of processors that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -40,8 +40,8 @@ def num_cores() -> int:
 def environment(cache: Path | None = None) -> dict[str, str]:
     """Variables of a worker: one thread (NPROC is XLA's), double precision.
 
-    They are set before it starts, for OpenBLAS counts its threads and JAX reads its settings
-    when they are imported. Other flags of XLA stay.
+    They are set before it starts, because OpenBLAS and JAX read them when they are imported.
+    Other flags of XLA are kept.
 
     Args:
         cache: where compiled programs are kept.
@@ -58,7 +58,7 @@ def environment(cache: Path | None = None) -> dict[str, str]:
 
 
 class Call:
-    """A call in the queue or under way."""
+    """A call that is waiting or running."""
 
     def __init__(
         self, number: int, line: str, tell: Callable[[Message], None], is_urgent: bool
@@ -69,11 +69,11 @@ class Call:
 
     @property
     def is_over(self) -> bool:
-        """Whether the last was said of it."""
+        """Whether its last message was passed on."""
         return self._is_over
 
     def say(self, message: Message) -> None:
-        """Passes a message on, but none after the last."""
+        """Passes a message on, unless the call is over."""
         with self._lock:
             if self._is_over:
                 return
@@ -81,7 +81,7 @@ class Call:
         self._tell(message)
 
     def forget(self) -> None:
-        """Nobody is told anything any more."""
+        """Stops passing messages on."""
         with self._lock:
             self._is_over = True
 
@@ -90,13 +90,13 @@ class Call:
 
 
 class Workers:
-    """Processes that answer calls, and the queue before them.
+    """Processes that answer calls, and their queue.
 
     Args:
-        memory: bytes of data that a process may take; 0 for no limit.
-        niceness: by how much others go before them.
-        time_limit: seconds that a call may take.
-        warm_up: a function that every process runs first, where nobody waits.
+        memory: limit of the data of a process [bytes]; 0 for no limit.
+        niceness: added to the niceness of the processes.
+        time_limit: of a call [s].
+        warm_up: a function that every process runs first, unless a call is waiting.
         cache: where they keep compiled programs.
     """
 
@@ -120,7 +120,7 @@ class Workers:
 
     @property
     def num_waiting(self) -> int:
-        """Calls in the queue."""
+        """Number of calls in the queue."""
         return len(self._waiting)
 
     def open(self) -> None:
@@ -132,7 +132,7 @@ class Workers:
             lane.start()
 
     def close(self, sentence: str = "the workers were ended") -> None:
-        """Ends the processes at once, and tells everybody who waits for them."""
+        """Ends the processes at once; every open call fails with `sentence`."""
         with self._changed:
             self._is_closed = True
             calls = [*self._waiting, *self._running]
@@ -151,11 +151,11 @@ class Workers:
         tell: Callable[[Message], None],
         is_urgent: bool = False,
     ) -> Call:
-        """Asks for a call; what is said of it goes to `tell`, in a thread of this pool.
+        """Queues a call; its messages are passed to `tell` in a thread of this pool.
 
         Args:
             target: "package.module:function".
-            is_urgent: before all that is not: somebody waits for the first sign of life.
+            is_urgent: before all calls that are not, because a user is waiting.
         """
         with self._changed:
             number = next(self._numbers)
@@ -169,7 +169,7 @@ class Workers:
         return call
 
     def withdraw(self, call: Call) -> None:
-        """Ends a call that nobody waits for any longer; it takes nobody's place then."""
+        """Ends a call that is no longer needed, also in the queue."""
         with self._changed:
             call.forget()
             if call in self._waiting:
@@ -188,7 +188,7 @@ class Workers:
                 call.process.kill()
 
     def _next(self) -> Call | None:
-        """The call that is first in the queue, once there is one; None where this is closed."""
+        """Waits for the first call in the queue; None where the pool is closed."""
         with self._changed:
             self._changed.wait_for(lambda: self._waiting or self._is_closed)
             if self._is_closed:
@@ -199,25 +199,25 @@ class Workers:
             return call
 
     def _lane(self) -> None:
-        """One worker and its successors; where none starts, the last lane tells everybody."""
+        """One worker and its successors; if none starts, the last lane fails all calls."""
         num_failures = 0
         while num_failures < MAX_FAILURES and not self._is_closed:
             num_failures = 0 if self._worked() else num_failures + 1
         with self._changed:
             self._num_broken += 1
         while self._num_broken == self.num_workers and (call := self._next()) is not None:
-            call.say(Failure("the workers do not start; the terminal says why"))
+            call.say(Failure("the workers do not start; the terminal shows the reason"))
             self._running.discard(call)
 
     def _worked(self) -> bool:
-        """What one process does until it ends; whether it came to work at all."""
+        """Runs one process until it ends; whether it became ready."""
         process = self._started()
         if process is None:
             return False
         is_warm = not self._warm_up
         try:
             while True:
-                if is_warm or self._waiting:  # somebody waits already
+                if is_warm or self._waiting:  # a call is waiting
                     if (call := self._next()) is None:
                         return True
                     if not self._answered(process, call):
@@ -236,7 +236,7 @@ class Workers:
         return Call(-1, line, lambda message: None, False)
 
     def _started(self) -> _Process | None:
-        """A process that is ready; None where there can be none."""
+        """A process that is ready; None where none can be started."""
         try:
             process = _Process(self._limits, {**os.environ, **environment(self._cache)})
         except OSError as error:
@@ -260,9 +260,9 @@ class Workers:
         return None
 
     def _answered(self, process: _Process, call: Call) -> bool:
-        """Passes a call and its answers on; whether the process can be given another call."""
+        """Passes on a call and its answers; whether the process can take another call."""
         with self._changed:
-            if call.is_over:  # withdrawn meanwhile
+            if call.is_over:  # cancelled in the meantime
                 self._running.discard(call)
                 return True
             call.process = process
@@ -282,7 +282,7 @@ class Workers:
                 call.say(message)
                 if isinstance(message, Ending):
                     return True
-        except Exception as error:  # what follows would be taken for the next answer
+        except Exception as error:  # the rest would be read as the next answer
             _LOG.error("a worker was replaced: %s", error)
             call.say(Failure("invalid worker response; worker restarted"))
             return False
@@ -302,7 +302,7 @@ def _later(seconds: float, function: Callable[[Call], None], call: Call) -> thre
 
 
 class _Process:
-    """A worker, and what goes in and out of it."""
+    """A worker process with its input and output."""
 
     def __init__(self, limits: tuple[str, str], variables: Mapping[str, str]) -> None:
         path = os.pathsep.join(folder for folder in sys.path if folder)
@@ -311,13 +311,13 @@ class _Process:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             env={**variables, "PYTHONPATH": path},
-            start_new_session=True,  # Ctrl-C is for who started this; on Windows by the next line
+            start_new_session=True,  # Ctrl-C is for the parent; on Windows by the next line
             creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
         )
         self._lock = threading.Lock()
 
     def send(self, message: object) -> None:
-        """A line in; where nobody reads it, the next answer says so."""
+        """Sends a line; if the process has ended, the next answer is empty."""
         line = message if isinstance(message, str) else encoded(message)
         with self._lock, contextlib.suppress(OSError, ValueError):
             if self._process.stdin is not None:
@@ -325,7 +325,7 @@ class _Process:
                 self._process.stdin.flush()
 
     def line(self) -> bytes:
-        """The next line out; empty where the process has ended.
+        """The next line of output; empty where the process has ended.
 
         Raises:
             ValueError: for one that is too long.
@@ -336,14 +336,14 @@ class _Process:
         return line if line.endswith(b"\n") else b""
 
     def kill(self) -> None:
-        """Ends it at once."""
+        """Kills the process."""
         self._process.kill()
 
     def end(self) -> None:
-        """Ends it, and waits for that."""
+        """Kills the process and waits for its end."""
         self.kill()
         self._process.wait()
         for pipe in (self._process.stdin, self._process.stdout):
-            with contextlib.suppress(OSError):  # what nobody reads any longer
+            with contextlib.suppress(OSError):  # unsent input
                 if pipe is not None:
                     pipe.close()

@@ -1,1 +1,1 @@
-"""Trainers: what turns a decision process into a policy."""
+"""Training of policies and design of signals for a decision process."""

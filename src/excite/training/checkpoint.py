@@ -1,4 +1,4 @@
-"""What a training reports: progress, checkpoints from which it is resumed, its result."""
+"""Progress, checkpoints and result of a training."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from ..policy import Weights
 FORMAT = "excite checkpoint 1"
 
 Progress: TypeAlias = Callable[[str, int, int], None]
-"""Called with what is being computed, how much of it is done, and how much there is."""
+"""Called with what is being computed, how much is done, and the total."""
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """Training at a rollout boundary.
+    """State of a training at a rollout boundary.
 
     Attributes:
         tensors: weights, moments, running episodes, random states.
@@ -35,7 +35,7 @@ class Checkpoint:
 
     @classmethod
     def from_bytes(cls, content: bytes, where: str) -> Checkpoint:
-        """The checkpoint in the content of a file; ValueError where it is none."""
+        """The checkpoint in the content of a file; ValueError for another file."""
         return cls(*tensors_from_bytes(content, FORMAT, where))
 
 
@@ -45,8 +45,8 @@ class Trained:
 
     Attributes:
         weights: of its network.
-        curve: one row a look.
-        validation: the look at these weights.
+        curve: one row per validation.
+        validation: of these weights.
     """
 
     weights: Weights

@@ -1,7 +1,7 @@
-"""`design`: an open-loop input for a plant, found, judged on fresh plants, ready to be written.
+"""`design`: an open-loop input for a plant, searched, then tested on new plants.
 
 `robust` and `clairvoyant` search by gradient (`signals`); a classical excitation is tuned
-(`tuning`). Whatever found it, the input is then judged as the fixed sequence that a rig plays.
+(`tuning`). In each case the input is then tested as the fixed sequence that a rig plays.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ except ImportError:
     tuned_signal = None
 
 NUM_FRESH = 1000
-"""Plants on which an input is judged."""
+"""Number of plants on which an input is tested."""
 
 BY_GRADIENT = ("robust", "clairvoyant")
 
@@ -49,13 +49,13 @@ class Design:
     """A designed input.
 
     Attributes:
-        plant: what it was designed for.
+        plant: for which it was designed.
         kind: `robust`, `clairvoyant`, or the classical excitation that was tuned.
         criterion, seed: of the search.
         inputs: by sample and input, in input units.
         record: these inputs and the noise-free response of the nominal plant.
         log_det_information: mean logarithm of the determinant of the Fisher information.
-        violations: experiments that reached a critical level, of as many `evaluations`.
+        violations: experiments that reached a critical level, of `evaluations`.
         worth_by_start: gain of the criterion over the prior, by start of a search by gradient;
             minus infinity where a start found no safe signal.
         tuned: the excitation and its options, where one was tuned.
@@ -79,7 +79,7 @@ class Design:
         return Replay(jnp.asarray(self.inputs))
 
     def save(self, path: str | Path, overwrite: bool = False) -> None:
-        """Writes the record as CSV or MAT, as the ending says; `excite run` plays the file.
+        """Writes the record as CSV or MAT, by the file's ending; `excite run` plays the file.
 
         Raises:
             ValueError: for another ending, or a file that exists, unless `overwrite`.
@@ -94,7 +94,7 @@ class Design:
         return episode_figure(self.plant, self.record)
 
     def summary(self) -> dict[str, object]:
-        """How it was found and what it is worth, JSON-ready."""
+        """How it was found, its information and violations, JSON-ready."""
         return {
             "plant": self.plant.name,
             **_found(self.kind, self.criterion, self.seed, self.worth_by_start, self.tuned),
@@ -106,7 +106,7 @@ class Design:
 
     def __repr__(self) -> str:
         """Two lines, a third for a tuned excitation."""
-        where = f"{self.evaluations} fresh plants" if self.evaluations > 1 else "the nominal plant"
+        where = f"{self.evaluations} new plants" if self.evaluations > 1 else "the nominal plant"
         lines = [
             f"{self.kind} input for {self.plant.name}, {len(self.inputs)} samples",
             f"log det {self.log_det_information:.2f}, {self.violations} violations on {where}",
@@ -146,7 +146,7 @@ def design(
         steps: samples of the experiment.
         spread: parameters are uniform in nominal value ± spread times their scale.
         noise: standard deviation by output, in its unit, where it differs from the plant's.
-        seed: of the search, and of the plants on which the input is judged.
+        seed: of the search, and of the plants on which the input is tested.
         starts: of a search by gradient, default 4.
         updates: gradient updates, default 1000 (robust) or 1500 (clairvoyant).
         trials: of a tuning, default 400.
@@ -168,7 +168,7 @@ def design(
     if kind in BY_GRADIENT:
         if trials is not None:
             raise ValueError(f"trials are for tuning; a {kind} design has updates (--updates)")
-        if kind == "clairvoyant":  # the plant is known, what an experiment is worth stays the same
+        if kind == "clairvoyant":  # the plant is known, the objective is the same
             env = dataclasses.replace(env, spread=0.0)
         inputs, worth_by_start = _searched(env, kind, seed, starts, updates, progress)
     else:
@@ -216,7 +216,7 @@ def _check(
 def _searched(
     env: Env, kind: str, seed: int, starts: int | None, updates: int | None, progress: Progress
 ) -> tuple[Float[Array, "time input"], tuple[float, ...]]:
-    """The input found by gradient, and the worth by start."""
+    """The input found by gradient, and the worth of each start."""
     settings = ROBUST if kind == "robust" else CLAIRVOYANT
     if updates is not None:
         settings = dataclasses.replace(settings, num_updates=updates)
@@ -249,7 +249,7 @@ def _tuned(
 def _found(
     kind: str, criterion: str, seed: int, worth_by_start: tuple[float, ...], tuned: Tuned | None
 ) -> dict[str, object]:
-    """How an input was found, as its file says."""
+    """How an input was found, for its file."""
     found = {"design": kind, "criterion": criterion, "seed": seed}
     if tuned is None:
         return {**found, "worth_by_start": list(worth_by_start)}

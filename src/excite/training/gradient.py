@@ -3,9 +3,9 @@
 The decision process is one differentiable function of the policy's weights, so that the
 gradient of what an experiment is worth follows from one backward pass through it. Every
 update takes a fresh batch of plants. Safety is a quadratic penalty on the true outputs
-from a margin below the critical level, whose weight grows after a batch in which a plant
-came too near to that level and slowly decays otherwise. Of all looks at the policy the
-best one whose violation rate on held-out plants is allowed is kept.
+from a margin below the critical level. Its weight grows after a batch in which a plant came
+too near to that level, and slowly decays otherwise. The policy with the best validation and
+an allowed violation rate on held-out plants is kept.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ class Scores(eqx.Module):
 
     Attributes:
         worth: of each, by the objective.
-        outcome: of each, what the objective needs to know of it beside others.
-        excess: of each, the mean square of how far outputs lie beyond the margin; one is
+        outcome: of each, for the objective over a batch.
+        excess: of each, the mean square of the distance of outputs beyond the margin; one is
             the critical level.
         nearness: of each, the largest output over its critical level; infinite for an
             experiment that cannot be computed.
@@ -66,7 +66,7 @@ def experiments(
     keys: Key[Array, " plant"],
     margin: Float[Array, ""] | float,
 ) -> Scores:
-    """One experiment for every key, differentiable in what `act` holds.
+    """One experiment for every key, differentiable with respect to the arrays of `act`.
 
     Only the states at every step are kept for the backward pass; the rest of a step is
     computed again.
@@ -95,7 +95,7 @@ def experiments(
 
 
 class Optimisation(eqx.Module):
-    """What changes from update to update.
+    """State that changes from update to update.
 
     Attributes:
         player: the policy or signal being trained.
@@ -117,7 +117,7 @@ class Optimisation(eqx.Module):
 def update(
     env: Env, settings: GradientSettings, now: Optimisation, keys: Key[Array, " plant"]
 ) -> tuple[Optimisation, Scores]:
-    """One step of Adam on the plants of these keys, and their experiments before it."""
+    """One step of Adam on the plants of these keys, and the experiments before it."""
 
     def loss(player: PyTree) -> tuple[Array, Scores]:
         batch = experiments(env, player, keys, settings.margin)
@@ -137,7 +137,7 @@ def update(
 update_all = eqx.filter_jit(
     eqx.filter_vmap(update, in_axes=(None, None, eqx.if_array(0), eqx.if_array(0)))
 )
-"""`update` for several trainings side by side; their axis is the first of progress and keys."""
+"""`update` for several parallel trainings; their axis is the first of progress and keys."""
 
 
 def train(
@@ -168,9 +168,9 @@ def train_all(
     resume: Checkpoint | None = None,
     on_boundary: OnBoundary = lambda *_: None,
 ) -> list[Trained]:
-    """Trains one policy a seed, all in one batch; see `train`.
+    """Trains one policy per seed, all in one batch; see `train`.
 
-    Their looks go to `on_boundary` as one, the mean.
+    `on_boundary` gets the mean of their validations.
     """
     course, keys = started(env, settings, seeds)
     if resume is not None:
@@ -195,13 +195,13 @@ def train_all(
 
 @dataclass
 class _Course:
-    """A training under way; the leading axis of arrays is the seed.
+    """A running training; the leading axis of arrays is the seed.
 
     Attributes:
         now: progress.
-        best: the best policy seen by a look.
-        rank: of that look: minus the violation rate beyond the one allowed, then worth.
-        curves: looks, by seed.
+        best: the best policy in a validation.
+        rank: of that validation: minus the violation rate beyond the allowed one, then worth.
+        curves: validations, by seed.
         num_updates: done.
     """
 
@@ -212,11 +212,11 @@ class _Course:
     num_updates: int = 0
 
     def last_look(self) -> float:
-        """Steps of the last look; before any, below zero."""
+        """Steps of the last validation; before the first, below zero."""
         return self.curves[0][-1]["steps"] if self.curves[0] else -1.0
 
     def checkpoint(self, steps: float) -> Checkpoint:
-        """All of it, to be restored."""
+        """The whole state, to be restored."""
         leaves = jax.tree.leaves((self.now, self.best, self.rank))
         tensors = {f"leaf.{i}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
         state = {"num_updates": self.num_updates, "num_steps": steps}
@@ -225,7 +225,7 @@ class _Course:
 
 def _restored(course: _Course, saved: Checkpoint) -> _Course:
     old, structure = jax.tree.flatten((course.now, course.best, course.rank))
-    leaves = [  # a file has no scalars
+    leaves = [  # the file format has no scalars
         jnp.asarray(saved.tensors[f"leaf.{i}"], x.dtype).reshape(x.shape) for i, x in enumerate(old)
     ]
     now, best, rank = jax.tree.unflatten(structure, leaves)
@@ -255,7 +255,7 @@ def started(
 def _looked(
     env: Env, settings: GradientSettings, course: _Course, steps: float
 ) -> dict[str, float]:
-    """Looks at every policy and keeps the best; returns the mean of what was seen."""
+    """Validates every policy and keeps the best; returns the mean of the validations."""
     for s, curve in enumerate(course.curves):
         own = jax.tree.map(lambda x, s=s: x[s], course.now)
         seen = look(env, own.player.weights, settings.watch_episodes)
@@ -282,9 +282,9 @@ def _judged(env: Env, player: Network, keys: Key[Array, " plant"]) -> dict[str, 
 
 
 def rank(settings: GradientSettings, row: Mapping[str, float]) -> tuple[float, float]:
-    """How good a look was: the violation rate beyond the one allowed, then the worth.
+    """Rank of a validation: the violation rate beyond the allowed one, then the worth.
 
-    The first look, at a policy that learnt nothing yet, is the last choice.
+    The first validation, of an untrained policy, is the last choice.
     """
     too_many = max(0.0, row["violation_rate"] - settings.violation_rate)
     worth = -math.inf if math.isnan(row["worth"]) else row["worth"]
@@ -292,14 +292,14 @@ def rank(settings: GradientSettings, row: Mapping[str, float]) -> tuple[float, f
 
 
 def _optimiser(settings: GradientSettings) -> optax.GradientTransformation:
-    """Adam on clipped gradients; one that is not finite is left out and counted."""
+    """Adam on clipped gradients; a gradient that is not finite is left out and counted."""
     rate = optax.cosine_decay_schedule(settings.learning_rate, settings.num_updates)
     adam = optax.chain(optax.clip_by_global_norm(settings.max_grad_norm), optax.adam(rate))
     return optax.apply_if_finite(adam, max_consecutive_errors=settings.num_updates)
 
 
 def _first_weights(env: Env, settings: GradientSettings, key: PRNGKeyArray) -> Weights:
-    """Glorot's (X. Glorot, Y. Bengio, 2010), those of the last layer made small."""
+    """Glorot's weights (X. Glorot, Y. Bengio, 2010), those of the last layer made small."""
     widths = [env.layout.size, *settings.hidden, len(env.layout.input_half)]
     gains = [1.0] * len(settings.hidden) + [settings.last_gain]
     keys = jax.random.split(key, len(gains))

@@ -1,9 +1,9 @@
 """Proximal policy optimisation of Stable-Baselines3 on a batch of plants.
 
-Its VecEnv hands the batched Gymnasium environment through as it is: one compiled call a
-step, no loop over environments. Training can be stopped at any rollout boundary and resumed
-bit by bit: a checkpoint holds weights, Adam's moments, the running episodes and all random
-states, as tensors and JSON, never as a pickle.
+The VecEnv passes on the batched Gymnasium environment: one compiled call per step, no loop
+over environments. Training can be stopped at any rollout boundary and resumed bit by bit: a
+checkpoint holds weights, Adam's moments, the running episodes and all random states, as
+tensors and JSON, not as a pickle.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from .validation import look
 
 
 class BatchedVecEnv(VecEnv):
-    """The batched environment as Stable-Baselines3 wants it."""
+    """The batched environment as a VecEnv of Stable-Baselines3."""
 
     def __init__(self, env: ExperimentVectorEnv) -> None:
         self.env = env
@@ -49,11 +49,11 @@ class BatchedVecEnv(VecEnv):
         return observations
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Remembers the actions."""
+        """Stores the actions."""
         self._actions = actions
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, object]]]:
-        """One step of all; an episode that ended tells its last observation and its return."""
+        """One step of all; `info` of an ended episode has its last observation and its return."""
         observations, rewards, dones, _, final = self.env.step(self._actions)
         self.totals += rewards
         self.lengths += 1
@@ -69,7 +69,7 @@ class BatchedVecEnv(VecEnv):
         return observations, rewards.astype(np.float32), dones, infos
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Nothing to release."""
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[object]:
         """An attribute of the batch, once for every index."""
@@ -86,13 +86,13 @@ class BatchedVecEnv(VecEnv):
         raise NotImplementedError("the environments of a batch have no methods")
 
     def env_is_wrapped(self, wrapper_class: type, indices: VecEnvIndices = None) -> list[bool]:
-        """Never: wrappers of single environments do not apply."""
+        """Always False: wrappers of single environments do not apply."""
         return [False] * len(list(self._get_indices(indices)))
 
 
 @contextlib.contextmanager
 def _one_thread() -> Iterator[None]:
-    """Torch in one thread: its networks are small, and more threads wait for each other."""
+    """Limits torch to one thread: with small networks, more threads are slower."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -161,7 +161,7 @@ def policy_weights(model: PPO) -> Weights:
 
 
 class _Watcher(BaseCallback):
-    """At every rollout boundary: anneals the noise, looks at the policy, offers a checkpoint."""
+    """At every rollout boundary: anneals the noise, validates the policy, offers a checkpoint."""
 
     def __init__(self, env: Env, settings: PPOSettings, on_boundary: OnBoundary) -> None:
         super().__init__()
@@ -189,7 +189,7 @@ class _Watcher(BaseCallback):
 
     @property
     def weights(self) -> Weights:
-        """Of the policy as it would be delivered now."""
+        """Validation of the present policy."""
         model: Any = self.model
         return self.average if self.num_averaged else policy_weights(model)
 

@@ -1,4 +1,4 @@
-"""Hyper-parameters of both trainers; each field's type says what it may be."""
+"""Hyper-parameters of both trainers; the type of each field has its allowed values."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Annotated, NamedTuple, TypeAlias, get_args, get_type_hints
 
 
 class Rule(NamedTuple):
-    """What a hyper-parameter must be, in words and as a test."""
+    """Allowed values of a hyper-parameter, in words and as a test."""
 
     words: str
     holds: Callable[..., bool]
@@ -32,7 +32,7 @@ class _Checked:
     """Hyper-parameters that are checked by the rules of their types."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError for a value that is not allowed; None is, where it is a default."""
+        """Raises ValueError for a value that is not allowed; a default of None is allowed."""
         types = get_type_hints(type(self), include_extras=True)
         for field in fields(self):  # pyright: ignore[reportArgumentType]
             value, kind = getattr(self, field.name), types[field.name]
@@ -55,15 +55,15 @@ class GradientSettings(_Checked):
         learning_rate: of Adam, decaying to zero by a cosine.
         max_grad_norm: a longer gradient is scaled down to this norm.
         hidden: widths of the hidden layers, tanh.
-        last_gain: scale of the last layer's first weights; a loud first policy runs away.
+        last_gain: scale of the last layer's initial weights; with large ones training diverges.
         margin: the penalty begins at this fraction of a critical level.
         penalty_weight: of the penalty, at the beginning and at least.
         near: fraction of a critical level that counts as too near to it.
-        penalty_growth, penalty_decay: what is added to the weight's logarithm after a batch
-            of which more than `violation_rate` came too near, and taken away after another.
+        penalty_growth, penalty_decay: added to the weight's logarithm after a batch of which
+            more than `violation_rate` came too near; subtracted after any other batch.
         violation_rate: allowed on held-out plants.
-        watch_every: updates between two looks at the policy.
-        watch_episodes: episodes of such a look.
+        watch_every: updates between two validations of the policy.
+        watch_episodes: episodes of a validation.
     """
 
     num_updates: Count = 1000
@@ -84,7 +84,7 @@ class GradientSettings(_Checked):
 
 @dataclass(frozen=True)
 class PPOSettings(_Checked):
-    """Hyper-parameters, named as in Stable-Baselines3 and with its defaults where it has one.
+    """Hyper-parameters of PPO, with the names and defaults of Stable-Baselines3 where it has them.
 
     Attributes:
         total_steps: environment steps of the whole training, rounded up to whole rollouts.
@@ -95,14 +95,14 @@ class PPOSettings(_Checked):
         learning_rate, learning_rate_end: Adam's step, first and last, linear between;
             without an end it is constant.
         noise_sd, noise_sd_end: standard deviation of the exploration noise, in units of
-            the input limit, in the first rollout and in one that would follow the last,
-            geometric between; without an end it is learnt.
+            the input limit, in the first rollout and in one after the last, geometric
+            between; without an end it is learned.
         average_last: fraction of the training, at its end, over which the weights of the policy
             are averaged (B. Polyak, A. Juditsky, Acceleration of stochastic approximation by
             averaging, 1992); 0 is the last policy, as in Stable-Baselines3.
         hidden: widths of the hidden layers of policy and value function, tanh.
-        watch_every: rollouts between two looks at the deterministic policy.
-        watch_episodes: episodes of such a look.
+        watch_every: rollouts between two validations of the deterministic policy.
+        watch_episodes: episodes of a validation.
     """
 
     total_steps: Count = 1_000_000
@@ -136,7 +136,7 @@ class PPOSettings(_Checked):
             )
 
     def noise_at(self, progress: float) -> float | None:
-        """Exploration noise at a fraction of the training; None where it is learnt."""
+        """Exploration noise at a fraction of the training; None where it is learned."""
         if self.noise_sd_end is None:
             return None
         return self.noise_sd ** (1 - progress) * self.noise_sd_end**progress
@@ -144,4 +144,4 @@ class PPOSettings(_Checked):
     def learning_rate_at(self, remaining: float) -> float:
         """Learning rate at a remaining fraction of the training."""
         end = self.learning_rate if self.learning_rate_end is None else self.learning_rate_end
-        return end + (self.learning_rate - end) * max(remaining, 0.0)  # the last rollout is whole
+        return end + (self.learning_rate - end) * max(remaining, 0.0)  # full rollouts

@@ -1,10 +1,10 @@
-"""Open-loop signals by the gradient of the information they bring.
+"""Open-loop signals by the gradient of their information.
 
-`robust_signal` is designed for plants not known in advance, on average over the prior;
-`clairvoyant_signals` one for each plant as if its parameters were known: what no
-experiment can beat, and what others are measured by (L. Pronzato, A. Pazman, Design of
-Experiments in Nonlinear Models, 2013). Both search from several starts under the limits of
-inputs and outputs; a last line search along the amplitude takes a signal to the limit.
+`robust_signal` is designed on average over the prior of the plant. `clairvoyant_signals`
+are designed for each plant as if its parameters were known, as a reference for other
+methods (L. Pronzato, A. Pazman, Design of Experiments in Nonlinear Models, 2013). Both
+search locally from several starts under the limits of inputs and outputs; a line search
+then scales the amplitude up to the limit.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from .gradient import GradientSettings, Optimisation, Scores, experiments, updat
 
 
 def signal_env(plant: AbstractPlant, num_steps: int, spread: float, criterion: str = "D") -> Env:
-    """The decision process of a designer who sees nothing of the experiment.
+    """The decision process for signals that do not use the measurements.
 
-    All parameters count alike, as where information is reported.
+    All parameters have the same weight.
     """
     every = (True,) * len(plant.definition.parameters)
     objective = InformationGain(every, prior_sd_of(spread), criterion=criterion, dense=False)
@@ -39,12 +39,12 @@ def signal_env(plant: AbstractPlant, num_steps: int, spread: float, criterion: s
 
 
 CLAIRVOYANT = GradientSettings(num_updates=1500, learning_rate=0.03, margin=0.97, near=0.9975)
-"""Its outputs may come as near to the critical level as 0.9975 of it (39.9 of 40 degrees)."""
+"""Its outputs may reach 0.9975 of the critical level (39.9 of 40 degrees)."""
 
 ROBUST = GradientSettings(num_updates=1000, num_plants=32, learning_rate=0.03)
 
 NUM_JUDGES = 1000
-"""Plants that a robust signal is never trained on and must be safe for."""
+"""Number of plants, not used in the search, for which a robust signal must be safe."""
 
 AMPLITUDES = np.linspace(0.8, 1.04, 25)
 """Factors of the line search."""
@@ -61,7 +61,7 @@ class OpenLoop(eqx.Module):
 
 
 class _Played(eqx.Module):
-    """A signal as it is, within the input limits."""
+    """A fixed signal within the input limits."""
 
     actions: Float[Array, "*search time input"]
 
@@ -95,7 +95,7 @@ def clairvoyant_signals(
     *,
     seed: int = 0,
 ) -> FoundSignals:
-    """The best signal for each plant that these keys draw; the seed is that of the starts.
+    """The best signal for each plant drawn with these keys; the seed is that of the starts.
 
     Raises:
         ValueError: where no safe signal was found for a plant.
@@ -172,7 +172,7 @@ def _at_the_limit(
     by_start = worth.reshape(num_plants, -1)
     if np.any(np.isneginf(by_start.max(axis=1))):
         raise ValueError(
-            "no safe signal was found: each breaks a critical level on some plant; a smaller "
+            "no safe signal was found: each reaches a critical level on some plant; a smaller "
             "spread, a shorter experiment or a longer search may help"
         )
     num_starts = by_start.shape[1]

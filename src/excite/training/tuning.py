@@ -1,8 +1,8 @@
-"""Classical signals at their best: amplitude, band, clock, hold, phases, loop, by search.
+"""Tuning of classical signals: amplitude, band, clock, hold, phases, loop, by search.
 
-A comparison with a classical signal says little unless the signal was given its chance.
-The search (Optuna's tree-structured Parzen estimator) asks for the mean criterion over
-plants drawn from the prior, among signals that break no critical level.
+A comparison with a classical signal is fair only if the signal is tuned. The search
+(Optuna's tree-structured Parzen estimator) maximises the mean criterion over plants drawn
+from the prior, among signals that reach no critical level.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from ..safety import critical_levels, watched_output
 from .checkpoint import Progress
 
 VIOLATION_COST = 5000.0
-"""What the criterion loses when every experiment of a signal is a violation."""
+"""Penalty on the criterion when every experiment of a signal is a violation."""
 
 NEAR = 0.97
 """Fraction of a critical level that counts as a violation while tuning."""
 
 NUM_FINALISTS = 60
-"""Settings that are judged again on fresh plants, best first, until one is safe there too."""
+"""Number of best settings tested on new plants, until one is safe there too."""
 
 Options: TypeAlias = dict[str, float | bool | list[float]]
 """Options of an excitation, as study files have them."""
@@ -51,10 +51,10 @@ class Tuned:
 
     Attributes:
         excitation, options: as names and study files have them.
-        value: mean criterion over fresh plants.
-        violations: among as many fresh plants.
-        episodes: their number.
-        trials: tried settings.
+        value: mean criterion over new plants.
+        violations: on these plants.
+        episodes: number of these plants.
+        trials: number of settings tried.
     """
 
     excitation: str
@@ -65,11 +65,11 @@ class Tuned:
     trials: int
 
     def __str__(self) -> str:
-        """How to use it as an excitation on the command line, and what that is worth."""
+        """Its options on the command line, and its violations."""
         settings = ",".join(f"{k}={json.dumps(v)}" for k, v in self.options.items())
         return (
-            f"as an excitation, drawn or closed anew each time: --excitation {self.excitation} "
-            f"--set {settings}; {self.violations} violations on {self.episodes} fresh plants"
+            f"as an excitation, generated for each plant: --excitation {self.excitation} "
+            f"--set {settings}; {self.violations} violations on {self.episodes} new plants"
         )
 
 
@@ -82,15 +82,15 @@ def tuned_signal(
     seed: int = 0,
     report: Progress = lambda *_: None,
 ) -> Tuned:
-    """The best options of a classical excitation, judged again on plants it was not tuned on.
+    """The best options of a classical excitation, tested on plants not used in the search.
 
-    Of the best settings the first without a violation on 1000 fresh plants is taken,
-    or the one with the fewest.
+    Of the best settings the first without a violation on 1000 new plants is taken, or the
+    one with the fewest.
 
     Args:
-        env: the task of a designer, see `signal_env`.
+        env: the decision process, see `signal_env`.
         excitation: its name.
-        criterion: of the information, as everywhere.
+        criterion: of the information.
     """
     plant, num_steps = env.plant, env.layout.num_steps
     tuning, judging = jax.random.split(jax.random.key(seed))
@@ -133,12 +133,12 @@ def tuned_signal(
 
 
 def _cost(trial: FrozenTrial) -> float:
-    """What is sorted by: a trial without a value comes last."""
+    """Sorting key: a trial without a value comes last."""
     return np.inf if trial.value is None else -trial.value
 
 
 def _usual(plant: AbstractPlant, num_steps: int) -> Options:
-    """What the excitations do where nothing is said, the first trial of every search."""
+    """The default options, the first trial of every search."""
     d = plant.description
     halves = [(i.upper - i.lower) / 2 for i in d.inputs]
     amplitudes = {f"amplitude.{n}": i.amplitude / halves[n] for n, i in enumerate(d.inputs)}
@@ -162,7 +162,7 @@ def _suggested(
 
 
 def _amplitude(trial: optuna.Trial, plant: AbstractPlant) -> Options:
-    """One amplitude an input, from a hundredth of half the limits to all of it."""
+    """One amplitude per input, from a hundredth of half the width of its limits to all of it."""
     halves = [(i.upper - i.lower) / 2 for i in plant.definition.inputs]
     values = [
         half * trial.suggest_float(f"amplitude.{n}", 0.01, 1.0, log=True)
@@ -184,7 +184,7 @@ def _loop(trial: optuna.Trial, plant: AbstractPlant) -> Options:
 
 
 def _frequency(trial: optuna.Trial, plant: AbstractPlant, name: str, num_steps: int) -> float:
-    """Between one period an experiment and the sampling theorem."""
+    """A frequency between one period per experiment and the Nyquist frequency."""
     longest, nyquist = 1 / (num_steps * float(plant.dt)), 0.5 / float(plant.dt)
     return trial.suggest_float(name, longest, nyquist, log=True)
 
@@ -195,7 +195,7 @@ def _band(trial: optuna.Trial, plant: AbstractPlant, num_steps: int) -> Options:
 
 
 def _multisine(trial: optuna.Trial, plant: AbstractPlant, num_steps: int) -> Options:
-    """Its band must hold a harmonic: two of them at least."""
+    """A band wide enough for at least two harmonics."""
     low, high = sorted(_band(trial, plant, num_steps).values())
     high = min(max(high, 2 * low), 0.5 / float(plant.dt))
     phases = trial.suggest_categorical("phases", range(8))

@@ -1,4 +1,4 @@
-"""A look at the policy being trained: validation episodes without exploration noise."""
+"""Validation of the policy during training: episodes without exploration noise."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..environment import Env
 from ..policy import Weights, forward
 
 WATCH_SEED = 0x7A11DA7E
-"""Validation episodes, the same for all seeds, apart from training and every evaluation."""
+"""Seed of the validation episodes: the same for all trainings, not used elsewhere."""
 
 
 class Watched(eqx.Module):
@@ -61,7 +61,7 @@ def watch_keys(num_episodes: int) -> Key[Array, " episode"]:
 
 
 def look(env: Env, weights: Weights, num_episodes: int) -> dict[str, float]:
-    """What a learning curve shows of the deterministic policy, in the validation episodes."""
+    """A row of the learning curve: results of the deterministic policy in validation episodes."""
     seen = watch(env, weights, watch_keys(num_episodes))
     names = names_of(env.plant.definition.parameters)
     errors = np.asarray(seen.relative_errors).mean(axis=0)

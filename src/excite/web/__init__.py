@@ -1,9 +1,9 @@
-"""The bench page: choose an excitation, watch the identification happen, keep the result.
+"""The bench page: run experiments and identifications in a browser.
 
-This process serves and computes nothing: it loads neither JAX nor a plant, so that the page
-opens at once. Worker processes run `jobs` and tell what they find, event by event (`events`).
-`requests` checks what a browser asks, `security` guards every request, `sessions` keeps what
-belongs to a browser, `streams`, `places`, `runs` and `trainings` answer.
+The server does not compute: it loads neither JAX nor a plant, so that the page opens fast.
+Worker processes run `jobs` and send `events`. `requests` checks the content of a request,
+`security` its origin and session, `sessions` stores the data of each browser. `streams`,
+`places`, `runs` and `trainings` answer.
 """
 
 from __future__ import annotations
@@ -47,11 +47,11 @@ _STATIC = Path(__file__).with_name("static")
 def application(
     settings: PageSettings, scratch: Path, ready: Callable[[], None] = lambda: None
 ) -> Starlette:
-    """The page and everything it may ask for.
+    """The application: the page and its requests.
 
     Args:
-        scratch: an empty folder for what browsers upload and what is found for them.
-        ready: called when it answers.
+        scratch: an empty folder for uploads and results.
+        ready: called when the server answers.
     """
     workers, trainings = Workers(settings.num_workers, settings.cache), list[Training]()
     known = list[Catalogue]()
@@ -75,7 +75,7 @@ def application(
             async with contextlib.aclosing(workers.events("catalogue", {}, True)) as events:
                 known.extend([event async for event in events if event["kind"] == "catalogue"])
         if not known:
-            raise RefusedError(503, "the workers do not start; the terminal says why")
+            raise RefusedError(503, "the workers do not start; the terminal shows the reason")
         return JSONResponse(known[0])
 
     routes = [
@@ -98,9 +98,9 @@ def application(
 
 
 async def _session(request: Request) -> JSONResponse:
-    """Whether this browser may come in; lets it in where it shows the token, or none is needed."""
+    """Opens a session if the browser sends the token, or if none is needed."""
     asked = await _body(request)
-    if request.state.session is not None:  # it stays the one it is
+    if request.state.session is not None:  # the session is kept
         return JSONResponse({"is_known": True})
     cookie = request.state.enter(asked)
     headers = {} if cookie is None else {"set-cookie": cookie}
@@ -116,11 +116,11 @@ async def _body(request: Request) -> dict[str, object]:
             raise RefusedError(413, "the request is too large")
     try:
         asked = json.loads(bytes(content))
-        json.dumps(asked, ensure_ascii=False).encode()  # half a character is no text
+        json.dumps(asked, ensure_ascii=False).encode()  # refuses lone surrogates
     except (ValueError, RecursionError):
         asked = None
     if not isinstance(asked, dict):
-        raise RefusedError(400, "the request is no JSON object")
+        raise RefusedError(400, "the request is not a JSON object")
     return asked
 
 
@@ -132,7 +132,7 @@ def _refused(request: Request, error: Exception) -> JSONResponse:
 
 
 class _Server(uvicorn.Server):
-    """A server that a signal ends; what computes ends first, so that no request waits for it."""
+    """A server that a signal ends; the workers end first, so that no request waits for them."""
 
     def __init__(self, app: Starlette, came: list[int]) -> None:
         super().__init__(
@@ -148,24 +148,24 @@ class _Server(uvicorn.Server):
 
     @contextlib.contextmanager
     def capture_signals(self) -> Generator[None]:
-        """Leaves the signals to `serve`, which has to clean up after them."""
+        """Leaves signals to `serve`, which cleans up."""
         yield
 
     async def on_tick(self, counter: int) -> bool:
-        """Whether it is to end."""
+        """Whether the server must end."""
         return await super().on_tick(counter) or bool(self._came)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Ends what computes, then what serves."""
+        """Ends the workers, then the server."""
         await self._app.state.end_work()
         await super().shutdown(sockets)
 
 
 @contextlib.contextmanager
 def _signals() -> Generator[list[int]]:
-    """Ctrl-C, a closed terminal and a polite kill, as they come; none of them ends anything."""
+    """Collects SIGINT, SIGTERM and SIGHUP, which then do not end the process."""
     came = list[int]()
-    names = ("SIGINT", "SIGTERM", "SIGHUP")  # the last is unknown to Windows
+    names = ("SIGINT", "SIGTERM", "SIGHUP")  # Windows has no SIGHUP
     kinds = [getattr(signal, name) for name in names if hasattr(signal, name)]
     before = {kind: signal.signal(kind, lambda number, _: came.append(number)) for kind in kinds}
     try:
@@ -176,15 +176,15 @@ def _signals() -> Generator[list[int]]:
 
 
 def listening_at(host: str, port: int) -> socket.socket:
-    """A socket that listens; port 0 takes a free one.
+    """A listening socket; port 0 takes a free one.
 
     Raises:
-        ValueError: where there can be none.
+        ValueError: where the address cannot be used.
     """
     try:
         [family, kind, _, _, address] = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
     except (socket.gaierror, UnicodeError):
-        raise ValueError(f"{host!r} is no address of this computer") from None
+        raise ValueError(f"{host!r} is not an address of this computer") from None
     listening = socket.socket(family, kind)
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
@@ -200,7 +200,7 @@ def listening_at(host: str, port: int) -> socket.socket:
 
 
 def address_of(settings: PageSettings, listening: socket.socket) -> str:
-    """What a browser opens: the name of this computer where all its addresses are bound."""
+    """The address to open: the computer's name where all its addresses are bound."""
     host = settings.host
     if host in ("0.0.0.0", "::"):
         host = socket.gethostname().lower()
@@ -210,10 +210,10 @@ def address_of(settings: PageSettings, listening: socket.socket) -> str:
 
 
 def serve(settings: PageSettings, listening: socket.socket, ready: Callable[[], None]) -> int:
-    """Serves until a signal comes, on a socket that is bound already; calls `ready` at its start.
+    """Serves on a bound socket until a signal comes; calls `ready` at its start.
 
     Returns:
-        The exit code: 0 after Ctrl-C, which is how a page is ended, else that of the signal.
+        The exit code: 0 after Ctrl-C, else that of the signal.
     """
     folder = partial(tempfile.TemporaryDirectory, ignore_cleanup_errors=True)
     with _signals() as came, folder(prefix="excite-bench-") as scratch:

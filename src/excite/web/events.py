@@ -1,4 +1,4 @@
-"""What a worker is asked and tells, and what the page is told: one type for every kind of event.
+"""Types of the requests to workers, of their events, and of the events for the page.
 
 They are JSON from the worker to the browser: a number that is not finite is None there.
 """
@@ -8,9 +8,9 @@ from __future__ import annotations
 from typing import Literal, NotRequired, TypedDict
 
 Numbers = dict[str, float]
-"""By the name of a parameter or an output; NaN where there is none."""
+"""Number by the name of a parameter or an output; NaN where there is none."""
 Rows = list[list[float]]
-"""One row a sample, one column a channel."""
+"""One row per sample, one column per channel."""
 
 
 class ExperimentRequest(TypedDict):
@@ -37,26 +37,26 @@ class IdentificationRequest(TypedDict):
 
 
 class StartedEvent(TypedDict):
-    """A worker has begun."""
+    """A worker has started."""
 
     kind: Literal["started"]
 
 
 class EndEvent(TypedDict):
-    """Everything was told."""
+    """The last event of a completed call."""
 
     kind: Literal["end"]
 
 
 class FailedEvent(TypedDict):
-    """The call ended early."""
+    """The call failed."""
 
     kind: Literal["failed"]
     sentence: str
 
 
 class Catalogue(TypedDict):
-    """What can be chosen; a plant is its description, with `policies` that fit."""
+    """The choices of the page; each plant has its description and its `policies`."""
 
     kind: Literal["catalogue"]
     version: str
@@ -112,7 +112,7 @@ class Row(TypedDict):
 
 
 class Concluded(TypedDict):
-    """What the experiment asked for comes to; `result` names its files, for the browser."""
+    """Results of the requested experiment; `result` names its files."""
 
     kind: Literal["result"]
     row: Row
@@ -121,7 +121,7 @@ class Concluded(TypedDict):
 
 
 class Compared(TypedDict):
-    """Another excitation on the same plant."""
+    """Result of another excitation on the same plant."""
 
     kind: Literal["other"]
     row: Row
@@ -166,24 +166,24 @@ JobEvent = (
     StartedEvent | EndEvent | FailedEvent | Catalogue | Episode | Estimate | Concluded | Compared
     | LeftOut | Columns | Identified | Reported
 )  # fmt: skip
-"""What is told of a call."""
+"""Events of a call."""
 
 
 class Begun(TypedDict):
-    """The first of a stream: the name by which it is stopped."""
+    """The first event of a stream: the name by which it can be stopped."""
 
     kind: Literal["job"]
     job: str
 
 
 class Pulse(TypedDict):
-    """Nothing for a while: the stream lives."""
+    """Sent during long computations to keep the stream alive."""
 
     kind: Literal["pulse"]
 
 
 class Stopped(TypedDict):
-    """The browser has asked for it."""
+    """The browser has stopped the stream."""
 
     kind: Literal["stopped"]
 
@@ -209,4 +209,4 @@ class Samples(TypedDict):
 
 
 StreamEvent = JobEvent | Begun | Pulse | Stopped | Plan | Samples
-"""What a browser is told in a stream."""
+"""Events of a stream for a browser."""

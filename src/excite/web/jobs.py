@@ -1,8 +1,8 @@
-"""What the bench page asks for: experiments told as they happen, files identified, reports.
+"""Jobs of the bench page, run in workers: experiments, identification of files, reports.
 
-Every function here is a generator of JSON-ready events, so that whoever asked can show the
-first while the next is computed, and can stop in between. Plants, excitations and policies
-are taken by their shipped names only: a name from a browser must never become a file.
+Every function is a generator of JSON-ready events, so that the page can show the first while
+the next is computed, and can stop in between. Plants, excitations and policies are taken by
+their shipped names only: a name from a browser must never become a path.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ from .events import JobEvent as Event
 
 NUM_ESTIMATES = 20
 _FIRST = 40  # samples before the first estimate, the shortest horizon of the estimator
-_RECORD = "record.csv"  # name of a simulated record, here and in the command that makes it
-_MAX_POINTS = 2000  # more cannot be told apart on a screen
+_RECORD = "record.csv"  # name of a simulated record
+_MAX_POINTS = 2000  # more cannot be seen on a screen
 _MAX_COLUMNS, _MAX_NAME = 500, 200  # of an uploaded file, and characters of a column's name
 
 
@@ -82,7 +82,7 @@ def catalogue() -> Iterator[Event]:
 
 
 def warm_up() -> Iterator[Event]:
-    """Compiles what the page offers first, so that a worker's first run starts at once."""
+    """Compiles the default experiment, so that a worker's first run starts fast."""
     plant = PLANTS["aero2"]().definition
     asked: ExperimentRequest = {
         "plant": plant.name, "excitation": "chirp", "amplitude": plant.inputs[0].amplitude,
@@ -102,7 +102,7 @@ def _fits(policy: Policy, description: PlantDescription) -> bool:
 
 
 def _shown(description: PlantDescription) -> dict[str, object]:
-    """A description, with the unit in which people read each quantity, and its factor."""
+    """A description, with the display unit of each quantity and its factor."""
     data = description.to_dict()
     for part in (*data["inputs"], *data["outputs"]):
         part["shown_unit"], part["factor"] = display_unit(part["unit"])
@@ -113,10 +113,10 @@ def _shown(description: PlantDescription) -> dict[str, object]:
 
 
 def _experiment(asked: ExperimentRequest, name: str) -> Experiment:
-    """The experiment asked for, or the same with another excitation.
+    """The requested experiment, or the same with another excitation.
 
     Raises:
-        ValueError: for anything that is not known or not allowed.
+        ValueError: for an unknown name or a value that is not allowed.
     """
     allowed = [*EXCITATIONS, *(LOOP + n for n in EXCITATIONS), *shipped_policies()]
     if name not in allowed:
@@ -144,7 +144,7 @@ def _plant(name: str) -> AbstractPlant:
 
 
 def episode(asked: ExperimentRequest) -> Iterator[Event]:
-    """All samples of the experiment asked for: what there is to be shown first."""
+    """All samples of the requested experiment."""
     own = _experiment(asked, asked["excitation"])
     run, d = own.run(), own.plant.description
     yield {
@@ -160,10 +160,10 @@ def episode(asked: ExperimentRequest) -> Iterator[Event]:
 
 
 def followed(asked: ExperimentRequest, folder: str) -> Iterator[Event]:
-    """Estimates on the way, then the result, then two other excitations beside it.
+    """Running estimates, then the result, then the comparison with two other excitations.
 
-    The run folder of the identification is left at `folder`, the same as that of
-    `excite simulate` and `excite identify` one after the other.
+    The run folder of the identification is written to `folder`. It is the same as that of
+    `excite simulate` followed by `excite identify`.
     """
     own = _experiment(asked, asked["excitation"])
     run = own.run()
@@ -178,7 +178,7 @@ def followed(asked: ExperimentRequest, folder: str) -> Iterator[Event]:
         try:
             other = _experiment(asked, name)
             its_run = other.run()
-        except ValueError as error:  # the experiment asked for stands without it
+        except ValueError as error:  # the requested experiment is complete without it
             yield {"kind": "left_out", "excitation": name, "sentence": str(error)}
             continue
         its = running_information(other.plant, other.params, its_run.inputs)[-1]
@@ -186,7 +186,7 @@ def followed(asked: ExperimentRequest, folder: str) -> Iterator[Event]:
 
 
 def _estimates(own: Experiment, run: Trajectory, information: Array) -> Iterator[Event]:
-    """The estimate from the first samples, from more of them, and at last from all."""
+    """Estimates from growing numbers of samples, the last one from all."""
     plant, size = _plant(own.plant.definition.name), relative_size(own.plant, own.params)
     data = stack_experiments(plant, [run.inputs], [run.measured], True)
     free = jnp.ones(len(own.params), bool)
@@ -208,7 +208,7 @@ def _estimates(own: Experiment, run: Trajectory, information: Array) -> Iterator
 
 
 def _experiment_again(asked: ExperimentRequest) -> str:
-    """The commands that make the same run folder, one a line."""
+    """The commands that make the same run folder, one per line."""
     has_amplitude = asked["amplitude"] is not None and asked["excitation"] in EXCITATIONS
     simulate = [
         "excite", "simulate", asked["plant"], "--excitation", asked["excitation"],
@@ -232,25 +232,25 @@ def _identification_again(asked: IdentificationRequest, name: str) -> str:
 
 
 def _given(option: str, values: Mapping[str, object]) -> list[str]:
-    """An option with its assignments, numbers in full; nothing where there are none."""
+    """An option with its assignments, numbers with all digits; empty where there are none."""
     pairs = [f"{name}={value}".replace(",", "\\,") for name, value in values.items()]
     return [option, ",".join(pairs)] if pairs else []
 
 
 def _first(data: Experiments, count: int) -> Experiments:
-    """The experiment when so many samples were measured; nothing compiles again."""
+    """The experiment after some samples, padded so that nothing is compiled again."""
     return dataclasses.replace(data, valid=jnp.arange(data.valid.shape[1])[None] < count)
 
 
 def _outcome(
     own: Experiment, run: Trajectory, information: Array
 ) -> tuple[Row, Identification | None]:
-    """A row of the comparison, and what was identified, unless nothing could be."""
+    """A row of the comparison, and the identification; None where it failed."""
     plant, d = _plant(own.plant.definition.name), own.plant.description
     record = dataclasses.replace(own.record(run), source=_RECORD)
     result, sentence = None, ""
     try:
-        # The estimator knows the plant as shipped: it is told nothing of this one's noise.
+        # The estimator uses the shipped plant, not the noise of this one.
         result = identify(record, plant)
     except ValueError as error:
         sentence = str(error)
@@ -288,7 +288,7 @@ def _by_name(parts: Sequence[Parameter | Output], values: Iterable[ArrayLike]) -
 
 def columns(folder: str, name: str) -> Iterator[Event]:
     """The columns of an uploaded file, and how many samples each has."""
-    with contextlib.chdir(folder):  # so that sentences say the file's name, not where it lies
+    with contextlib.chdir(folder):  # so that messages have the file's name without its folder
         table = columns_in(Path(name))
     if not table:
         raise ValueError(f"{name} has no column of numbers")
@@ -303,7 +303,7 @@ def columns(folder: str, name: str) -> Iterator[Event]:
 def identified(
     asked: IdentificationRequest, source: str, name: str, folder: str
 ) -> Iterator[Event]:
-    """Parameters from an uploaded file; leaves a run folder as `excite identify` does."""
+    """Parameters from an uploaded file; writes a run folder like `excite identify`."""
     with contextlib.chdir(source):
         result = identify(
             Path(name),

@@ -1,4 +1,4 @@
-"""Uploads and results of one browser, which no other can reach, and reports of runs."""
+"""Uploads and results of a browser, which others cannot reach, and reports of runs."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _DOWNLOADS = {
 
 
 def routes(workers: Workers, run_of: Callable[[Request], Path]) -> list[Route]:
-    """What takes files, and gives results back.
+    """Routes that receive files and return results.
 
     Args:
         run_of: the run in the run folder that a request names.
@@ -60,13 +60,13 @@ def routes(workers: Workers, run_of: Callable[[Request], Path]) -> list[Route]:
         session: Session = request.state.session
         with session.using(request.path_params["name"]) as folder:
             if not (folder / "run").is_dir():
-                raise RefusedError(404, "there is nothing to report of yet")
+                raise RefusedError(404, "there is no result to report yet")
             return await _reported(workers, session, folder / "run")
 
     async def run_report(request: Request) -> Response:
         run = run_of(request)
         if any(path.is_symlink() for path in run.rglob("*")):
-            raise RefusedError(422, "this run holds links, which the page does not follow")
+            raise RefusedError(422, "this run contains links, which the page does not follow")
         return await _reported(workers, request.state.session, run)
 
     return [
@@ -78,7 +78,7 @@ def routes(workers: Workers, run_of: Callable[[Request], Path]) -> list[Route]:
 
 
 async def _reported(workers: Workers, session: Session, run: Path) -> Response:
-    """The report of a run, made in a folder that goes at once."""
+    """The report of a run, made in a temporary folder."""
     job = session.begin()
     try:
         with tempfile.TemporaryDirectory(dir=session.folder) as folder:
@@ -91,7 +91,7 @@ async def _reported(workers: Workers, session: Session, run: Path) -> Response:
     return Response(
         content,
         media_type="text/html",
-        # It is a file to be kept; shown here, it could not run or load anything.
+        # For download only; shown in the browser it could not run or load anything.
         headers={
             "content-disposition": 'attachment; filename="report.html"',
             "content-security-policy": "sandbox; default-src 'none'",
@@ -100,7 +100,7 @@ async def _reported(workers: Workers, session: Session, run: Path) -> Response:
 
 
 def _file_name(name: str) -> str:
-    """The name of an uploaded file as its owner knows it, freed of what is no part of a name."""
+    """The name of an uploaded file, without folders and control characters."""
     if not name.lower().endswith((".csv", ".mat")):
         raise RefusedError(415, "experiment files end in .csv or .mat")
     plain = "".join(c if c.isprintable() and c not in "/\\" else "_" for c in name)
@@ -108,21 +108,21 @@ def _file_name(name: str) -> str:
 
 
 def _stored(scratch: Path) -> int:
-    """Bytes that are kept for all browsers."""
+    """Bytes stored for all browsers."""
     size = 0
     for file in scratch.rglob("*"):
-        with contextlib.suppress(OSError):  # another worker's, gone by now
+        with contextlib.suppress(OSError):  # removed in the meantime
             size += file.stat().st_size
     return size
 
 
 async def _receive(request: Request, path: Path, scratch: Path) -> None:
-    """Writes the body of a request, which is read no further than it is allowed to be long."""
+    """Writes the body of a request, up to the allowed length."""
     too_large = RefusedError(413, f"the file is larger than {MAX_UPLOAD >> 20} MiB")
     if int(request.headers.get("content-length") or 0) > MAX_UPLOAD:
         raise too_large
     if _stored(scratch) > MAX_STORED:
-        raise RefusedError(507, "too much is kept here for all browsers; try again later")
+        raise RefusedError(507, "the server's storage is full; try again later")
     parts = request.stream()
     try:
         with path.open("wb") as file:
@@ -131,9 +131,9 @@ async def _receive(request: Request, path: Path, scratch: Path) -> None:
                 if file.tell() > MAX_UPLOAD:
                     raise too_large
     except TimeoutError:
-        raise RefusedError(408, "the file stopped coming") from None
+        raise RefusedError(408, "the upload stopped") from None
     except OSError as error:
-        raise RefusedError(507, f"the file cannot be kept ({error.strerror})") from None
+        raise RefusedError(507, f"the file cannot be stored ({error.strerror})") from None
     if not path.stat().st_size:
         raise RefusedError(400, "the file is empty")
 

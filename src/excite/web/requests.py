@@ -1,4 +1,4 @@
-"""What a browser asks, checked: words, numbers and limits; a refusal is one sentence."""
+"""Checks of the content of requests: names, numbers and limits; an error is one sentence."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from collections.abc import Awaitable, Callable, Mapping
 from starlette.requests import Request
 
 MAX_UPLOAD = 32 * 2**20
-"""Bytes of an uploaded file."""
+"""Largest size of an uploaded file [bytes]."""
 MAX_STEPS = 5000
-"""Samples of a simulated experiment."""
+"""Largest number of samples of a simulated experiment."""
 MAX_BODY = 64 * 2**10
-"""Bytes of a request that is no upload."""
+"""Largest size of a request that is not an upload [bytes]."""
 
 Asked = Mapping[str, object]
-"""What a browser sends, as JSON."""
+"""The content of a request, as JSON."""
 Body = Callable[[Request], Awaitable[dict[str, object]]]
 """Reads it."""
 
@@ -25,7 +25,7 @@ _WORD = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
 
 
 def without_folders(sentence: str) -> str:
-    """A sentence that names files, and not where on this computer they lie."""
+    """A sentence with the names of files but without their folders."""
     return _FOLDERS.sub("", sentence)
 
 
@@ -41,15 +41,15 @@ class RefusedError(Exception):
 
 
 def word(asked: Asked, key: str) -> str:
-    """A name without dots, slashes and colons: never a path, never a file."""
+    """A name without dots, slashes and colons, so that it is never a path."""
     value = asked.get(key)
     if not (isinstance(value, str) and _WORD.fullmatch(value)):
-        raise RefusedError(400, f"{key}: the name of something that is shipped is needed")
+        raise RefusedError(400, f"{key}: a shipped name is needed")
     return value
 
 
 def number(asked: Asked, key: str, lower: float, upper: float) -> float:
-    """A finite number of a range."""
+    """A finite number in a range."""
     value = asked.get(key)
     if isinstance(value, bool) or not isinstance(value, int | float) or not _is_finite(value):
         raise RefusedError(400, f"{key}: a number is needed")
@@ -66,7 +66,7 @@ def _is_finite(value: float) -> bool:
 
 
 def whole(asked: Asked, key: str, lower: int, upper: int) -> int:
-    """A whole number of a range."""
+    """A whole number in a range."""
     value = number(asked, key, lower, upper)
     if value != int(value):
         raise RefusedError(400, f"{key} must be a whole number: got {value:g}")

@@ -1,7 +1,7 @@
-"""The run folder, to be looked at: what it holds is listed, and only what is listed is served.
+"""The run folder: its runs are listed, and only listed files are served.
 
-A name from a browser is looked up among the names found by walking the folder; it is never
-made into a path. Links are not followed.
+A name from a browser is looked up among the names found by walking the folder; it never
+becomes a path. Links are not followed.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _DEPTH, _MAX_RUNS, _MAX_CURVES, _MAX_TEXT = 4, 500, 256, 4 * 2**20
 
 
 def routes(folder: Path) -> list[Route]:
-    """What shows the run folder."""
+    """Routes that show the run folder."""
 
     def listed(request: Request) -> JSONResponse:
         del request
@@ -74,12 +74,12 @@ def run_of(folder: Path, request: Request) -> Path:
     runs = found(folder)
     name = request.query_params.get("name", "")
     if name not in runs:
-        raise RefusedError(404, "the run folder holds no such run")
+        raise RefusedError(404, "the run folder has no such run")
     return runs[name]
 
 
 def _files(run: Path) -> dict[str, Path]:
-    """Files of a run that may be looked at, by name; those of finished seeds too."""
+    """Files of a run that are served, by name, also those of finished seeds."""
 
     def each() -> Iterator[Path]:
         yield from run.iterdir()
@@ -93,13 +93,13 @@ def _files(run: Path) -> dict[str, Path]:
 
 
 def _is_inside(path: Path, run: Path) -> bool:
-    """Whether this is a file of the run itself: no link, nor behind one."""
+    """Whether this is a file in the run's folder, not reached by a link."""
     inside = not path.is_symlink() and path.resolve().is_relative_to(run.resolve())
     return inside and path.is_file()
 
 
 def _text(run: Path, name: str) -> str:
-    """Content of a file of a run; empty where it is missing, damaged, too long or elsewhere."""
+    """Content of a file of a run; empty where it is missing, damaged, too long or a link."""
     path = run / name
     try:
         if not _is_inside(path, run) or path.stat().st_size > _MAX_TEXT:
@@ -132,7 +132,7 @@ def _summary(name: str, run: Path) -> dict[str, object]:
 
 
 def _content(run: Path) -> dict[str, object]:
-    """What a run shows: its table as it was written, or its estimate, and its files."""
+    """Content of a run for the page: its table or estimate, and its files."""
     files = _files(run)
     return {
         **_summary(run.name, run),
@@ -155,7 +155,7 @@ def _table(text: str) -> dict[str, object]:
 
 
 def _curves(run: Path) -> list[dict[str, object]]:
-    """Learning curves of the finished seeds; those of bounds are told from those of errors."""
+    """Learning curves of the finished seeds; those of bounds are marked."""
     bounds = _json(run, "table.json").get("bound_curves")
     bounds = bounds if isinstance(bounds, list) else []
     agents = _json(run, "study.json").get("agents")

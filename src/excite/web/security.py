@@ -1,10 +1,9 @@
-"""What every request has to pass: the Host, where it comes from, who sends it; and headers.
+"""Checks of every request: Host, origin, session; and headers of every response.
 
-The page answers to the name it is bound to and no other, so that a foreign name that is
-made to point here (DNS rebinding) reads nothing. What changes anything must come from the
-page itself, and every browser has a secret that the page's own scripts cannot read. Only the
-page's own request makes one, after the token where there is one: whoever is led here by a
-link in a foreign page, which no such cookie goes along with, keeps the one he has.
+The server answers only to the name to which it is bound, which prevents DNS rebinding. A
+request that changes anything must come from the page itself. Every browser has a secret in
+a cookie that scripts cannot read. Only a request of the page makes one, after the token if
+there is one. A link from another site, which does not send the cookie, does not replace it.
 """
 
 from __future__ import annotations
@@ -27,11 +26,11 @@ from .requests import Asked, RefusedError
 from .sessions import PageSettings, Session, Sessions, is_loopback
 
 MAX_TRIES = 10
-"""Wrong tokens in a minute, from one address."""
+"""Allowed number of wrong tokens per minute from one address."""
 _MAX_SOURCES = 4096
 _LOCAL = ("localhost", "127.0.0.1", "::1")
 _OPEN = ("/", "/api/session")
-"""What is answered before a token is shown: the page itself, which says nothing, and the door."""
+"""Paths that need no session: the static page, and the request with the token."""
 _LOG = logging.getLogger(__name__)
 _HEADERS = {
     "content-security-policy": "default-src 'self'; object-src 'none'; base-uri 'none'; "
@@ -45,13 +44,13 @@ _HEADERS = {
 
 
 class Guard:
-    """Refuses what does not come from the page, and hands sessions out."""
+    """Refuses requests that do not come from the page, and opens sessions."""
 
     def __init__(self, app: ASGIApp, settings: PageSettings, sessions: Sessions) -> None:
         self._app, self._settings, self._sessions = app, settings, sessions
         self._wrong: dict[str, deque[float]] = {}
         self._names = {settings.host, *_LOCAL}
-        if not is_loopback(settings.host):  # looked up once: a name server may be slow
+        if not is_loopback(settings.host):  # looked up once, because a name server may be slow
             self._names |= {socket.gethostname().lower(), socket.getfqdn().lower()}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -84,19 +83,19 @@ class Guard:
             name, port = "", 0
         bound = scope.get("server") or ("", port)
         if len(hosts) != 1 or port != bound[1] or not self._is_own(name):
-            raise RefusedError(421, "this is not the address that the bench page answers to")
+            raise RefusedError(421, "the bench page does not answer to this address")
 
     def _is_own(self, name: str) -> bool:
         host = self._settings.host
         if name in self._names or is_loopback(host):
             return name in self._names
-        try:  # a number cannot be made to point elsewhere
+        try:  # an IP address needs no DNS
             return ipaddress.ip_address(host).is_unspecified and bool(ipaddress.ip_address(name))
         except ValueError:
             return False
 
     def _session(self, headers: Headers, scope: Scope) -> Session | None:
-        """The session whose secret the browser shows."""
+        """The session of the secret in the browser's cookie."""
         try:
             morsel = SimpleCookie(headers.get("cookie", "")).get(_cookie(scope))
         except CookieError:
@@ -105,11 +104,11 @@ class Guard:
 
     def _stranger(self) -> RefusedError:
         if self._settings.token is None:
-            return RefusedError(403, "this browser is not known here; open the page again")
-        return RefusedError(401, "the token is needed; it was printed where the page was started")
+            return RefusedError(403, "this browser has no session; open the page again")
+        return RefusedError(401, "the token is needed; `excite serve` printed it")
 
     def _enter(self, asked: Asked, scope: Scope) -> str | None:
-        """The cookie of a new session; None where the token is needed and was not shown.
+        """The cookie of a new session; None where the token is needed and was not sent.
 
         Raises:
             RefusedError: for a wrong token, or after too many of them.
@@ -122,7 +121,7 @@ class Guard:
 
     def _check_token(self, token: object, own: str, source: str) -> None:
         now = time.monotonic()
-        # The others' tries do not count: nobody can lock out who knows the token.
+        # Attempts are counted by address, so that a client with the token is not locked out.
         self._wrong = {s: w for s, w in self._wrong.items() if now - w[-1] < 60}
         wrong = self._wrong.get(source, deque(maxlen=MAX_TRIES))
         if len(wrong) == MAX_TRIES and now - wrong[0] < 60:
@@ -132,7 +131,7 @@ class Guard:
         wrong.append(now)
         if len(self._wrong) < _MAX_SOURCES:
             self._wrong[source] = wrong
-        raise RefusedError(401, "this is not the token")
+        raise RefusedError(401, "wrong token")
 
 
 def _is_open(path: str) -> bool:
@@ -140,23 +139,23 @@ def _is_open(path: str) -> bool:
 
 
 def _cookie(scope: Scope) -> str:
-    """Its name: cookies are shared by all ports of a computer, and each server has its own."""
+    """The cookie's name, with the port, because all ports of a computer share cookies."""
     return f"excite_{(scope.get('server') or ('', 0))[1]}"
 
 
 def _source(scope: Scope) -> str:
-    """Where a request comes from; of version 6 the network, for a computer has many of them."""
+    """Address of a request; for IPv6 its network, because a computer has many addresses."""
     address = (scope.get("client") or ("", 0))[0]
     try:
         number = ipaddress.ip_address(address)
     except ValueError:
         return address
-    number = getattr(number, "ipv4_mapped", None) or number  # of version 4, to a socket of 6
+    number = getattr(number, "ipv4_mapped", None) or number  # IPv4 on an IPv6 socket
     return str(ipaddress.ip_network((number, 64 if number.version == 6 else 32), strict=False))
 
 
 async def _answered(app: ASGIApp, scope: Scope, receive: Receive, send: Send) -> None:
-    """Passes a request on; a defect is one sentence for the user, the rest for the terminal."""
+    """Passes a request on; on an internal error the user gets one sentence, the log the rest."""
     is_begun = False
 
     async def answer(message: Message) -> None:
@@ -166,18 +165,18 @@ async def _answered(app: ASGIApp, scope: Scope, receive: Receive, send: Send) ->
 
     try:
         await app(scope, receive, answer)
-    except ClientDisconnect:  # nobody waits for an answer
+    except ClientDisconnect:  # the client has left
         return
     except Exception:
         if is_begun:  # the connection has to break
             raise
         _LOG.exception("a request failed")
-        sentence = "the server has failed at this request; its terminal says why"
+        sentence = "the server failed at this request; its terminal shows the reason"
         await JSONResponse({"sentence": sentence}, 500)(scope, receive, send)
 
 
 def _check_origin(headers: Headers, scope: Scope) -> None:
-    """What changes something, or costs something, is asked for by the page itself."""
+    """Raises RefusedError where a request that changes or computes is not from the page."""
     site, origin = headers.get("sec-fetch-site"), headers.get("origin")
     own = f"http://{headers.get('host', '')}"
     if scope["method"] in ("GET", "HEAD"):

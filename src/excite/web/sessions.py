@@ -1,4 +1,4 @@
-"""How the page is served, and what it keeps for every browser."""
+"""Settings of the server, and the data it stores for every browser."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from .requests import RefusedError
 from .trainings import Training
 
 MAX_JOBS = 4
-"""Jobs that a browser may run at once."""
+"""Largest number of jobs that a browser may run at once."""
 MAX_SESSIONS = 256
 MAX_STORED = 2 * 2**30
-"""Bytes of what is kept for all browsers, beyond which no more is uploaded."""
+"""Limit of the data stored for all browsers [bytes]; beyond it uploads are refused."""
 MAX_KEPT = 8
-"""Results, and likewise uploads, that are kept for a browser; what was used last stays."""
+"""Number of results, and of uploads, stored for a browser; the oldest is removed first."""
 
 
 @dataclass(frozen=True)
 class PageSettings:
-    """How the page is served.
+    """Settings of the server.
 
     Attributes:
-        runs: the run folder; nothing outside of it is ever shown.
-        host: the address that is bound to.
-        token: what a browser must know; None where everybody on this computer may.
-        num_workers: processes that compute.
+        runs: the run folder; nothing outside of it is shown.
+        host: the address to listen on.
+        token: that a browser must send; None for no token.
+        num_workers: number of worker processes.
         cache: where they keep compiled programs.
     """
 
@@ -48,7 +48,7 @@ class PageSettings:
     def of(
         cls, runs: Path, host: str, token: str | None, workers: int | None, cache: Path
     ) -> PageSettings:
-        """Checked; a token is drawn where other computers may come, and a worker a core, at most 4.
+        """Checked settings; by default a token for other computers, one worker per core, at most 4.
 
         Raises:
             ValueError: for a short token, or a run folder that does not exist.
@@ -56,14 +56,14 @@ class PageSettings:
         if token is not None and len(token) < 8:
             raise ValueError("a token needs eight characters or more")
         if not runs.is_dir():
-            raise ValueError(f"{runs}: no such folder; --runs names the run folder to be shown")
+            raise ValueError(f"{runs}: no such folder; --runs names the run folder to show")
         if token is None and not is_loopback(host):
             token = secrets.token_urlsafe(16)
         return cls(runs.absolute(), host, token, workers or min(4, num_cores()), cache)
 
 
 def is_loopback(host: str) -> bool:
-    """Whether an address is of this computer alone."""
+    """Whether only this computer can reach an address."""
     if host == "localhost":
         return True
     try:
@@ -77,9 +77,9 @@ class Place:
     """A folder for an upload or a result.
 
     Attributes:
-        kind: "upload" or "result"; each gives way to its own kind alone.
-        num_users: how many jobs need it now.
-        is_done: whether it holds what it was made for.
+        kind: "upload" or "result"; each is replaced only by its kind.
+        num_users: number of jobs that use it.
+        is_done: whether its content is complete.
     """
 
     folder: Path
@@ -90,11 +90,11 @@ class Place:
 
 @dataclass
 class Session:
-    """One browser that may come in: what it may see, and nobody else.
+    """The session of one browser, and the data that only this browser can see.
 
     Attributes:
         folder: its uploads and results.
-        stops: how to stop each running job, by its name; None for a short one.
+        stops: functions that stop the running jobs, by name; None for a short one.
         kept: results and uploads by name, the one used last at the end.
         trainings: trainings it has started, by name.
     """
@@ -107,7 +107,7 @@ class Session:
 
     @contextlib.contextmanager
     def making(self, kind: str) -> Iterator[tuple[str, Place]]:
-        """A name that cannot be guessed, and its place, which goes where it is not done."""
+        """A new folder with a name that cannot be guessed; it is removed if not completed."""
         name, folder = secrets.token_urlsafe(12), Path(tempfile.mkdtemp(dir=self.folder))
         place = self.kept[name] = Place(folder, kind)
         self._give_way(kind, name)
@@ -120,11 +120,11 @@ class Session:
 
     @contextlib.contextmanager
     def using(self, name: str) -> Iterator[Path]:
-        """The folder of a result or upload of this browser, which stays for that long."""
+        """The folder of a result or upload of this browser, not removed while in use."""
         place = self.kept.pop(name, None)
         if place is None:
-            raise RefusedError(404, "there is no such result in this browser; run it again")
-        self.kept[name] = place  # the last one now
+            raise RefusedError(404, "this browser has no such result; run it again")
+        self.kept[name] = place  # now the last one
         place.num_users += 1
         try:
             yield place.folder
@@ -132,7 +132,7 @@ class Session:
             place.num_users -= 1
 
     def _give_way(self, kind: str, new: str) -> None:
-        """Removes what was not used for longest, and is not in use, where there is too much."""
+        """Removes the folders unused for longest, except those in use, where there are too many."""
         same = [name for name, place in self.kept.items() if place.kind == kind]
         free = [name for name in same if not self.kept[name].num_users and name != new]
         for name in free[: max(0, len(same) - MAX_KEPT)]:
@@ -143,7 +143,7 @@ class Session:
 
     @property
     def is_empty(self) -> bool:
-        """Whether nothing would be lost with it."""
+        """Whether it holds no data."""
         return not (self.kept or self.trainings)
 
     @property
@@ -152,7 +152,7 @@ class Session:
         return not (self.stops or any(t.is_running for t in self.trainings.values()))
 
     def begin(self, stop: asyncio.Event | None = None) -> str:
-        """The name of one more job that runs, until `end`.
+        """The name of a new job, which runs until `end`.
 
         Raises:
             RefusedError: where too many run already.
@@ -164,7 +164,7 @@ class Session:
         return name
 
     def end(self, name: str) -> None:
-        """That job is over."""
+        """Ends the entry of a job."""
         self.stops.pop(name, None)
 
 
@@ -182,14 +182,14 @@ class Sessions:
         return session
 
     def new(self) -> str:
-        """The secret of a new session; where there are too many, an idle one gives way.
+        """The secret of a new session; where there are too many, an idle one is removed.
 
-        Empty ones go before those that hold results, and then those that rested for longest.
+        Empty sessions are removed first, then those unused for longest.
         """
         idle = [secret for secret, session in self._all.items() if session.is_idle]
         if len(self._all) >= MAX_SESSIONS:
             if not idle:
-                raise RefusedError(503, "too many browsers are working here")
+                raise RefusedError(503, "too many browsers have running jobs")
             gone = min(idle, key=lambda s: (not self._all[s].is_empty, self._all[s].seen))
             shutil.rmtree(self._all.pop(gone).folder, ignore_errors=True)
         secret = secrets.token_urlsafe(32)

@@ -1,7 +1,7 @@
 """Experiments and identifications as streams of events, one JSON object a line.
 
-A simulated experiment is computed faster than anybody can look. It is played: its samples
-leave at an even pace, and every estimate not before the sample it was made at.
+A simulated experiment is computed faster than real time and then played: samples are sent at
+an even pace, and an estimate not before the sample at which it was made.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from .workers import Workers
 
 FRAME = 0.04
 """Seconds between two parts of a stream."""
-_PULSE = 1.0  # seconds after which a silent stream says that it lives
+_PULSE = 1.0  # seconds without an event, then a pulse is sent
 
 Events = AsyncGenerator[StreamEvent]
 
 
 def routes(workers: Workers, body: Body) -> list[Route]:
-    """What starts and stops an experiment or an identification.
+    """Routes that start and stop an experiment or an identification.
 
     Args:
         body: reads a request's JSON.
@@ -59,7 +59,7 @@ def routes(workers: Workers, body: Body) -> list[Route]:
         stops: dict[str, asyncio.Event | None] = request.state.session.stops
         asked = stops.get(request.path_params["job"])
         if asked is None:
-            raise RefusedError(404, "this browser runs no such job")
+            raise RefusedError(404, "this browser has no such job")
         asked.set()
         return JSONResponse({"stopped": True})
 
@@ -71,7 +71,7 @@ def routes(workers: Workers, body: Body) -> list[Route]:
 
 
 def _experiment(asked: Asked) -> ExperimentRequest:
-    """An experiment as `excite.web.jobs` takes it: checked names and numbers, nothing else."""
+    """An experiment for `excite.web.jobs`: only checked names and numbers."""
     others = asked.get("others")
     if not isinstance(others, list) or len(others) > 2:
         raise RefusedError(400, "others: at most two excitations can be compared")
@@ -99,7 +99,7 @@ def _identification(asked: Asked) -> IdentificationRequest:
 
 
 def _streamed(session: Session, events: Callable[[asyncio.Event], Events]) -> StreamingResponse:
-    """A response that goes on until the events end, or the browser stops or leaves."""
+    """A response that continues until the events end, or the browser stops or leaves."""
     stop = asyncio.Event()
     job = session.begin(stop)
 
@@ -122,7 +122,7 @@ def _line(event: StreamEvent) -> str:
 
 
 async def _lively(events: AsyncGenerator[JobEvent], stop: asyncio.Event) -> Events:
-    """The same events; a pulse where there is none for long; the end where asked to stop."""
+    """The events, with a pulse during long pauses, and an end when the browser stops."""
     stopped = asyncio.ensure_future(stop.wait())
     following = None
     try:
@@ -175,7 +175,7 @@ async def _played(
     seconds: float,
     stop: asyncio.Event,
 ) -> Events:
-    """The samples at their pace, estimates among them, then what the rest comes to."""
+    """Samples at their pace with estimates between them, then the remaining events."""
     shown = None
     async with aclosing(_lively(workers.events("episode", {"asked": asked}, True), stop)) as events:
         async for event in events:
@@ -199,7 +199,7 @@ async def _played(
 async def _followed(
     workers: Workers, arguments: Mapping[str, object], player: _Player, stop: asyncio.Event
 ) -> Events:
-    """Frames of samples, and what is found from them."""
+    """Frames of samples, and the results."""
     waiting = asyncio.Queue[JobEvent]()
 
     async def follow() -> None:
@@ -218,12 +218,12 @@ async def _followed(
 
 
 async def _mixed(player: _Player, waiting: asyncio.Queue[JobEvent], stop: asyncio.Event) -> Events:
-    """Frames of samples with the estimates made until then; afterwards whatever comes."""
+    """Frames of samples with the estimates up to then; afterwards all events."""
     early, silent = list[JobEvent](), 0.0
     while not stop.is_set():
         while not waiting.empty():
             early.append(waiting.get_nowait())
-            if early[-1]["kind"] == "failed":  # nothing is to be waited for
+            if early[-1]["kind"] == "failed":  # no more events will come
                 player.hurry()
         if (frame := player.frame()) is not None:
             yield frame
@@ -242,14 +242,14 @@ async def _mixed(player: _Player, waiting: asyncio.Queue[JobEvent], stop: asynci
 
 
 class _Player:
-    """How much of an experiment was shown so far."""
+    """State of the playback of an experiment."""
 
     def __init__(self, shown: Episode, seconds: float) -> None:
         self._shown, self._seconds, self._sent = shown, seconds, 0
         self._start = asyncio.get_running_loop().time()
 
     def plan(self) -> Plan:
-        """What is known before the first sample."""
+        """The plan of the experiment, before the first sample."""
         shown = self._shown
         return {
             "kind": "plan",
@@ -266,7 +266,7 @@ class _Player:
         return self._sent == len(self._shown["time"])
 
     def allows(self, event: JobEvent) -> bool:
-        """Whether an event may be shown: not before the sample it was made at, or the last."""
+        """Whether an event may be shown: not before its sample, or the last one."""
         return self.is_over or (event["kind"] == "estimate" and event["k"] < self._sent)
 
     def hurry(self) -> None:
@@ -274,7 +274,7 @@ class _Player:
         self._seconds = 0.0
 
     def frame(self) -> Samples | None:
-        """The samples that are due."""
+        """Samples that are due."""
         total, elapsed = len(self._shown["time"]), asyncio.get_running_loop().time() - self._start
         part = 1.0 if self._seconds == 0 else min(1.0, elapsed / self._seconds)
         due = slice(self._sent, math.ceil(part * total))

@@ -1,7 +1,7 @@
-"""Trainings: `excite train`, started and interrupted as at the command line.
+"""Trainings: processes of `excite train`, started and interrupted as in a terminal.
 
-A training goes on when its page is closed, and ends with the server, however that ends.
-Interrupted, it keeps its checkpoint, and the same command goes on from there.
+A training continues when its page is closed, and ends with the server. An interrupted
+training keeps its checkpoint; rerun the same command to resume.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from .requests import Asked, Body, RefusedError, number, whole, without_folders,
 
 MAX_TRAININGS = 2
 _PATIENCE = 10.0  # seconds for a training to end when it is interrupted
-_MAX_ROWS = 500  # of a learning curve; of a longer one every second row is let go
+_MAX_ROWS = 500  # of a learning curve; a longer one is thinned to every second row
 _STEP_BACK = """
 import ctypes, os, signal, sys
 if hasattr(os, "nice"):
-    os.nice(10)  # what is being watched comes first
+    os.nice(10)  # experiments on the page have priority
 if sys.platform == "linux":  # a server that is killed interrupts its trainings
     PR_SET_PDEATHSIG = 1
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGINT)
-    if os.getppid() != int(sys.argv[1]):  # it was killed meanwhile
+    if os.getppid() != int(sys.argv[1]):  # the server was killed in the meantime
         sys.exit(1)
 os.execv(sys.executable, [sys.executable, "-m", "excite", *sys.argv[2:]])
 """
@@ -44,9 +44,9 @@ class TrainingStatus(TypedDict):
     """A training as the page shows it.
 
     Keys:
-        sentence: why it failed.
+        sentence: the error of a failed training.
         curve: rows of its learning curve; None for a number that is not finite.
-        is_bound: whether the curve's errors are bounds, for an objective of the information.
+        is_bound: whether the curve has bounds instead of errors (objectives of information).
     """
 
     name: str
@@ -84,11 +84,11 @@ class Training:
 
     @property
     def is_running(self) -> bool:
-        """Whether it is not over."""
+        """Whether it is running."""
         return self.state in ("starting", "training", "stopping")
 
     async def stop(self) -> None:
-        """Interrupts it, as Ctrl-C does, and ends it where that is not enough."""
+        """Interrupts it like Ctrl-C; kills it if it does not end."""
         process = self._process
         if process is None or not self.is_running:
             return
@@ -104,7 +104,7 @@ class Training:
             await self._followed
 
     async def _follow(self, process: asyncio.subprocess.Process) -> None:
-        """Collects looks at the policy until the process ends."""
+        """Collects rows of the learning curve until the process ends."""
         told = asyncio.create_task(process.communicate())
         while not told.done():
             self._look()
@@ -130,7 +130,7 @@ class Training:
             self.state = "training" if self.state == "starting" else self.state
 
     def told(self) -> TrainingStatus:
-        """What the page shows."""
+        """Its state for the page."""
         return {
             "name": self.name,
             "folder": self.folder.name,
@@ -143,16 +143,16 @@ class Training:
 
 
 def routes(folder: Path, body: Body, every: list[Training]) -> list[Route]:
-    """What starts, shows and stops trainings.
+    """Routes that start, show and stop trainings.
 
     Args:
-        every: all trainings of this server that run, kept up to date.
+        every: all running trainings of this server; updated here.
     """
 
     async def start(request: Request) -> JSONResponse:
         asked = await body(request)
         if sum(t.is_running for t in every) >= MAX_TRAININGS:
-            raise RefusedError(429, f"{MAX_TRAININGS} trainings are running already; stop one")
+            raise RefusedError(429, f"{MAX_TRAININGS} trainings already running; stop one")
         every[:] = [training for training in every if training.is_running]
         words, place = _words(asked), _free(folder, word(asked, "name"), every)
         training = Training(secrets.token_urlsafe(12), place, words)
@@ -183,7 +183,7 @@ def routes(folder: Path, body: Body, every: list[Training]) -> list[Route]:
 
 
 def _words(asked: Asked) -> list[str]:
-    """The command, of checked words and numbers alone."""
+    """The command, made of checked names and numbers only."""
     objective, updates = word(asked, "objective"), whole(asked, "updates", 1, 100_000)
     if objective not in OBJECTIVES:
         raise RefusedError(400, f"objective: one of {', '.join(OBJECTIVES)} is needed")
@@ -199,5 +199,5 @@ def _free(folder: Path, name: str, running: Sequence[Training]) -> Path:
     """A folder for a training: a new one of this name in the run folder."""
     path = folder / name
     if path.exists() or path.is_symlink() or any(path == training.folder for training in running):
-        raise RefusedError(409, f"{path.name} is there already; choose another name")
+        raise RefusedError(409, f"{path.name} exists already; choose another name")
     return path

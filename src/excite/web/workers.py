@@ -15,13 +15,13 @@ from .events import JobEvent
 from .requests import RefusedError, without_folders
 
 MAX_WAITING = 64
-"""Calls in the queue."""
-_MEMORY = 2 * 2**30, 6 * 2**30  # bytes of a worker: it needs the first, and gets no more
+"""Largest number of calls in the queue."""
+_MEMORY = 2 * 2**30, 6 * 2**30  # smallest and largest memory limit of a worker [bytes]
 _TIME_LIMIT = 900.0  # seconds a single call may take
-_NICENESS = 5  # the server comes first: a stream has to flow while others compute
+_NICENESS = 5  # the server has priority, so that streams are not delayed
 
 JOBS = "excite.web.jobs"
-"""The module of what a worker runs; by name, for this process must not load JAX."""
+"""The module of the workers' functions, by name, because this process must not load JAX."""
 Job = Literal["catalogue", "episode", "followed", "columns", "identified", "reported"]
 
 
@@ -44,7 +44,7 @@ class Workers:
         self._processes.open()
 
     async def close(self) -> None:
-        """Ends them all, and tells everybody who waits for one, or comes too late."""
+        """Ends all workers; waiting and later calls fail."""
         self._is_closed = True
         await asyncio.to_thread(self._processes.close, "the server has ended")
 
@@ -54,12 +54,12 @@ class Workers:
         """Events of one call, from `started` to `end` or `failed`; closing it ends the work.
 
         Args:
-            urgent: before all that is not: somebody waits for the first sign of life.
+            urgent: before all calls that are not, because a user is waiting.
         """
         if self._is_closed:
             raise RefusedError(503, "the server has ended")
         if self._processes.num_waiting >= MAX_WAITING:
-            raise RefusedError(503, "too much is waiting for the workers; try again later")
+            raise RefusedError(503, "the queue of the workers is full; try again later")
         loop, said = asyncio.get_running_loop(), asyncio.Queue[Message]()
 
         def tell(message: Message) -> None:
@@ -78,7 +78,7 @@ class Workers:
 
 
 def _event(message: Message) -> JobEvent:
-    """A message as the page reads it."""
+    """A message as an event for the page."""
     if isinstance(message, Started):
         return {"kind": "started"}
     if isinstance(message, Event):
@@ -89,7 +89,7 @@ def _event(message: Message) -> JobEvent:
 
 
 def _memory(num_workers: int) -> int:
-    """Bytes a worker may take: its part of half of what this computer has, within limits."""
+    """Memory limit of a worker [bytes]: its share of half the memory, within limits."""
     if not hasattr(os, "sysconf"):  # Windows: no limit
         return 0
     half = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2

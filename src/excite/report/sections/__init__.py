@@ -1,1 +1,1 @@
-"""What a report says of one run: an experiment, a record, or a study."""
+"""Sections of a report, one per run: an experiment, a record, or a study."""

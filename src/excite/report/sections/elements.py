@@ -1,6 +1,6 @@
-"""What all sections of a report are made of: text, tables, figures, settings in words.
+"""Elements of all sections of a report: text, tables, figures, settings.
 
-Everything that comes from a file passes `text`, so that it is shown and never obeyed.
+Everything that comes from a file passes `text`, which escapes it.
 """
 
 from __future__ import annotations
@@ -41,20 +41,20 @@ class Section:
 
     @property
     def name(self) -> str:
-        """Last part of where it was read from; where the rest lies is nobody's business."""
+        """Last part of its path; the report does not show the rest."""
         return self.source.absolute().name
 
 
 @dataclass(frozen=True)
 class Marker:
-    """`run.json`: what a run folder is.
+    """`run.json`: kind, plant and origin of a run folder.
 
     Attributes:
-        folder: that it lies in.
-        kind: of run.
-        plant: that it is about.
-        version: of the program that made it.
-        command: that made it; empty where it is not known.
+        folder: the run folder.
+        kind: of the run.
+        plant: of the run.
+        version: of the program that made the run.
+        command: that made the run; empty where it is not known.
         policies: by method, the hash of its policy.
     """
 
@@ -67,7 +67,7 @@ class Marker:
 
     @classmethod
     def read(cls, folder: Path, kinds: Collection[str]) -> Marker:
-        """Of a run folder; ValueError where it is damaged, missing or of another kind."""
+        """That of a run folder; ValueError where it is damaged, missing or of another kind."""
         path = folder / "run.json"
         if not path.is_file():
             raise ValueError(f"{folder} is no run folder: it has no run.json")
@@ -82,16 +82,16 @@ class Marker:
 
 
 class Run(abc.ABC):
-    """What a report shows in one section."""
+    """A run that a report shows in one section."""
 
     @abc.abstractmethod
     def section(self, name: str) -> Section:
-        """What the report says of it; `name` begins the names of its figures."""
+        """The section of the report; `name` is the prefix of its figures' names."""
 
 
 @contextlib.contextmanager
 def understood(path: Path, advice: str = "") -> Iterator[None]:
-    """Whatever in a file is not as it was written becomes one sentence that names the file."""
+    """Turns an error in the content of a file into one sentence that names the file."""
     try:
         yield
     except (LookupError, TypeError, AttributeError, ArithmeticError, ValueError) as error:
@@ -99,7 +99,7 @@ def understood(path: Path, advice: str = "") -> Iterator[None]:
 
 
 def text(value: object) -> str:
-    """A value as text of a page, whatever characters are in it."""
+    """A value as escaped text of a page."""
     return html.escape(str(value))
 
 
@@ -125,12 +125,12 @@ def table(
     labels: int = _NUM_LABELS,
     name: str = "",
 ) -> str:
-    """A table that scrolls in a box of its own where it is wide.
+    """A table; a wide one scrolls in its box.
 
     Args:
-        name: what it is, for those who cannot see it; default the titles of its columns.
+        name: for screen readers; default the titles of its columns.
         labels: how many columns are words; a line is drawn where the first of them changes,
-            and published rows look different.
+            and published rows are marked.
     """
 
     def cells(kind: str, row: Sequence[str]) -> str:
@@ -153,19 +153,19 @@ def table(
 
 
 def facts(pairs: Iterable[tuple[str, object]]) -> str:
-    """Names and values below each other; values in words, those that say nothing left out."""
+    """Names and values below each other; empty values are left out."""
     rows = [(name, in_words(value)) for name, value in pairs]
     body = "".join(f"<dt>{text(n)}</dt><dd>{text(v)}</dd>\n" for n, v in rows if v)
     return f"<dl>\n{body}</dl>\n"
 
 
 def folded(summary: str, body: str) -> str:
-    """What not every reader wants to see; it opens on a click, and in print."""
+    """Content that is folded on the screen, and open in print."""
     return f"<details><summary>{text(summary)}</summary>\n{body}</details>\n"
 
 
 def figure(drawn: matplotlib.figure.Figure, name: str, caption: str) -> str:
-    """A figure in a box that scrolls; `name` is its own on the page."""
+    """A figure in a box that scrolls; `name` is unique on the page."""
     svg = inline_svg(drawn, name)
     labelled = svg.replace("<svg", f'<svg role="img" aria-label="{text(caption)}"', 1)
     is_wide = bool(drawn.get_figwidth() > _NARROW_FIGURE)
@@ -174,18 +174,18 @@ def figure(drawn: matplotlib.figure.Figure, name: str, caption: str) -> str:
 
 
 def _reachable(name: str, also: str = "") -> str:
-    """The beginning of a box that scrolls on a usual screen: by the keyboard, too, and named."""
+    """The opening tag of a box that scrolls, also by the keyboard, with a name."""
     return f'<div class="scroll{also}" tabindex="0" role="region" aria-label="{text(name)}">'
 
 
 def command(kept: str | None, likely: str) -> str:
-    """What to type to do it again: as the run folder says, or as it most likely was."""
-    remark = "" if kept else paragraph("The run folder does not say; most likely:")
-    return f"{heading('Do it again')}{remark}<pre><code>{text(kept or likely)}</code></pre>\n"
+    """The command to repeat the run: that of the run folder, or the most likely one."""
+    remark = "" if kept else paragraph("The run folder does not store the command. Most likely:")
+    return f"{heading('Repeat the run')}{remark}<pre><code>{text(kept or likely)}</code></pre>\n"
 
 
 def in_words(value: object) -> str:
-    """Settings as people read them: 'amplitude 7.2, clock 4'; nothing for none."""
+    """Settings as text: 'amplitude 7.2, clock 4'; empty for none."""
     if isinstance(value, Mapping):
         return ", ".join(f"{k} {words}" for k, v in value.items() if (words := in_words(v)))
     if isinstance(value, list | tuple):
@@ -198,7 +198,7 @@ def in_words(value: object) -> str:
 
 
 def plant_facts(d: PlantDescription) -> str:
-    """All that a description says of a plant."""
+    """The content of a plant's description."""
     levels = {
         o.name: {"warning level": _level(o.warning_level, o.unit),
                  "critical level": _level(o.critical_level, o.unit)}
@@ -225,7 +225,7 @@ def _level(value: float | None, unit: str) -> str:
 
 
 def record_in(path: Path, d: PlantDescription) -> Record:
-    """A record as it is, of whatever size its values are.
+    """A record, without a check of the size of its values.
 
     Raises:
         ValueError: for a file that cannot be read.
@@ -234,7 +234,7 @@ def record_in(path: Path, d: PlantDescription) -> Record:
 
 
 def origin_in_words(record: Record) -> str:
-    """What the sidecar says of where a record comes from."""
+    """The origin of a record according to its sidecar."""
     provenance, ended = (record.metadata.get(key) for key in ("provenance", "ended"))
     parts = dict(provenance) if isinstance(provenance, Mapping) else {}
     if isinstance(ended, Mapping):
@@ -243,7 +243,7 @@ def origin_in_words(record: Record) -> str:
 
 
 def signals_table(d: PlantDescription, records: Collection[Record]) -> str:
-    """Extremes of every input and output over some records, and what was reached."""
+    """Extremes of every input and output over some records, and the safety level reached."""
     rows = []
     for kind, parts in (("inputs", d.inputs), ("outputs", d.outputs)):
         for i, part in enumerate(parts):

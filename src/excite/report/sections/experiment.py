@@ -1,4 +1,4 @@
-"""Experiments: what was measured, and what was identified from it."""
+"""Identified experiments: measurements, estimates, tests."""
 
 from __future__ import annotations
 
@@ -51,13 +51,13 @@ _ADVICE = "'excite identify --out' writes it again"
 
 @dataclass(frozen=True)
 class Experiment(Run):
-    """The run folder of an identification, as it was read.
+    """The run folder of an identification.
 
     Attributes:
         marker: the content of `run.json`, and the folder.
-        plant: what was fitted.
+        plant: as it was fitted.
         result: the content of `estimate.json`.
-        records, simulated: what was measured, and the outputs of the estimated plant.
+        records, simulated: measurements, and the outputs of the estimated plant.
     """
 
     marker: Marker
@@ -67,7 +67,7 @@ class Experiment(Run):
     simulated: Sequence[np.ndarray]
 
     def section(self, name: str) -> Section:
-        """What the report says of an identification."""
+        """The section of an identification."""
         d, result = self.plant, self.result
         with understood(self.marker.folder / "estimate.json", _ADVICE):
             cells = [parameter_cells(n, p) for n, p in result.params.items()]
@@ -75,7 +75,7 @@ class Experiment(Run):
                 heading("Parameters"),
                 table(parameter_header(), cells),
                 _truth(self),
-                heading("What the data can see"),
+                heading("What can be identified"),
                 bullets(result.verdict),
                 heading("Measured"),
                 signals_table(d, self.records),
@@ -86,7 +86,7 @@ class Experiment(Run):
                 figure(
                     autocorrelation_figure(d, _residual_values(self)),
                     f"{name}-white",
-                    "Autocorrelation of the residual; 95 % of that of white noise lies between "
+                    "Autocorrelation of the residual. For white noise, 95 % of it lies between "
                     "the dashed lines.",
                 ),
                 _correlation(result, name),
@@ -139,7 +139,7 @@ def _truth(experiment: Experiment) -> str:
 
 
 def _figures(experiment: Experiment, name: str) -> str:
-    """Signals and fit of every record, as far as they are few."""
+    """Signals and fit of the first records."""
     d, parts = experiment.plant, []
     pairs = list(zip(experiment.records, experiment.simulated, strict=True))
     for i, (record, simulated) in enumerate(pairs[:_MAX_RECORDS], 1):
@@ -149,7 +149,7 @@ def _figures(experiment: Experiment, name: str) -> str:
             figure(
                 identification_figure(d, experiment.result, record, simulated),
                 f"{name}-fit{i}",
-                f"{file}: measured against simulated, what is left, and the parameters.",
+                f"{file}: measured and simulated output, residual, and parameters.",
             ),
         ]
     if len(pairs) > _MAX_RECORDS:
@@ -183,7 +183,7 @@ def _correlation(result: EstimateSummary, name: str) -> str:
     if drawn is None:
         return ""
     caption = (
-        "Where each pair of parameters lies with 95 %, in percent of the estimates. "
+        "95 % confidence region of each pair of parameters, in percent of the estimates. "
         f"Largest correlation: {largest_correlation(result)}."
     )
     return heading("Correlation of the estimates") + figure(drawn, f"{name}-pairs", caption)
@@ -212,7 +212,7 @@ def _lengths(record: Record) -> list[str]:
 
 
 def _likely_command(result: EstimateSummary) -> str:
-    """Where it was made by a program."""
+    """The command that made the run; empty where it was made from Python."""
     files = shlex.join(result.files)
     return (
         f"excite identify {files} --plant {result.plant} --estimator {result.estimator} --out RUN"
@@ -220,7 +220,7 @@ def _likely_command(result: EstimateSummary) -> str:
 
 
 def comparison(numbered: Mapping[str, Experiment]) -> str:
-    """Estimates, with their intervals, and fits of several experiments side by side, by title."""
+    """Estimates with intervals, and fits, of several experiments side by side, by title."""
     header, experiments = ["", "unit", *numbered], list(numbered.values())
     names = {n: p.unit for e in experiments for n, p in e.result.params.items()}
     outputs = list(dict.fromkeys(n for e in experiments for n in e.result.fit_percent))

@@ -1,4 +1,4 @@
-"""A record alone: what was played, what was measured, and how the experiment ended."""
+"""A record: excitation, measurements, and how the experiment ended."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Recorded(Run):
     record: Record
 
     def section(self, name: str) -> Section:
-        """What the report says of a record."""
+        """The section of a record."""
         d, record = self.plant, self.record
         with understood(self.path.with_suffix(".json")):
             ended = _ended(record.metadata)
@@ -67,7 +67,7 @@ def read_recorded(path: Path) -> Recorded:
     """The record in a file.
 
     Raises:
-        ValueError: where it cannot be read, or has no sidecar that says what its columns are.
+        ValueError: where it cannot be read, or has no sidecar that names its plant.
     """
     sidecar = path.with_suffix(".json")
     if path.suffix.lower() not in (".csv", ".mat"):
@@ -91,9 +91,7 @@ def _ended(metadata: Mapping[str, object]) -> str:
         return ""
     ended = metadata["ended"]
     if ended is None:
-        return paragraph(
-            "The experiment has not ended, or was killed: its record stops where it is."
-        )
+        return paragraph("The experiment is still running, or its process was killed.")
     if not isinstance(ended, Mapping):
         raise TypeError("how it ended")
     details = {k: v for k, v in ended.items() if k != "reason"}

@@ -39,7 +39,7 @@ from .elements import (
 )
 
 _BESIDE = 4  # episodes and learning curves in one figure
-_LEARNING = "Policies without exploration noise, while they learn: median and band over the seeds."
+_LEARNING = "Policies without exploration noise during training: median and band over the seeds."
 _COMPARED = ("plant", "episodes", "num_steps", "seed", "seeds", "spread", "sensor", "rig",
              "decision", "training", "gradient")  # fmt: skip
 _ADVICE = "rerun 'excite study run' to write it again"
@@ -47,18 +47,18 @@ _ADVICE = "rerun 'excite study run' to write it again"
 
 @dataclass(frozen=True)
 class StudyRun(Run):
-    """The run folder of a study, as it was read.
+    """The run folder of a study.
 
     Attributes:
         marker: the content of `run.json`, and the folder.
-        table: what the study found, and its settings.
+        table: results and settings of the study.
     """
 
     marker: Marker
     table: StudyTable
 
     def section(self, name: str) -> Section:
-        """What the report says of a study."""
+        """The section of a study."""
         t = self.table
         notes = "".join(map(paragraph, footnotes(t.study)))
         parts = [
@@ -95,8 +95,8 @@ def _comparisons(found: StudyTable, name: str) -> str:
         figure(
             benchmark_figure(rows, title),
             f"{name}-errors",
-            "Mean relative error of each method and estimator; grey, what an efficient estimator "
-            "would reach with the same data.",
+            "Mean relative error of each method and estimator; grey: error of an efficient "
+            "estimator with the same data.",
         ),
     ]
     if len({row.method for row in rows}) > 1:
@@ -114,14 +114,14 @@ def _comparisons(found: StudyTable, name: str) -> str:
             figure(
                 lengths_figure(rows, title),
                 f"{name}-lengths",
-                "Least standard deviation that experiments of so many samples allow.",
+                "Smallest possible standard deviation against the number of samples.",
             ),
         ]
     return "".join(parts)
 
 
 def _learning(run: StudyRun, name: str) -> str:
-    """Learning curves of all agents; nothing where they are not kept."""
+    """Learning curves of all agents; empty where none are stored."""
     folder, study, plant = run.marker.folder / "seeds", run.table.study, run.marker.plant
     paths = {
         agent: [folder / folder_word(agent) / f"{seed}/curve.csv" for seed in range(study.seeds)]
@@ -145,9 +145,9 @@ def _learning(run: StudyRun, name: str) -> str:
 
 
 def _episodes(run: StudyRun, name: str) -> str:
-    """One episode of each method and agent; nothing where none is kept."""
+    """One episode of each method and agent; empty where none is stored."""
     path, plant = run.marker.folder / "episodes.json", run.marker.plant
-    caption = "Inputs, outputs with their safety levels, and estimates while data come in."
+    caption = "Inputs, outputs with their safety levels, and running estimates."
     if not path.is_file():
         return ""
     figures, content = [], read_json(path, advice=_ADVICE)
@@ -161,7 +161,7 @@ def _episodes(run: StudyRun, name: str) -> str:
 
 
 def _episode(d: PlantDescription, data: EpisodeData) -> tuple[Record, np.ndarray]:
-    """A record and running estimates, as `episodes.json` has them."""
+    """A record and running estimates from `episodes.json`."""
 
     def stacked(columns: Mapping[str, Sequence[float]], names: Sequence[str]) -> np.ndarray:
         return np.stack([np.array(columns[name]) for name in names], axis=1)
@@ -174,7 +174,7 @@ def _episode(d: PlantDescription, data: EpisodeData) -> tuple[Record, np.ndarray
 
 
 def _groups(names: Sequence[str]) -> list[Sequence[str]]:
-    """Names in groups as even as can be, each for one figure."""
+    """Names in groups of nearly equal size, each for one figure."""
     count = -(-len(names) // _BESIDE)
     return [list(part) for part in np.array_split(np.array(names, object), count or 1) if len(part)]
 
@@ -187,7 +187,7 @@ def _differences(found: StudyTable) -> str:
 
 
 def _settings(run: StudyRun) -> str:
-    """Every choice of the study in words, and where it comes from."""
+    """Every setting of the study, and its source."""
     s, marker = run.table.study, run.marker
     common = [
         ("plant", s.plant),
@@ -232,7 +232,7 @@ def _choices(what: str, kind: str, choices: Mapping[str, Options]) -> list[str]:
 
 
 def common_methods(numbered: Mapping[str, StudyRun]) -> str:
-    """Methods that stand in several studies side by side, by title; nothing without any.
+    """Methods of several studies side by side, by title; empty without common methods.
 
     Studies whose plants have other parameters or outputs are not compared.
     """
@@ -253,7 +253,7 @@ def _compared(group: Mapping[str, StudyRun]) -> str:
 
 
 def _settings_beside(group: Mapping[str, StudyRun]) -> str:
-    """The settings in which studies differ: what a difference in their numbers may come from."""
+    """The settings in which studies differ, which may explain differences in their results."""
     studies = [run.table.study for run in group.values()]
     every = [_flat({key: getattr(study, key) for key in _COMPARED}) for study in studies]
     rows = []
@@ -268,7 +268,7 @@ def _settings_beside(group: Mapping[str, StudyRun]) -> str:
 
 
 def _flat(settings: Mapping[str, object]) -> dict[str, str]:
-    """Settings in words, those of a group each by its own name."""
+    """Settings as text; those of a group each with its name."""
     flat = {}
     for key, value in settings.items():
         if isinstance(value, Mapping):
