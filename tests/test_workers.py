@@ -100,7 +100,7 @@ def test_no_tasks_open_no_engine():
 
 
 def test_less_than_one_worker_is_refused():
-    with pytest.raises(ValueError, match="at least one"):
+    with pytest.raises(ValueError, match="at least 1"):
         engine.local_engine(0)
 
 
