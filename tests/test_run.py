@@ -155,7 +155,7 @@ def test_a_trip_is_a_failed_run_that_is_recorded_and_explained(call):
     words = ("--policy", "aero2-ppo-all", "--steps", 60, "--fault", "dropout=0.99999")
     code, out, err = call(*words, *FAST)
     assert code == 1
-    assert "stood still" in out
+    assert "did not change" in out
     assert "next: excite identify r.csv --plant aero2_detailed" in out
     assert "Traceback" not in err
     assert read_record("r.csv", AERO).metadata["ended"]["trip"] == "stale"

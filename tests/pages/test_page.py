@@ -328,10 +328,10 @@ def test_a_link_in_a_foreign_page_leaves_the_browser_its_own(address: str, page:
 def test_a_download_that_is_refused_says_why(address: str, page: Page):
     page.goto(f"{address}/#runs")
     page.get_by_role("button", name="a_study").click()
-    refusal: Any = {"status": 429, "json": {"sentence": "4 things are under way"}}
+    refusal: Any = {"status": 429, "json": {"sentence": "4 jobs already running"}}
     page.route("**/report.html*", lambda route: route.fulfill(**refusal))
     page.locator("#run-view .downloads a").first.click()
-    expect(status(page, "runs")).to_have_text("4 things are under way")
+    expect(status(page, "runs")).to_have_text("4 jobs already running")
     expect(status(page, "runs")).to_have_class(re.compile("bad"))
     with page.expect_download() as waiting:
         page.locator("#run-view a[href$='table.md']").click()

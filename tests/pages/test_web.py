@@ -717,7 +717,7 @@ def test_a_training_takes_names_and_numbers_alone(change: dict, page: TestClient
 def test_a_training_never_goes_where_something_is(page: TestClient, runs: Path):
     assert page.post("/api/trainings", json={**TRAINING, "name": "some"}).status_code == 409
     begun = Training("x", runs / "other", ["train", "aero2", "--objective", "D"])
-    with pytest.raises(RefusedError, match="there already"):
+    with pytest.raises(RefusedError, match="exists already"):
         _free(runs, "other", [begun])  # its folder comes later
     assert _free(runs, "another", [begun]) == runs / "another"
 
