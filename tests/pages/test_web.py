@@ -913,7 +913,7 @@ def test_every_address_of_this_computer_is_answered_where_all_are_bound(runs, sc
     ("words", "sentence"),
     [
         (["--runs", "nowhere"], "no such folder"),
-        (["--host", "no.such.host.invalid"], "is no address"),
+        (["--host", "no.such.host.invalid"], "is not an address"),
         (["--host", "192.0.2.1"], "cannot listen"),
         (["--token", "short"], "eight characters"),
         (["--port", "70000"], "70000"),
