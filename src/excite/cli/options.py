@@ -239,12 +239,12 @@ def progress_bar(what: str) -> Iterator[Callable[[str, float, float], None]]:
 
     Yields a function that sets the current step, how much is done, and the total.
     """
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TimeRemainingColumn
-
-    console = Console(stderr=True)
     with contextlib.ExitStack() as stack:
-        if console.is_terminal:
+        if sys.stderr.isatty():
+            from rich.console import Console
+            from rich.progress import BarColumn, Progress, TaskProgressColumn, TimeRemainingColumn
+
+            console = Console(stderr=True)
             columns = "{task.description}", BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
             bar = stack.enter_context(Progress(*columns, console=console, transient=True))
             task = bar.add_task(what, total=None)

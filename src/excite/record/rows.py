@@ -38,7 +38,7 @@ Options = dict[str, object]
 class Saved(BaseModel):
     """Part of a file in a run folder."""
 
-    model_config = ConfigDict(frozen=True)
+    model_config = ConfigDict(frozen=True, defer_build=True)
 
     @classmethod
     def read(cls, path: Path, advice: str = "") -> Self:
