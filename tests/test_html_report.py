@@ -474,7 +474,7 @@ def test_long_records_make_no_large_page(here, drawn, monkeypatch):
     assert_is_self_contained(page)
     assert len(page.text) <= 2 * whole // 3
     monkeypatch.setattr("excite.report.html._NUM_POINTS", (4000,))
-    assert "easier to send on several" in report_html([here / "one", here / "one"])
+    assert "larger than" in report_html([here / "one", here / "one"])
 
 
 def test_what_scrolls_on_a_screen_is_reached_by_the_keyboard_and_named(made):
