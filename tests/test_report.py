@@ -16,14 +16,19 @@ from catalogue import TwoMasses
 from excite.description import HALF_95, PlantDescription
 from excite.plant import EMPS, Aero2, CartPole
 from excite.record import Record
+from excite.record.figure import (
+    PLOT_ENDINGS,
+    episode_figure,
+    episodes_figure,
+    kept_samples,
+    require_plot_path,
+    save,
+)
 from excite.record.rows import Difference, EstimateSummary, Row, StudyFacts
-from excite.report.figure import PLOT_ENDINGS, kept_samples, require_plot_path, save
 from excite.report.figures import (
     autocorrelation_figure,
     benchmark_figure,
     correlation_figure,
-    episode_figure,
-    episodes_figure,
     identification_figure,
     information_figure,
 )

@@ -274,9 +274,16 @@ class PlantDescription:
         )
 
     def __repr__(self) -> str:
-        from .report.results import plant_text
-
-        return plant_text(self)
+        lines = [f"plant {self.name}, sampled every {self.dt:g} s"]
+        lines += [f"  input {i.name}: {i.lower:g} to {i.upper:g} {i.unit}" for i in self.inputs]
+        for o in self.outputs:
+            unit, factor = display_unit(o.unit)
+            level = o.critical_level
+            words = "" if level is None else f", critical level {factor * level:g} {unit}"
+            lines.append(f"  output {o.name} [{o.unit}]{words}")
+        named = [f"{p.name} = {p.nominal:g} {p.unit}".rstrip() for p in self.parameters[:12]]
+        rest = f", and {len(self.parameters) - 12} more" if len(self.parameters) > 12 else ""
+        return "\n".join([*lines, f"  parameters {', '.join(named)}{rest}"])
 
     @property
     def columns(self) -> tuple[str, ...]:

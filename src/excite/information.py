@@ -24,7 +24,8 @@ from .excitation.catalogue import ExcitationLike
 from .plant import AbstractPlant, Params, require_double_precision
 from .plant.catalogue import PlantLike
 from .record import Record
-from .report.results import data_frame, information_html, information_text, wrapped
+from .record.table import data_frame
+from .report.results import information_html, information_text, wrapped
 from .simulation import Experiment, response, run_episode
 
 if TYPE_CHECKING:

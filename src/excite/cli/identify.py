@@ -102,7 +102,7 @@ def identify(
             scales=merged(options["scale"]),
         )
     if plot is not None:
-        from ..report.figure import save
+        from ..record.figure import save
 
         save(result.plot(), plot)
     if out is not None:

@@ -95,8 +95,7 @@ def _plot(plant: Any, path: Path) -> None:
 
     from ..excitation.catalogue import EXCITATIONS
     from ..record import Record
-    from ..report.figure import save
-    from ..report.figures import episodes_figure
+    from ..record.figure import episodes_figure, save
     from ..simulation import run_episode
 
     responses = {}

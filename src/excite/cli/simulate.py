@@ -131,8 +131,7 @@ def simulate(
         "warnings": experiment.warnings,
     }
     if plot is not None:
-        from ..report.figure import save
-        from ..report.figures import episode_figure
+        from ..record.figure import episode_figure, save
 
         save(episode_figure(description, record), plot)
     if out is not None:

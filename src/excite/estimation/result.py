@@ -15,7 +15,8 @@ from ..description import HALF_95, Named, PlantDescription, names_of
 from ..files import csv_text, new_run_folder, write_json
 from ..record import Record, write_record
 from ..record.rows import EstimateSummary
-from ..report.results import data_frame, identification_html, identification_text, wrapped
+from ..record.table import data_frame
+from ..report.results import identification_html, identification_text, wrapped
 from .diagnosis import correlation, fit_percent
 
 if TYPE_CHECKING:

@@ -27,7 +27,6 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..description import PlantDescription, names_of, wrong_type
-from ..report.results import plant_text
 from .fields import floats
 
 # Estimation and information need double precision. Every computation imports this module,
@@ -149,9 +148,9 @@ class AbstractPlant(_Module):
 
     def __repr__(self) -> str:
         try:
-            return plant_text(self.description)
+            return repr(self.description)
         except TypeError:  # traced numbers cannot be shown
-            return plant_text(self.definition)
+            return repr(self.definition)
 
     @abc.abstractmethod
     def derivative(

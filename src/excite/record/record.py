@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..description import PlantDescription, wrong_type
+from ..description import PlantDescription, display_unit, wrong_type
 from ..files import csv_text, require_new_file, write_bytes, write_json
+from .table import data_frame
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -78,9 +79,24 @@ class Record:
             object.__setattr__(self, name, values)
 
     def __repr__(self) -> str:
-        from ..report.results import record_text
-
-        return record_text(self)
+        about = self.metadata.get("provenance") or {}
+        made_with = self.metadata.get("plant") or {}
+        played = f", {about['excitation']}" if "excitation" in about else ""
+        lines = [
+            f"record of {made_with.get('name', 'an unknown plant')}{played}: "
+            f"{len(self.time)} samples, every {self.dt:.4g} s"
+        ]
+        for kind, values in (("inputs", self.inputs), ("outputs", self.outputs)):
+            parts = made_with.get(kind) or [
+                {"name": f"{kind[:-1]} {i + 1}", "unit": ""} for i in range(values.shape[1])
+            ]
+            for part, column in zip(parts, values.T, strict=True):
+                unit, factor = display_unit(part["unit"])
+                low, high = factor * column.min(), factor * column.max()
+                lines.append(f"  {part['name']}: {low:.3g} to {high:.3g} {unit}".rstrip())
+        if "warning" in about:
+            lines.append(f"warning: {about['warning']}")
+        return "\n".join(lines)
 
     @property
     def description(self) -> PlantDescription:
@@ -101,14 +117,12 @@ class Record:
 
     def plot(self) -> Figure:
         """Inputs and outputs over time, with the safety levels; ValueError without a plant."""
-        from ..report.figures import episode_figure
+        from .figure import episode_figure
 
         return episode_figure(self.description, self)
 
     def to_pandas(self) -> DataFrame:
         """Columns time, inputs, outputs, by the plant's names; ValueError without pandas."""
-        from ..report.results import data_frame
-
         values = np.column_stack([self.time, self.inputs, self.outputs]).T
         return data_frame(dict(zip(self.description.columns, values, strict=True)))
 

@@ -1,10 +1,15 @@
-"""CSV files from any source, as columns of text."""
+"""Tables: CSV files from any source as columns of text, columns as a pandas DataFrame."""
 
 from __future__ import annotations
 
 import csv
 import math
+from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import pandas
 
 
 def text_columns(path: Path) -> dict[str, list[str]]:
@@ -70,3 +75,12 @@ def _is_number(text: str) -> bool:
         return bool(text) and math.isfinite(float(text.replace(",", ".")))
     except ValueError:
         return False
+
+
+def data_frame(columns: Mapping[str, object], index: object = None) -> pandas.DataFrame:
+    """Columns as a pandas DataFrame; ValueError where pandas is not installed."""
+    try:
+        import pandas
+    except ImportError:
+        raise ValueError("to_pandas needs pandas: pip install pandas") from None
+    return pandas.DataFrame(columns, index)  # pyright: ignore[reportArgumentType]

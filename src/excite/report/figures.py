@@ -13,8 +13,7 @@ from jaxtyping import Float
 
 from ..description import HALF_95, PlantDescription, display_unit
 from ..record import Record
-from ..record.rows import EstimatedParameter, EstimateSummary, Row
-from .figure import (
+from ..record.figure import (
     BLUE,
     GREEN,
     GREY,
@@ -23,10 +22,10 @@ from .figure import (
     add_title,
     axis_label,
     colour_of,
-    draw_episodes,
     new_figure,
     thin,
 )
+from ..record.rows import EstimatedParameter, EstimateSummary, Row
 from .numbers import digits_for, number
 
 
@@ -121,31 +120,6 @@ def correlation_figure(result: EstimateSummary) -> matplotlib.figure.Figure | No
         axis.set(xlabel=f"{first} [%]", ylabel=f"{second} [%]")
         axis.set(title=f"correlation {correlation:+.3f}")
         axis.locator_params(nbins=5)
-    return figure
-
-
-def episode_figure(description: PlantDescription, record: Record) -> matplotlib.figure.Figure:
-    """Inputs and outputs of one experiment, with the safety levels."""
-    figure, axes = new_figure(len(description.inputs) + len(description.outputs))
-    draw_episodes(axes, description, [record])
-    axes[-1, 0].set(xlabel="time [s]")
-    add_legend(figure, *axes[:, 0])
-    add_title(figure, description.name)
-    return figure
-
-
-def episodes_figure(
-    description: PlantDescription, records: Mapping[str, Record]
-) -> matplotlib.figure.Figure:
-    """Several experiments of one plant side by side, by title."""
-    rows = len(description.inputs) + len(description.outputs)
-    figure, axes = new_figure(rows, len(records), width=3.2 * len(records), sharey="row")
-    draw_episodes(axes, description, list(records.values()))
-    for column, title in enumerate(records):
-        axes[0, column].set(title=title)
-        axes[-1, column].set(xlabel="time [s]")
-    add_legend(figure, *axes[:, 0])
-    add_title(figure, f"{description.name}: nominal response")
     return figure
 
 

@@ -10,11 +10,12 @@ import matplotlib
 
 from .. import __version__
 from ..files import write_bytes
-from .figure import MAX_POINTS, PAGE_STYLE, at_most
+from ..record.figure import MAX_POINTS, at_most
 from .sections.elements import Marker, Run, Section, paragraph, text
 from .sections.experiment import Experiment, comparison, read_experiment
 from .sections.record import read_recorded
 from .sections.study import StudyRun, common_methods, read_study_run
+from .svg import PAGE_STYLE
 
 MAX_BYTES = 3_000_000
 """Size above which a page is drawn again with fewer points, so that it can be mailed."""

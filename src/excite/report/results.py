@@ -1,4 +1,4 @@
-"""Text and HTML of a record, an identification and an information result.
+"""Text and HTML of an identification and an information result.
 
 The command line prints the same text as `repr` in Python; a notebook gets the table as HTML.
 The data are those of the results' `to_dict`.
@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from ..description import PlantDescription, display_unit
-from ..record import Record
 from ..record.rows import EstimateSummary
 from .estimates import (
     largest_correlation,
@@ -22,21 +20,9 @@ from .estimates import (
 from .numbers import number
 from .tables import Table, html_table, text_table
 
-if TYPE_CHECKING:
-    import pandas
-
 _WIDTH = 80
 Data = Mapping[str, Any]
 """A result as returned by its `to_dict`."""
-
-
-def data_frame(columns: Mapping[str, object], index: object = None) -> pandas.DataFrame:
-    """Columns as a pandas DataFrame; ValueError where pandas is not installed."""
-    try:
-        import pandas
-    except ImportError:
-        raise ValueError("to_pandas needs pandas: pip install pandas") from None
-    return pandas.DataFrame(columns, index)  # pyright: ignore[reportArgumentType]
 
 
 def wrapped(text: str) -> str:
@@ -130,46 +116,3 @@ def information_html(result: Data) -> str:
     """The same for a notebook."""
     title, (header, rows) = _bounds(result)
     return html_table(title, header, rows) + _paragraphs(_criteria(result))
-
-
-# --------------------------------------------------------------------------------- record
-
-
-def record_text(record: Record) -> str:
-    """A record in a few lines."""
-    about = record.metadata.get("provenance") or {}
-    made_with: Data = record.metadata.get("plant") or {}
-    lines = [
-        f"record of {made_with.get('name', 'an unknown plant')}"
-        + "".join(f", {about[word]}" for word in ("excitation",) if word in about)
-        + f": {len(record.time)} samples, every {record.dt:.4g} s"
-    ]
-    for kind, values in (("inputs", record.inputs), ("outputs", record.outputs)):
-        parts = made_with.get(kind) or [
-            {"name": f"{kind[:-1]} {i + 1}", "unit": ""} for i in range(values.shape[1])
-        ]
-        for part, column in zip(parts, values.T, strict=True):
-            unit, factor = display_unit(part["unit"])
-            low, high = number(factor * column.min()), number(factor * column.max())
-            lines.append(f"  {part['name']}: {low} to {high} {unit}".rstrip())
-    if "warning" in about:
-        lines.append(f"warning: {about['warning']}")
-    return "\n".join(lines)
-
-
-# ---------------------------------------------------------------------------------- plant
-
-
-def plant_text(d: PlantDescription) -> str:
-    """A plant in a few lines: inputs, outputs, parameters."""
-
-    def level(value: float | None, unit: str) -> str:
-        shown, factor = display_unit(unit)
-        return "" if value is None else f", critical level {factor * value:g} {shown}"
-
-    lines = [f"plant {d.name}, sampled every {d.dt:g} s"]
-    lines += [f"  input {i.name}: {i.lower:g} to {i.upper:g} {i.unit}" for i in d.inputs]
-    lines += [f"  output {o.name} [{o.unit}]{level(o.critical_level, o.unit)}" for o in d.outputs]
-    named = [f"{p.name} = {p.nominal:g} {p.unit}".rstrip() for p in d.parameters[:12]]
-    rest = f", and {len(d.parameters) - 12} more" if len(d.parameters) > 12 else ""
-    return "\n".join([*lines, f"  parameters {', '.join(named)}{rest}"])

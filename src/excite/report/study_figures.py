@@ -11,7 +11,16 @@ import numpy as np
 
 from ..description import PlantDescription
 from ..record import Record
-from .figure import BLUE, RED, add_legend, add_title, colour_of, draw_episodes, new_figure, thin
+from ..record.figure import (
+    BLUE,
+    RED,
+    add_legend,
+    add_title,
+    colour_of,
+    draw_episodes,
+    new_figure,
+    thin,
+)
 
 Curve = Mapping[str, np.ndarray]
 """Columns of one learning curve by name; `steps` is one of them."""

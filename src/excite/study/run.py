@@ -32,9 +32,9 @@ from ..files import (
 )
 from ..plant import AbstractPlant
 from ..policy import POLICY_ENDING, read_policy
+from ..record.figure import image
 from ..record.read import SIGNAL_ENDINGS
 from ..record.rows import Rows
-from ..report.figure import image
 from ..report.frontier import frontier_figure, lengths_figure
 from ..report.study_figures import agents_figure, curves_figure
 from ..report.study_table import StudyTable, differences_csv

@@ -46,7 +46,7 @@ from ..plant import AbstractPlant
 from ..plant.catalogue import PLANTS
 from ..policy import Policy, mismatch, read_policy, shipped_policies
 from ..record import columns_in
-from ..report.figure import kept_samples
+from ..record.figure import kept_samples
 from ..report.html import report_html
 from ..safety import critical_levels, is_violation, max_abs_output
 from ..simulation import Experiment, Trajectory

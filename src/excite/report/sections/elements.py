@@ -17,8 +17,8 @@ import matplotlib.figure
 from ...description import Input, Output, PlantDescription, display_unit
 from ...files import damaged, read_json
 from ...record import Record, read_record
-from ..figure import inline_svg
 from ..numbers import number
+from ..svg import inline_svg
 
 _NUM_LABELS = 2  # columns of words before those of numbers
 _NARROW = 8  # columns that fit a page that stands upright

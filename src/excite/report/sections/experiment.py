@@ -12,12 +12,12 @@ import numpy as np
 from ...description import RARE, PlantDescription, display_unit, names_of
 from ...files import read_columns
 from ...record import Record
+from ...record.figure import episode_figure
 from ...record.rows import EstimatedParameter, EstimateSummary
 from ..estimates import largest_correlation, parameter_cells, parameter_header, residual_cells
 from ..figures import (
     autocorrelation_figure,
     correlation_figure,
-    episode_figure,
     identification_figure,
 )
 from ..numbers import number

@@ -9,7 +9,7 @@ from pathlib import Path
 from ...description import PlantDescription
 from ...files import read_json
 from ...record import RECORD_KIND, Record
-from ..figures import episode_figure
+from ...record.figure import episode_figure
 from .elements import (
     Run,
     Section,

@@ -1,4 +1,4 @@
-"""Functions for all figures: axes, levels, colours, files.
+"""Experiments drawn over time, and what all figures share: axes, levels, colours, files.
 
 Here and in the command line angles are in degrees and fractions in percent; elsewhere in SI units.
 """
@@ -7,30 +7,25 @@ from __future__ import annotations
 
 import contextlib
 import io
-import re
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Any, Literal
-from xml.etree import ElementTree
+from typing import Literal, Protocol, runtime_checkable
 
 import matplotlib.axes
-import matplotlib.axis
 import matplotlib.figure
-import matplotlib.ticker
 import numpy as np
 
 from ..description import Input, Output, PlantDescription, display_unit
 from ..files import require_folder, write_bytes
-from ..record import Record
 
 Axes = np.ndarray
 """A grid of Matplotlib's axes: rows, columns."""
 
 # Distinguishable with any colour vision (M. Okabe and K. Ito, 2008).
 BLUE, ORANGE, GREEN, RED, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#767676"
-_COLOURS = (BLUE, ORANGE, GREEN, RED, "#CC79A7", "#56B4E9")
+COLOURS = (BLUE, ORANGE, GREEN, RED, "#CC79A7", "#56B4E9")
 PLOT_ENDINGS = (".png", ".svg", ".pdf")
 _MIN_WIDTH = 6.4  # inches; a narrower figure cuts its title and its legend
 MAX_POINTS = 4000
@@ -57,79 +52,24 @@ def image(figure: matplotlib.figure.Figure, kind: str) -> bytes:
     return buffer.getvalue()
 
 
-PAGE_STYLE: dict[Any, Any] = {
-    "svg.fonttype": "none",  # keep text searchable and the file small
-    "svg.hashsalt": "excite",  # the same figure gives the same file
-    "text.parse_math": False,  # names may contain $
-    "legend.frameon": False,
-}
-"""Matplotlib's settings under which a figure for `inline_svg` is drawn."""
+@runtime_checkable
+class Samples(Protocol):
+    """What is drawn of a record, one row per sample."""
 
-_NAMED = {"blue": BLUE, "orange": ORANGE, "green": GREEN, "red": RED, "grey": GREY}
-_NAMED |= {"pink": _COLOURS[4], "sky": _COLOURS[5]}
-_PAGE_COLOURS = {value.lower(): f"var(--{name})" for name, value in _NAMED.items()}
-_PAGE_COLOURS["#000000"] = "currentColor"
+    @property
+    def time(self) -> np.ndarray:
+        """Sampling instants [s]."""
+        ...
 
+    @property
+    def inputs(self) -> np.ndarray:
+        """Inputs, in SI units."""
+        ...
 
-class _PlainLog(matplotlib.ticker.LogFormatter):
-    """Powers of ten as plain text, without mathematics."""
-
-    def _num_to_string(self, x: float, *_: object) -> str:
-        return f"{x:g}"
-
-
-def inline_svg(figure: matplotlib.figure.Figure, prefix: str) -> str:
-    """A figure as an SVG element of a page; the page's style sets its colours.
-
-    It has no title, because a page has headings and captions.
-
-    Args:
-        prefix: of the figure's ids; unique on the page.
-    """
-    if figure.get_suptitle():
-        figure.suptitle("")
-    for axes in figure.axes:
-        for axis in (axes.xaxis, axes.yaxis):
-            if axis.get_scale() in ("log", "symlog"):
-                _set_plain(axis)
-    buffer = io.StringIO()
-    figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
-    svg = ElementTree.fromstring(buffer.getvalue())
-    for element in list(svg.iter()):
-        for child in [child for child in element if child.tag.endswith(("}metadata", "}style"))]:
-            element.remove(child)
-    values = " ".join(value for element in svg.iter() for value in element.attrib.values())
-    used = set(re.findall(r"#(\w+)", values))
-    for element in svg.iter():
-        element.tag = element.tag.rpartition("}")[2]
-        named = {name.rpartition("}")[2]: value for name, value in element.attrib.items()}
-        element.attrib = {
-            name: _of_page(name, value, prefix)
-            for name, value in named.items()
-            if name != "id" or value in used
-        }
-    svg.attrib = {"viewBox": svg.attrib["viewBox"], "style": f"--width: {svg.attrib['width']}"}
-    return re.sub(r"\s*\n\s*", "\n", ElementTree.tostring(svg, encoding="unicode"))
-
-
-def _set_plain(axis: matplotlib.axis.Axis) -> None:
-    """Few ticks of a logarithmic axis, as plain numbers."""
-    axis.set_major_formatter(_PlainLog())
-    axis.set_minor_formatter(_PlainLog())
-    low, high = sorted(axis.get_view_interval())
-    if low <= 0 or high / low > 100:  # powers of ten are enough
-        axis.set_minor_locator(matplotlib.ticker.NullLocator())
-
-
-def _of_page(name: str, value: str, prefix: str) -> str:
-    """The value of an attribute with unique ids, the page's colours and font, short numbers."""
-    if name == "id":
-        return f"{prefix}-{value}"
-    if name == "href":
-        return value.replace("#", f"#{prefix}-")
-    value = re.sub(r" ?font-family: [^;]*;", "", value.replace("url(#", f"url(#{prefix}-"))
-    value = re.sub(r"(\.\d\d)\d+", r"\1", value)  # hundredths of a point cannot be seen
-    return re.sub("#[0-9a-f]{6}", lambda m: _PAGE_COLOURS.get(m[0], m[0]), value)
+    @property
+    def outputs(self) -> np.ndarray:
+        """Measured outputs, in SI units."""
+        ...
 
 
 class _Figure(matplotlib.figure.Figure):
@@ -141,7 +81,7 @@ class _Figure(matplotlib.figure.Figure):
 
 def colour_of(i: int) -> str:
     """Colour of the i-th line of a figure."""
-    return _COLOURS[i % len(_COLOURS)]
+    return COLOURS[i % len(COLOURS)]
 
 
 def new_figure(
@@ -232,7 +172,7 @@ def draw_levels(axis: matplotlib.axes.Axes, part: Output, largest: float) -> Non
             axis.axhline(sign * level * factor, color=colour, ls="--", lw=1, label=label)
 
 
-def draw_episodes(axes: Axes, description: PlantDescription, records: Sequence[Record]) -> None:
+def draw_episodes(axes: Axes, description: PlantDescription, records: Sequence[Samples]) -> None:
     """One column per experiment; one row per input, then one per output."""
     for i, part in enumerate(description.inputs):
         axes[i, 0].set(ylabel=axis_label(part))
@@ -247,3 +187,28 @@ def draw_episodes(axes: Axes, description: PlantDescription, records: Sequence[R
             time, values = thin(record.time, record.outputs[:, i])
             axis.plot(time, display_unit(part.unit)[1] * values, color=BLUE, lw=1)
             draw_levels(axis, part, largest)
+
+
+def episode_figure(description: PlantDescription, record: Samples) -> matplotlib.figure.Figure:
+    """Inputs and outputs of one experiment, with the safety levels."""
+    figure, axes = new_figure(len(description.inputs) + len(description.outputs))
+    draw_episodes(axes, description, [record])
+    axes[-1, 0].set(xlabel="time [s]")
+    add_legend(figure, *axes[:, 0])
+    add_title(figure, description.name)
+    return figure
+
+
+def episodes_figure(
+    description: PlantDescription, records: Mapping[str, Samples]
+) -> matplotlib.figure.Figure:
+    """Several experiments of one plant side by side, by title."""
+    rows = len(description.inputs) + len(description.outputs)
+    figure, axes = new_figure(rows, len(records), width=3.2 * len(records), sharey="row")
+    draw_episodes(axes, description, list(records.values()))
+    for column, title in enumerate(records):
+        axes[0, column].set(title=title)
+        axes[-1, column].set(xlabel="time [s]")
+    add_legend(figure, *axes[:, 0])
+    add_title(figure, f"{description.name}: nominal response")
+    return figure
