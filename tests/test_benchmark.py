@@ -237,10 +237,10 @@ def test_the_interval_of_a_rate_is_wilsons(successes, count):
     assert 0 <= low <= successes / count <= high <= 1
 
 
-def outcome(status: list[Status], estimated: list[list[float]]) -> Any:
+def scores(status: list[Status], estimated: list[list[float]]) -> Any:
     """Episodes of a plant whose parameters are 2, 4 and 5, with standard errors of 10 %."""
     true = np.tile([2.0, 4.0, 5.0], (len(status), 1))
-    return benchmark.Outcome(
+    return benchmark.Scores(
         true=true,
         estimated=np.array(estimated),
         std_error=0.1 * true,
@@ -263,7 +263,7 @@ GOOD, BAD = [2.2, 3.6, 5.0], [math.nan, math.inf, -1e9]
 
 def test_means_are_over_the_estimates_that_did_not_fail():
     status = [Status.SUCCESSFUL, Status.UNPHYSICAL, Status.SUCCESSFUL, Status.NOT_FINITE]
-    mixed = outcome(status, [GOOD, BAD, [1.4, 4.0, 5.5], BAD])
+    mixed = scores(status, [GOOD, BAD, [1.4, 4.0, 5.5], BAD])
     row = benchmark.table_row(STUDY, PLANT.description, ("m", "e"), mixed).data()
     assert (row["evaluations"], row["failed"]) == (4, 2)
     assert row["failures"] == {"not_finite": 1, "unphysical": 1}
@@ -282,7 +282,7 @@ def test_means_are_over_the_estimates_that_did_not_fail():
 def test_violations_and_outputs_are_those_of_all_episodes():
     status = [Status.UNPHYSICAL, Status.SUCCESSFUL]
     row = benchmark.table_row(
-        STUDY, PLANT.description, ("m", "e"), outcome(status, [BAD, GOOD])
+        STUDY, PLANT.description, ("m", "e"), scores(status, [BAD, GOOD])
     ).data()
     assert row["violations"] == 1
     assert row["violation_rate"] == {"estimate": 0.5, "ci95": list(wilson(1, 2))}
@@ -292,14 +292,14 @@ def test_violations_and_outputs_are_those_of_all_episodes():
 
 def test_an_estimate_far_outside_its_own_interval_is_counted():
     status = [Status.SUCCESSFUL] * 3
-    wrong = outcome(status, [GOOD, [2.0, 4.0, 8.1], [4.0, 0.1, 5.0]])
+    wrong = scores(status, [GOOD, [2.0, 4.0, 8.1], [4.0, 0.1, 5.0]])
     row = benchmark.table_row(STUDY, PLANT.description, ("m", "e"), wrong).data()
     assert row["beyond_6_std_errors"] == 2
 
 
 def test_where_every_estimate_failed_there_is_no_mean():
     row = benchmark.table_row(
-        STUDY, PLANT.description, ("m", "e"), outcome([Status.UNPHYSICAL] * 2, [BAD, BAD])
+        STUDY, PLANT.description, ("m", "e"), scores([Status.UNPHYSICAL] * 2, [BAD, BAD])
     ).data()
     assert (row["evaluations"], row["failed"]) == (2, 2)
     plain = json_ready(row)
