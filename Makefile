@@ -24,7 +24,7 @@ test-pages: .venv/dev ## commands of the documentation, and the bench page in a 
 	$(QUICK) $(PYTEST) tests/pages
 
 test-science: .venv/dev ## promises of the shipped policies, baselines, trainings from end to end
-	$(PYTEST) -m science -o norecursedirs="pages results standin"
+	$(PYTEST) -m science
 
 check-results: .venv/dev ## the committed results are what the documentation says of them
 	$(BIN)/python -m pytest tests/results

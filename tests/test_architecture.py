@@ -114,13 +114,13 @@ def resolved(name: str) -> str | None:
     return None
 
 
-SHOWING = ("__repr__", "plot", "to_pandas", "data_frame", "require_matlab")
-"""Functions that import what shows a result, or an optional package, when they are called."""
+SHOWING = ("plot", "data_frame", "require_matlab")
+"""Functions that import Matplotlib's figures, or an optional package, when they are called."""
 
 
 @cache
 def _shown(module: str) -> frozenset[ast.AST]:
-    """Imports inside functions that show an object."""
+    """Imports inside these functions."""
     functions = [n for n in ast.walk(tree_of(module)) if isinstance(n, ast.FunctionDef)]
     return frozenset(n for f in functions if f.name in SHOWING for n in ast.walk(f))
 

@@ -1,4 +1,4 @@
-"""All tests in this folder are long."""
+"""All tests in this folder are long, and marked so."""
 
 from pathlib import Path
 

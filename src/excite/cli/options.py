@@ -240,7 +240,7 @@ def progress_bar(what: str) -> Iterator[Callable[[str, float, float], None]]:
     Yields a function that sets the current step, how much is done, and the total.
     """
     with contextlib.ExitStack() as stack:
-        if sys.stderr.isatty() or "FORCE_COLOR" in os.environ:
+        if sys.stderr.isatty() or os.environ.get("FORCE_COLOR"):
             from rich.console import Console
             from rich.progress import BarColumn, Progress, TaskProgressColumn, TimeRemainingColumn
 

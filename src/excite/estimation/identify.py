@@ -299,9 +299,10 @@ def _fit(
     estimator: AbstractEstimator,
     start: Params,
 ) -> _Fit:
-    """Fits, then tests parameters that were held again from the end of the search.
+    """Fits; parameters that were held are tested once more, from the estimate.
 
-    Far from the true values, a search can stop where the data seem to determine nothing.
+    Far from the true values a search can end at an estimate where the outputs hardly depend
+    on a parameter, although the data determine it.
     """
     fit = _fit_seen(plant, experiments, estimator, start)
     if not (fit.reasons and fit.is_successful):

@@ -118,7 +118,7 @@ def evaluate_method(
         squares.append(np.mean(inputs**2, axis=1))
         for e, estimator in estimators.items():
             parts[e].append(scores(plant, estimator, episodes, on_rig))
-    rows = [table_row(study, plant.description, (name, e), joined(o)) for e, o in parts.items()]
+    rows = [table_row(study, plant.description, (name, e), joined(p)) for e, p in parts.items()]
     if study.lengths:
         bounds = {"bound_by_length": _bound_by_length(study, plant, excitation)}
         rows = [row.model_copy(update=bounds) for row in rows]
