@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import queue
 import sys
 from contextlib import aclosing
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 from commands import PATIENCE
 
 from excite.study import workers as processes
+from excite.study.worker import Message, Result, Started
 from excite.web import workers as module
 from excite.web.jobs import columns
 from excite.web.requests import RefusedError, without_folders
@@ -74,6 +76,27 @@ def test_a_worker_that_answers_oddly_is_replaced_and_nobody_waits(kind: str, pro
     assert [event["kind"] for event in bad] == ["started", "failed"]
     assert "invalid worker response" in bad[-1]["sentence"]
     assert good == 2 * [[{"kind": "started"}, {"kind": "end"}]]
+
+
+def test_a_call_that_is_over_is_not_stopped(program: Path):
+    """The program ends at a message that is not a call."""
+    write(program, HEADER + "    print(good, flush=True)\n")
+    pool, said = processes.Workers(1), queue.SimpleQueue[Message]()
+    calls = queue.SimpleQueue[processes.Call]()
+
+    def tell(message: Message) -> None:
+        if isinstance(message, Result):
+            pool.withdraw(calls.get())
+        said.put(message)
+
+    pool.open()
+    try:
+        for _ in range(2):
+            calls.put(pool.submit("good", {}, tell))
+            assert said.get(timeout=PATIENCE) == Started()
+            assert said.get(timeout=PATIENCE) == Result()
+    finally:
+        pool.close()
 
 
 def test_what_comes_after_the_end_is_refused(program: Path):

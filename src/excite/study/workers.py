@@ -171,16 +171,22 @@ class Workers:
     def withdraw(self, call: Call) -> None:
         """Ends a call that is no longer needed, also in the queue."""
         with self._changed:
+            if call.is_over:
+                return
             call.forget()
             if call in self._waiting:
                 self._waiting.remove(call)
-            elif call.process is not None:
-                call.process.send({"stop": call.number})
-                _later(GRACE, self._kill, call)
+        self._stop(call)
 
     def _expire(self, call: Call) -> None:
         call.say(Failure("this took too long and was stopped"))
-        self.withdraw(call)
+        self._stop(call)
+
+    def _stop(self, call: Call) -> None:
+        with self._changed:
+            if call.process is not None:
+                call.process.send({"stop": call.number})
+                _later(GRACE, self._kill, call)
 
     def _kill(self, call: Call) -> None:
         with self._changed:
