@@ -136,6 +136,7 @@ def test_sensitivities_are_held_to_their_limit_and_below_it_left_alone():
     assert largest(2 * free) == free
 
 
+@pytest.mark.science
 def test_a_sum_is_worth_the_sum_of_its_terms():
     goals = [0.01, 0.004, 1.0]
     terms = (
@@ -156,7 +157,7 @@ def test_a_sum_is_worth_the_sum_of_its_terms():
     assert abs(together[1] - jnp.mean(together[0])) > 1e-3
 
 
-@pytest.mark.parametrize("name", OBJECTIVES)
+@pytest.mark.parametrize("name", [n if n == "D and errors" else LONG(n) for n in OBJECTIVES])
 def test_the_gradient_is_that_of_the_whole_experiment(name):
     env = env_of(OBJECTIVES[name])
     weights = weights_of(env)
@@ -216,6 +217,7 @@ def test_excess_counts_from_the_margin_to_the_critical_level():
     np.testing.assert_allclose(batch.nearness[0], outputs.max() / critical, rtol=1e-6)
 
 
+@pytest.mark.science
 def test_training_learns_and_one_seed_gives_one_policy():
     env = env_of(OBJECTIVES["D"])
     settings = dataclasses.replace(FEW, num_updates=30, watch_every=10, last_gain=0.1)

@@ -404,6 +404,7 @@ def test_a_study_says_what_was_set_inferred_and_its_own():
     assert "weight 5" in agents[2][3]
 
 
+@pytest.mark.science
 def test_learning_is_drawn_from_all_seeds_or_not_at_all(tmp_path):
     assert "RL(all), 10 seeds" in page_of(RESULTS / "table1", drawn=True).words
     assert "J_p bound [%]" in page_of(RESULTS / "frontier", drawn=True).words
@@ -458,6 +459,7 @@ def test_studies_without_a_common_method_say_so_and_other_plants_are_not_compare
     assert "side by side" not in report_html([here / "bench", here / "other"])
 
 
+@pytest.mark.science
 def test_long_records_make_no_large_page(here, drawn, monkeypatch):
     result, rng = read(here / "one" / "estimate.json"), np.random.default_rng(0)
     count, length = 2, 7999

@@ -316,6 +316,7 @@ def test_outputs_are_weighted_by_the_noise_they_turn_out_to_have():
     np.testing.assert_allclose(wrong.covariance, right.covariance, rtol=0.05, atol=1e-9)
 
 
+@pytest.mark.science
 def test_many_fits_are_successful_at_the_bound_and_inside_their_intervals():
     plant = Aero2(sensor=Sensor(jnp.array([0.00063]), jnp.zeros(1)))
     draw_key, episode_key = jax.random.split(KEY)

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import torch
-from catalogue import LONG
 from gymnasium import spaces
 from stable_baselines3 import PPO
 
@@ -65,9 +64,9 @@ class Probe(AbstractObjective):
         return jnp.zeros(3)
 
 
+@pytest.mark.science
 @pytest.mark.parametrize(
-    ("num_steps", "first", "later"),
-    [LONG(1, 0.5, 0.0), (2, 0.4, -0.4), LONG(4, -0.5, 0.25)],
+    ("num_steps", "first", "later"), [(1, 0.5, 0.0), (2, 0.4, -0.4), (4, -0.5, 0.25)]
 )
 def test_the_best_policy_of_a_probe_is_found(num_steps, first, later):
     plant = Aero2()

@@ -552,6 +552,7 @@ def test_experiments_on_rigs_are_scored_like_those_on_plants():
     assert not np.asarray(scored.is_violation).any()
 
 
+@pytest.mark.science
 def test_a_level_counts_between_samples_too():
     keys = jax.random.split(jax.random.key(0), 8)
     many = bodies(PLANT, readings_per_sample(PLANT), 0.3, keys)
