@@ -193,6 +193,7 @@ def from_poles(z_1: complex, z_2: complex) -> list[float]:
     ([-1.4, 0.45, np.inf, 0.1], Status.NOT_FINITE),
 ])  # fmt: skip
 def test_the_poles_decide_the_status(coefficients, status):
+    assert transfer_function(jnp.array(coefficients), Aero2().dt)[3] == status
     assert physical_params(Aero2(), jnp.array(coefficients))[1] == status
 
 
@@ -252,6 +253,20 @@ def test_the_covariance_of_the_estimate_is_that_of_many_estimates():
     np.testing.assert_allclose(estimates.information[0] @ relative, np.eye(3), atol=1e-6)
 
 
+def test_the_variance_of_few_samples_counts_the_four_coefficients():
+    rng = np.random.default_rng(6)
+    inputs = rng.uniform(-1, 1, 14)
+    outputs = spring_data(inputs) + 1e-3 * rng.normal(size=15)
+    estimate = ARX(start_covariance=1e9)(Spring(), experiments_of(Spring(), (inputs, outputs)))
+    rows, right = regression(inputs, outputs)
+    coefficients, squares, _, _ = np.linalg.lstsq(rows, right, rcond=None)
+    spread = squares[0] / (len(rows) - 4) * np.linalg.inv(rows.T @ rows)
+    slope = jax.jacfwd(lambda c: jnp.stack(physical_params(Spring(), c)[0]))(
+        jnp.asarray(coefficients)
+    )
+    np.testing.assert_allclose(estimate.covariance, slope @ spread @ slope.T, rtol=1e-4)
+
+
 def test_two_experiments_do_not_straddle():
     rng = np.random.default_rng(5)
     inputs = rng.uniform(-1, 1, 80), rng.uniform(-1, 1, 30)
@@ -280,10 +295,12 @@ def test_zero_input_is_ill_conditioned():
         assert estimate.status == Status.ILL_CONDITIONED
 
 
-def test_an_input_that_only_repeats_the_output_is_ill_conditioned():
+@pytest.mark.parametrize("other", [0.0, 1e-12])
+def test_an_input_that_only_repeats_the_output_is_ill_conditioned(other):
     plant = Aero2(initial_state=jnp.array([0.3, 0.0]))
     y = np.asarray(response(plant, plant.nominal, jnp.zeros((60, 1)))[:, 0])
-    estimate = ARX()(plant, experiments_of(plant, (-3 * y[:-1], y)))
+    inputs = -3 * y[:-1] + other * np.random.default_rng(0).normal(size=60)
+    estimate = ARX()(plant, experiments_of(plant, (inputs, y)))
     assert estimate.status == Status.ILL_CONDITIONED
 
 

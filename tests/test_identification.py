@@ -21,9 +21,10 @@ from excite.estimation.result import Identification, write_run
 from excite.excitation import PRBS, Chirp, Random, Replay
 from excite.files import json_ready
 from excite.information import best_possible
-from excite.plant import EMPS, AbstractPlant, Aero2, Aero2Lag, DCMotor
-from excite.record import Record, read_record, write_record
-from excite.simulation import response
+from excite.plant import EMPS, AbstractPlant, Aero2, Aero2Detailed, Aero2Lag, DCMotor
+from excite.plant.catalogue import plant_from
+from excite.record import Record, read_record, require_columns, write_record
+from excite.simulation import response, simulate
 
 ROOT = Path(__file__).parent.parent
 PLANT = Aero2()
@@ -276,6 +277,40 @@ def test_data_in_which_no_parameter_can_be_seen_are_refused(spoil, foreign):
 def test_a_record_of_a_plant_with_other_constants_is_remarked(chirp):
     result = identify([dataclasses.replace(chirp, source="chirp.csv")], PLANT.changed(m=1.2))
     assert any("chirp.csv" in s and "other known constants" in s for s in result.verdict)
+
+
+def test_a_record_of_another_plant_is_remarked_first_or_refused(chirp):
+    result = identify([chirp], Aero2Detailed())
+    assert result.verdict[0].endswith("was made with plant 'aero2', not with 'aero2_detailed'")
+    with pytest.raises(ValueError, match="'aero2' and has voltage, pitch; plant 'emps' has force"):
+        identify([chirp], "emps")
+    with pytest.raises(ValueError, match="'aero2' and has voltage; plant 'emps' has force"):
+        simulate("emps", chirp)
+
+
+def test_a_record_whose_columns_were_mapped_is_of_the_plant_they_were_mapped_to(tmp_path):
+    simulate("aero2", "chirp", steps=60).save(tmp_path / "r.csv")
+    plant = plant_from("emps")
+    mapped = {"force": "voltage", "position": "pitch"}
+    record = read_record(tmp_path / "r.csv", plant.description, mapped)
+    require_columns(record, plant.description)
+    with pytest.raises(ValueError, match="is of plant 'aero2'"):
+        require_columns(read_record(tmp_path / "r.csv"), plant.description)
+
+
+def test_a_failed_estimate_says_what_the_estimator_needs_and_shows_no_fit(chirp):
+    result = identify([chirp], PLANT, "decrement")
+    assert not result.is_usable
+    shown = str(result)
+    assert "decrement needs an input that ends at rest, and a free decay after it" in shown
+    assert "fit" not in shown
+    assert "– to –" not in shown
+
+
+def test_a_correlation_needs_two_estimates(chirp):
+    held = {"J_p": 0.0232, "D_p": 0.00071}
+    assert "correlation" in str(identify([chirp], PLANT))
+    assert "correlation" not in str(identify([chirp], PLANT, hold=held))
 
 
 def test_an_input_of_the_wrong_sign_gives_no_usable_result(foreign):

@@ -14,10 +14,12 @@ import difflib
 import hashlib
 import json
 import math
+import os
 import reprlib
 import textwrap
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
+from pathlib import Path
 from typing import Any, TypeVar
 
 FORMAT = 1
@@ -45,6 +47,8 @@ class _Named:
     name: str
 
     def __post_init__(self) -> None:
+        if not isinstance(self.name, str):
+            raise wrong_type(f"name of a {type(self).__name__.lower()}", self.name, "a text")
         _require(
             self.name.isidentifier() and not self.name.startswith("_"),
             f"{type(self).__name__.lower()} name {self.name!r} is not allowed: "
@@ -60,6 +64,8 @@ class _Named:
                     f"{field.name} of {self.name!r} is {value}; a finite number is needed "
                     "(leave a bound out for none)",
                 )
+            elif str(field.type).startswith("float") and value is not None:
+                raise wrong_type(f"{field.name} of {self.name!r}", value, "a number")
 
 
 @dataclass(frozen=True)
@@ -354,6 +360,9 @@ class Named(dict[str, _T]):
             return self[name]
         raise AttributeError(str(unknown("name", name, self)))
 
+    def __missing__(self, name: str) -> _T:
+        raise KeyError(str(unknown("name", name, self)))
+
     def __dir__(self) -> list[str]:
         return [*super().__dir__(), *self]
 
@@ -379,3 +388,10 @@ def wrong_type(what: str, value: object, allowed: str) -> TypeError:
     shown = "" if text.startswith("<") or "\n" in text else f" {text}"
     kind = f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
     return TypeError(f"{what} must be {allowed}: got {kind}{shown * (not isinstance(value, type))}")
+
+
+def path_from(what: str, value: object, allowed: str = "a path") -> Path:
+    """A path from a text or a path; TypeError for anything else."""
+    if not isinstance(value, str | os.PathLike):
+        raise wrong_type(what, value, allowed)
+    return Path(value)

@@ -52,9 +52,9 @@ class Assignments(click.ParamType, Generic[Value]):
 
     name = "NAME=VALUE,..."
 
-    def __init__(self, convert: Callable[[str], Value]) -> None:
-        """`convert` reads the text of one value; its ValueError becomes the user's sentence."""
-        self.convert_value = convert
+    def __init__(self, convert: Callable[[str], Value], kind: str) -> None:
+        """`convert` reads the text of one value, or raises ValueError; `kind` is what it allows."""
+        self.convert_value, self.kind = convert, kind
 
     def convert(
         self,
@@ -74,7 +74,7 @@ class Assignments(click.ParamType, Generic[Value]):
             try:
                 result[name] = self.convert_value(text)
             except ValueError:
-                self.fail(f"{text!r} is not a value for {name!r}", param, ctx)
+                self.fail(f"{text!r} is not {self.kind} for {name!r}", param, ctx)
         return result
 
 
@@ -92,9 +92,9 @@ def _option_value(text: str) -> bool | float | list[object]:
     return value
 
 
-NUMBERS = Assignments(float)
-NAMES = Assignments(str)
-VALUES = Assignments(_option_value)
+NUMBERS = Assignments(float, "a number")
+NAMES = Assignments(str, "a name")
+VALUES = Assignments(_option_value, "a number, true, false or a list of numbers")
 OUT_FILE = click.Path(path_type=Path)
 
 

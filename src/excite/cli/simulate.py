@@ -14,6 +14,7 @@ from .options import (
     OUT_FILE,
     VALUES,
     RunFailedError,
+    WholeNumber,
     computing,
     json_option,
     merged,
@@ -39,7 +40,7 @@ def excitation_options(command: Callable[..., Any]) -> Callable[..., Any]:
                          help="Options of the excitation: amplitude, hold, clock, register, "
                          "start_frequency, stop_frequency, frequency, logarithmic, pump; of a "
                          "loop also gain, damping."),
-            click.option("--steps", type=click.IntRange(2, 10_000_000), metavar="T",
+            click.option("--steps", type=WholeNumber(2, 10_000_000), metavar="T",
                          help="Length in samples; default 500, that of a policy, or all of a "
                          "file."),
             click.option("--params", type=NUMBERS, multiple=True,
@@ -48,7 +49,7 @@ def excitation_options(command: Callable[..., Any]) -> Callable[..., Any]:
                          help="Standard deviation of an output's noise, in its unit."),
             click.option("--resolution", type=NUMBERS, multiple=True,
                          help="Step of an output's encoder, in its unit."),
-            click.option("--seed", type=click.IntRange(0, 2**63 - 1), default=0, show_default=True),
+            click.option("--seed", type=WholeNumber(0, 2**63 - 1), default=0, show_default=True),
             click.option("--column", type=NAMES, multiple=True,
                          help="Columns of the input file with another name: voltage=u."),
             click.option("--scale", type=NUMBERS, multiple=True,

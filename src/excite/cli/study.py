@@ -39,14 +39,14 @@ def changes(command: Callable[..., Any]) -> Callable[..., Any]:
     for option in (
         click.option("--overwrite", is_flag=True, help="Replace the run folder if it exists."),
         click.option("--estimators", metavar="NAME,...", help="Instead of the study's."),
-        click.option("--seed", type=click.IntRange(0, 2**63 - 1), help="Instead of the study's."),
-        click.option("--episodes", type=click.IntRange(min=1), help="Instead of the study's."),
+        click.option("--seed", type=WholeNumber(0, 2**63 - 1), help="Instead of the study's."),
+        click.option("--episodes", type=WholeNumber(1), help="Instead of the study's."),
     ):
         command = option(command)
     return command
 
 
-@study.command()
+@study.command(short_help="Compare the methods of a study; train its agents first.")
 @click.argument("study", metavar="STUDY")
 @click.option("--out", type=OUT_FILE, metavar="FOLDER", help="Run folder; needed with agents.")
 @changes

@@ -9,7 +9,7 @@ from __future__ import annotations
 import abc
 import enum
 from collections.abc import Sequence
-from typing import TypeAlias
+from typing import ClassVar, TypeAlias
 
 import equinox as eqx
 import jax
@@ -112,9 +112,13 @@ class Estimate(eqx.Module):
 
 
 class AbstractEstimator(eqx.Module):
-    """Base of all estimators; `name` is used on the command line."""
+    """Base of all estimators; `name` is used on the command line.
+
+    `needs` says in words what a record must have; it is shown with a failed estimate.
+    """
 
     name: eqx.AbstractVar[str]
+    needs: ClassVar[str] = ""
 
     @abc.abstractmethod
     def __call__(

@@ -8,6 +8,8 @@ then one least-squares factor of the whole response.
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -48,6 +50,7 @@ class Decrement(AbstractEstimator):
     """
 
     name: str = eqx.field(static=True, default="decrement", kw_only=True)
+    needs: ClassVar[str] = "an input that ends at rest, and a free decay after it"
 
     @eqx.filter_jit
     def __call__(

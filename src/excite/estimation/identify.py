@@ -17,7 +17,7 @@ from ..files import json_ready
 from ..information import identifiability, worst_seen
 from ..plant import AbstractPlant, Params, floats, params_from
 from ..plant.catalogue import PLANTS, PlantLike, plant_from
-from ..record import Record, read_record, read_sidecar
+from ..record import Record, described_in, read_record, require_columns
 from .catalogue import estimator_from
 from .contract import (
     AbstractEstimator,
@@ -124,8 +124,8 @@ def identify(
     }
     covariance, verdict = _confidence(plant, experiments, estimator, fit, whiteness)
     wrong = _wrong_structure(structure, estimator) if fit.is_successful else ()
-    verdict = (*wrong, *verdict)
-    verdict += tuple(s for record in [*records, *validation] for s in _other_plant(record, plant))
+    others = tuple(s for record in [*records, *validation] for s in _other_plant(record, plant))
+    verdict = (*others, *wrong, *verdict)
     names, d = names_of(plant.definition.parameters), plant.description
     sd = np.where(fit.free, np.sqrt(np.maximum(np.diag(covariance), 0.0)), np.nan)
     return Identification(
@@ -162,10 +162,7 @@ def _plant_of(record: RecordLike) -> str:
     """The plant that a record's sidecar names."""
     is_read = isinstance(record, Record)
     where = (record.source if is_read else str(record)) or "the record"
-    made_with = (record.metadata if is_read else read_sidecar(Path(record))).get("plant", {})
-    name = made_with.get("name")
-    if name is None:
-        raise ValueError(f"{where} has no sidecar that names its plant: name the plant")
+    name = (record.description if is_read else described_in(Path(record))).name
     if name not in PLANTS:
         raise ValueError(
             f"{where} is of plant {name!r}, which does not come with the package: give the plant "
@@ -189,6 +186,7 @@ def _read(
             f"{record.source or 'the record'} has {found[0]} inputs and {found[1]} outputs; plant "
             f"{description.name!r} has {len(description.inputs)} and {len(description.outputs)}"
         )
+    require_columns(record, description)
     return record
 
 
@@ -222,14 +220,14 @@ def _starts_at(record: Record, plant: AbstractPlant) -> bool:
 
 
 def _other_plant(record: Record, plant: AbstractPlant) -> tuple[str, ...]:
-    """A warning where the sidecar has a plant with other constants."""
+    """A warning where the record was made with another plant or other constants."""
     made_with, own = record.metadata.get("plant", {}), json_ready(plant.description.to_dict())
     if all(made_with.get(key, own[key]) == own[key] for key in ("name", "constants")):
         return ()
-    return (
-        f"{record.source} is of plant {made_with.get('name')!r} with other known constants "
-        f"than {own['name']!r}, according to its sidecar",
-    )
+    where, name = record.source or "the record", made_with.get("name", own["name"])
+    if name != own["name"]:
+        return (f"{where} was made with plant {name!r}, not with {own['name']!r}",)
+    return (f"{where} was made with other known constants of {name!r}",)
 
 
 def _check_lengths(plant: AbstractPlant, records: Sequence[Record], known: bool) -> None:
@@ -385,7 +383,9 @@ def _confidence(
     """Covariance of the estimates, and the sentences of the verdict."""
     covariance = np.asarray(fit.estimate.covariance)
     if not fit.is_successful:
-        return covariance, (*fit.reasons, Status(int(fit.estimate.status)).sentence)
+        sentence = Status(int(fit.estimate.status)).sentence
+        needed = f"; {estimator.name} needs {estimator.needs}" if estimator.needs else ""
+        return covariance, (*fit.reasons, sentence + needed)
     names = names_of(plant.definition.parameters)
     parameters = zip(plant.definition.parameters, fit.estimate.params, strict=True)
     size = np.array([float(value) if p.positive else p.scale for p, value in parameters])

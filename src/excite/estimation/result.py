@@ -14,7 +14,7 @@ from .. import __version__
 from ..description import HALF_95, Named, PlantDescription, names_of
 from ..files import csv_text, new_run_folder, write_json
 from ..record import Record, write_record
-from ..record.rows import EstimateSummary
+from ..record.rows import USABLE, EstimateSummary
 from ..record.table import data_frame
 from ..report.results import identification_html, identification_text, wrapped
 from .diagnosis import correlation, fit_percent
@@ -83,7 +83,7 @@ class Identification:
     @property
     def is_usable(self) -> bool:
         """Whether there is an estimate."""
-        return self.status in ("successful", "partly identifiable")
+        return self.status in USABLE
 
     def ci95(self, name: str) -> tuple[float, float]:
         """95 % interval of a parameter; symmetric, estimate ± 1.96 standard errors."""

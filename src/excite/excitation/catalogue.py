@@ -130,8 +130,10 @@ def _object(
     if isinstance(given, AbstractExcitation):
         return with_options(given, name, options) if options else given
     inputs = given.inputs if isinstance(given, HasInputs) else given
-    is_sequence = isinstance(inputs, np.ndarray | Array) and inputs.dtype.kind in "fiu"
-    if not is_sequence or inputs.ndim != 2:
+    is_array = isinstance(inputs, np.ndarray | Array) and inputs.dtype.kind in "fiu"
+    if is_array and inputs.ndim != 2:
+        raise ValueError(f"inputs need a row for each sample: got shape {inputs.shape}")
+    if not is_array:
         raise wrong_type(
             "excitation",
             given,
@@ -142,7 +144,10 @@ def _object(
         raise ValueError(f"recorded inputs have no options: got {', '.join(options)}")
     if isinstance(given, Record):
         require_playable(given, plant.definition)
-    return Replay(floats(inputs))
+    rows = np.asarray(inputs, float)
+    if (bad := np.flatnonzero(~np.isfinite(rows).all(axis=1))).size:
+        raise ValueError(f"inputs must be finite: got {rows[bad[0]].tolist()} at sample {bad[0]}")
+    return Replay(floats(rows))
 
 
 def _recorded(name: str, options: Mapping[str, Any], plant: AbstractPlant) -> Replay:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..description import Listing, unknown
+from ..description import Listing, path_from, unknown
 from .contract import Policy
 
 POLICY_ENDING = ".safetensors"
+_ALLOWED = "a name or a path"
 SHIPPED = Path(__file__).parent / "shipped"
 
 
@@ -22,6 +23,7 @@ def read_policy(policy: str | Path) -> Policy:
         ValueError: one sentence for an unknown name, a file that cannot be read, or one that
             is not a valid policy.
     """
+    policy = policy if isinstance(policy, Path) else str(path_from("policy", policy, _ALLOWED))
     path = policy if isinstance(policy, Path) else policy_path(policy)
     if path is None:
         if Path(policy).exists():

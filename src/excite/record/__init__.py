@@ -3,6 +3,7 @@
 `table` reads CSV text from any source. Nothing here needs JAX.
 """
 
+from .prepare import require_columns as require_columns
 from .prepare import require_playable as require_playable
 from .read import SIGNAL_ENDINGS as SIGNAL_ENDINGS
 from .read import columns_in as columns_in
@@ -10,6 +11,6 @@ from .read import read_record as read_record
 from .read import read_signal as read_signal
 from .record import RECORD_KIND as RECORD_KIND
 from .record import Record as Record
-from .record import read_sidecar as read_sidecar
+from .record import described_in as described_in
 from .record import require_record_path as require_record_path
 from .record import write_record as write_record

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..description import Input, Output, PlantDescription
+from ..description import Input, Output, PlantDescription, names_of
 from .record import Record
 
 _UNEVEN = 0.05  # of the sampling time: more than rounding in the file explains
@@ -15,8 +15,26 @@ TIMES_DT = 50.0  # likewise sampling times this many times the plant's
 _TIMES_SCALE = 10.0  # likewise outputs beyond this many times their typical size
 
 
+def require_columns(
+    record: Record, description: PlantDescription, inputs_only: bool = False
+) -> None:
+    """Raises ValueError for a record that was made with other inputs and outputs."""
+    made_with = record.metadata.get("plant")
+    if not made_with or "columns" in record.metadata:
+        return
+    kinds = ("inputs",) if inputs_only else ("inputs", "outputs")
+    found = [part["name"] for kind in kinds for part in made_with[kind]]
+    needed = [name for kind in kinds for name in names_of(getattr(description, kind))]
+    if found != needed:
+        raise ValueError(
+            f"{record.source or 'the record'} is of plant {made_with['name']!r} and has "
+            f"{', '.join(found)}; plant {description.name!r} has {', '.join(needed)}"
+        )
+
+
 def require_playable(record: Record, description: PlantDescription) -> None:
-    """Raises ValueError for inputs beyond the limits, which would be clipped."""
+    """Raises ValueError for another plant's inputs, or beyond limits: they would be clipped."""
+    require_columns(record, description, inputs_only=True)
     for part, values in zip(description.inputs, record.inputs.T, strict=True):
         if values.min() < part.lower - 1e-9 or values.max() > part.upper + 1e-9:
             raise ValueError(

@@ -13,10 +13,11 @@ import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from ..description import PlantDescription, names_of
+from ..description import PlantDescription, names_of, path_from
 from .prepare import TIMES_DT, check_finite, check_size, check_time, require_playable
 from .record import Record, described_in, read_sidecar, require_matlab, require_record_ending
 from .table import text_columns
@@ -54,7 +55,7 @@ def read_record(
             truncated file, a missing column or sample, a value that is not finite,
             uneven sampling, values far outside what the plant can do.
     """
-    path, columns, scales = Path(path), columns or {}, scales or {}
+    path, columns, scales = path_from("record", path), columns or {}, scales or {}
     if description is None:
         description = described_in(path)
     for name in (*columns, *scales):
@@ -100,9 +101,19 @@ def read_record(
         time=time,
         inputs=np.stack([parts[n] for n in names_of(description.inputs)], axis=1),
         outputs=np.stack(chosen, axis=1) if chosen else np.empty((len(time), 0)),
-        metadata=read_sidecar(path),
+        metadata=_metadata(path, description),
         source=str(path),
     )
+
+
+def _metadata(path: Path, description: PlantDescription) -> Mapping[str, Any]:
+    """The sidecar; with `columns`, where the file's were mapped to those of another plant."""
+    sidecar = read_sidecar(path)
+    if not sidecar.get("plant"):
+        return sidecar
+    own = PlantDescription.from_dict(sidecar["plant"]).columns
+    mapped = {} if own == description.columns else {"columns": list(description.columns)}
+    return {**sidecar, **mapped}
 
 
 def read_signal(path: Path, description: PlantDescription) -> Record:

@@ -187,6 +187,9 @@ def read_sidecar(path: Path) -> Mapping[str, Any]:
 
 def described_in(path: Path) -> PlantDescription:
     """The plant that a record's sidecar names; ValueError without one."""
+    require_record_ending(path)
+    if not path.is_file():
+        raise ValueError(f"{path}: no such file")
     content = read_sidecar(path).get("plant")
     if not content:
         raise ValueError(f"{path} has no sidecar that names its plant: name the plant")

@@ -278,6 +278,10 @@ class HeldOut(Saved):
     fit_percent: dict[str, Number]
 
 
+USABLE = ("successful", "partly identifiable")
+"""Statuses of an identification that has estimates."""
+
+
 class EstimateSummary(Saved):
     """`estimate.json`: the result of an identification as plain data."""
 
@@ -299,3 +303,8 @@ class EstimateSummary(Saved):
     def of(cls, data: Mapping[str, object]) -> EstimateSummary:
         """From data as a file or `Identification` has them."""
         return cls.model_validate(json_ready(data))
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether there is an estimate."""
+        return self.status in USABLE

@@ -28,7 +28,7 @@ def parameter_cells(name: str, param: EstimatedParameter) -> list[str]:
         param.unit,
         number(param.estimate, digits),
         number(param.std_error),
-        f"{number(low, digits)} to {number(high, digits)}",
+        f"{number(low, digits)} to {number(high, digits)}" if math.isfinite(high) else "–",
         relative,
     ]
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import matplotlib
 
 from .. import __version__
+from ..description import path_from, wrong_type
 from ..files import write_bytes
 from ..record.figure import MAX_POINTS, at_most
 from .sections.elements import Marker, Run, Section, paragraph, text
@@ -77,8 +78,11 @@ def report(runs: str | Path | Sequence[str | Path], out: str | Path | None = Non
     """
     if out is not None and Path(out).suffix.lower() != ".html":
         raise ValueError(f"{out}: reports end in .html")
-    paths = [runs] if isinstance(runs, str | Path) else runs
-    page = report_html([Path(path) for path in paths])
+    given = [runs] if isinstance(runs, str | Path) else runs
+    allowed = "a run folder, a record's file, or several"
+    if not isinstance(given, Sequence):
+        raise wrong_type("runs", runs, allowed)
+    page = report_html([path_from("runs", path, allowed) for path in given])
     if out is not None:
         write_bytes(Path(out), page.encode())
     return page

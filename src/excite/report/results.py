@@ -45,6 +45,8 @@ def _estimates(result: EstimateSummary) -> tuple[str, Table]:
 
 def _judgement(result: EstimateSummary) -> list[str]:
     """Fits, tests of the residual, verdict and correlation, one a line."""
+    if not result.is_usable:
+        return list(result.verdict)
     lines = [
         f"{name}: fit {number(percent, 4)} %, {residual_in_words(result, name)}"
         for name, percent in result.fit_percent.items()
@@ -55,7 +57,7 @@ def _judgement(result: EstimateSummary) -> list[str]:
         for name, percent in v.fit_percent.items()
     ]
     lines += result.verdict
-    if len(result.params) > 1:
+    if sum(not p.held for p in result.params.values()) > 1:
         lines.append(f"largest correlation: {largest_correlation(result)}")
     return lines
 

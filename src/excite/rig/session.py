@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 
 from .. import __version__
-from ..description import PlantDescription, display_unit, wrong_type
+from ..description import PlantDescription, display_unit, path_from, wrong_type
 from ..policy import Policy, mismatch, policy_path, read_policy
 from ..record import Record, read_record, read_signal, require_record_path
 from ..record.read import SIGNAL_ENDINGS
@@ -229,7 +229,7 @@ def run(
         >>> ex.run(policy="aero2", dry_run=True).inputs.shape
         (500, 1)
     """
-    path = None if out is None else Path(out)
+    path = None if out is None else path_from("out", out)
     if path is not None:
         require_record_path(path, overwrite)
     elif not dry_run:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..description import unknown
+from ..description import path_from, unknown
 
 SHIPPED = Path(__file__).parent / "shipped"
 
@@ -25,7 +25,7 @@ def study_path(name: str | Path) -> Path:
     Raises:
         ValueError: for a word that is neither the name of a shipped study nor a file.
     """
-    path, shipped = Path(name), studies()
+    path, shipped = path_from("study", name, "a name or a path"), studies()
     if str(name) in shipped:
         return shipped[str(name)]
     if path.suffix == ".toml" or path.exists():

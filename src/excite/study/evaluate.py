@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from ..description import unknown
+from ..description import unknown, wrong_type
 from ..plant import AbstractARXPlant
 from ..plant.catalogue import PlantLike
 from ..policy import POLICY_ENDING, Policy, mismatch, policy_path, read_policy, shipped_policies
@@ -30,7 +30,7 @@ def evaluate(
     filter: bool = False,
     progress: Progress = lambda *_: None,
 ) -> StudyTable:
-    """Evaluates a policy on plants drawn at random.
+    """Evaluates a policy, not a plant, on plants drawn at random.
 
         >>> import excite as ex
         >>> table = ex.evaluate("aero2", episodes=4)
@@ -55,6 +55,8 @@ def evaluate(
     """
     if filter and not rig:
         raise ValueError("the safety filter is part of a rig: filter (--filter) needs rig (--rig)")
+    if not isinstance(policy, str | Path | Policy):
+        raise wrong_type("policy", policy, "a name, a path or a policy")
     with tempfile.TemporaryDirectory() as folder:
         word = str(policy)
         if isinstance(policy, Policy):

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
-from ..description import unknown
+from ..description import unknown, wrong_type
 
 OBJECTIVES: Mapping[str, Mapping[str, str]] = {
     "D": {"reward": "information", "criterion": "D"},
@@ -34,6 +34,8 @@ def rewards_of(
         ValueError: for an unknown name, one that repeats, or a weight that is not a number.
     """
     given = [objectives] if isinstance(objectives, str) else objectives
+    if not isinstance(given, Sequence | Mapping):
+        raise wrong_type("objective", objectives, "a name, several names, or a dict of weights")
     weights = list(given.items() if isinstance(given, Mapping) else map(_weighted, given))
     names = [name for name, _ in weights]
     for name in names:

@@ -14,7 +14,7 @@ import tomlkit
 import tomlkit.exceptions
 from pydantic import Field
 
-from ..description import names_of, unknown
+from ..description import names_of, unknown, wrong_type
 from ..environment import InformationGain
 from ..estimation import ARX, AbstractEstimator, Decrement
 from ..estimation.catalogue import ESTIMATORS, estimator_named
@@ -266,6 +266,8 @@ class Study(Settings):
         settings = {k: v for k, v in values.items() if v is not None}
         if estimators is not None:
             names = estimators.split(",") if isinstance(estimators, str) else estimators
+            if not (isinstance(names, Sequence) and all(isinstance(n, str) for n in names)):
+                raise wrong_type("estimators", estimators, "a name or several names")
             chosen = [name.strip() for name in names]
             known = {n: {"kind": n} for n in ESTIMATORS} | {
                 n: e.model_dump() for n, e in self.estimators.items()
