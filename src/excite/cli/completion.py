@@ -1,4 +1,4 @@
-"""Names that a shell completes, found without importing anything that computes.
+"""Names that a shell completes and help texts list, found without importing what computes.
 
 The shell calls this at every press of the Tab key, so it must be fast. Names of plants,
 excitations and estimators are read from the source of their catalogue, those of policies and
@@ -22,10 +22,14 @@ def plants() -> list[str]:
     return _keys("plant/catalogue.py", "PLANTS")
 
 
+def signals() -> list[str]:
+    """Names of the classical signals."""
+    return _keys("excitation/catalogue.py", "EXCITATIONS")
+
+
 def excitations() -> list[str]:
     """Names of the signals, alone and as the reference of a position loop."""
-    names = _keys("excitation/catalogue.py", "EXCITATIONS")
-    return [*names, *(f"loop-{name}" for name in names)]
+    return [*signals(), *(f"loop-{name}" for name in signals())]
 
 
 def estimators() -> list[str]:

@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+from .completion import signals
 from .options import (
     NUMBERS,
     OUT_FILE,
@@ -38,8 +39,8 @@ from .options import (
     show_default=True,
     metavar="NAME",
     help="robust: by gradient, safe for all plants of the spread; clairvoyant: for the nominal "
-    "plant; or a classical excitation to be tuned: random, prbs, chirp, multisine, square, decay, "
-    "or loop-NAME around one of them, whose run on the nominal plant is then written.",
+    f"plant; or a classical excitation to be tuned: {', '.join(signals())}, or loop-NAME around "
+    "one of them, whose run on the nominal plant is then written.",
 )
 @click.option(
     "--steps",

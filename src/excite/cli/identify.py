@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+from .completion import estimators
 from .options import (
     NAMES,
     NUMBERS,
@@ -31,7 +32,7 @@ from .options import (
     default="nls",
     show_default=True,
     metavar="NAME",
-    help="nls, arx-rls (the paper's), arx-rls-wide (wide start covariance) or decrement.",
+    help=f"{', '.join(estimators())}; arx-rls is the paper's.",
 )
 @click.option(
     "--initial-state",

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from .completion import signals
 from .options import (
     NAMES,
     NUMBERS,
@@ -33,13 +34,12 @@ def excitation_options(command: Callable[..., Any]) -> Callable[..., Any]:
     for option in reversed(
         [
             click.option("--excitation", metavar="NAME",
-                         help="random, prbs, chirp, multisine, square, decay, loop-NAME around one "
-                         "of them, a shipped policy, or a file: policy (.safetensors) or signal "
-                         "(.csv, .mat); default chirp."),
+                         help=f"{', '.join(signals())}, loop-NAME around one of them, a shipped "
+                         "policy, or a file: policy (.safetensors) or signal (.csv, .mat); default "
+                         "chirp."),
             click.option("--set", "settings", type=VALUES, multiple=True,
-                         help="Options of the excitation: amplitude, hold, clock, register, "
-                         "start_frequency, stop_frequency, frequency, logarithmic, pump; of a "
-                         "loop also gain, damping."),
+                         help="Options of the excitation, such as amplitude=5 (the message about "
+                         "an unknown one lists them); of a loop also gain, damping."),
             click.option("--steps", type=WholeNumber(2, 10_000_000), metavar="T",
                          help="Length in samples; default 500, that of a policy, or all of a "
                          "file."),

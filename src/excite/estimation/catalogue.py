@@ -25,8 +25,8 @@ def estimators() -> Listing:
     """The estimators, by name.
 
     >>> import excite as ex
-    >>> list(ex.estimators())
-    ['arx-rls', 'arx-rls-wide', 'nls', 'decrement']
+    >>> "nls" in ex.estimators()
+    True
     """
     return Listing({name: first_line(type(chosen)) for name, chosen in ESTIMATORS.items()})
 

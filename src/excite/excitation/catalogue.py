@@ -37,8 +37,8 @@ def excitations() -> Listing:
     """The excitations that need no training, by name.
 
     >>> import excite as ex
-    >>> list(ex.excitations())
-    ['random', 'prbs', 'chirp', 'multisine', 'square', 'decay', 'loop-NAME']
+    >>> "chirp" in ex.excitations()
+    True
     """
     listed = {name: first_line(kind) for name, kind in EXCITATIONS.items()}
     return Listing({**listed, f"{LOOP}NAME": first_line(PositionLoop)})
