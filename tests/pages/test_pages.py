@@ -89,6 +89,7 @@ def test_the_figures_of_the_pages_are_made_by_their_scripts(script: Path, tmp_pa
         (tmp_path / folder).symlink_to(ROOT / folder)
     copy = tmp_path / script.relative_to(ROOT)
     copy.parent.mkdir(parents=True)
+    (tmp_path / "docs" / "reference").symlink_to(ROOT / "docs" / "reference")
     shutil.copy(script, copy)
     subprocess.run([sys.executable, str(copy)], cwd=tmp_path, check=True, timeout=PATIENCE)
     made = [path for path in copy.parent.rglob("*.*") if path != copy]
