@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -74,7 +75,7 @@ def test_the_estimator_passes_its_test(added, monkeypatch):
     text, test = examples("Add an estimator")
     OneStep = added("estimation", "one_step", text).OneStep
     monkeypatch.setattr(estimation, "OneStep", OneStep, raising=False)
-    names = {"__name__": "test_one_step"}
+    names: dict[str, Any] = {"__name__": "test_one_step"}
     exec(test, names)
     names["test_noise_free_data_give_the_parameters"]()
     record = ex.simulate("aero2", "chirp", params={"J_p": 0.0233}, seed=0)
