@@ -148,7 +148,8 @@ def test_what_ran_on_the_rig_identifies_its_hidden_parameters(seed, call):
         assert abs(found.params[name] - true) < 2.6 * found.std_error[name]  # 99 %
     wrong = identify([read_record("r.csv", Aero2.definition)], Aero2())
     assert wrong.structure["pitch"] < 0.01
-    assert "structure" in wrong.verdict[0]
+    assert wrong.verdict[0].endswith("was made with plant 'aero2_detailed', not with 'aero2'")
+    assert "structure" in wrong.verdict[1]
 
 
 def test_a_trip_is_a_failed_run_that_is_recorded_and_explained(call):

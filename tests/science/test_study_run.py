@@ -32,6 +32,7 @@ from excite.study.table import (
     learning_curves,
     study_table,
 )
+from excite.training.checkpoint import Checkpoint
 
 TINY = """
 name = "tiny"
@@ -229,11 +230,14 @@ def test_a_gradient_seed_that_is_worth_more_but_unsafe_is_not_the_best(tmp_path,
 # Interruption
 
 
-def steps_of(progress: Path) -> float:
+def steps_kept(seed: Path) -> int:
+    """Steps in the checkpoint of a seed that is still trained."""
+    path = seed / "checkpoint.safetensors"
     try:
-        return json.loads(progress.read_text())["steps"]
-    except (OSError, ValueError):
-        return 0.0
+        steps = Checkpoint.from_bytes(path.read_bytes(), str(path)).state["num_steps"]
+    except OSError:
+        return 0
+    return 0 if (seed / "metrics.json").exists() else steps
 
 
 def killed_in_the_middle(study: Path, folder: Path) -> None:
@@ -244,7 +248,7 @@ def killed_in_the_middle(study: Path, folder: Path) -> None:
     deadline = time.monotonic() + PATIENCE
     while time.monotonic() < deadline:
         finished = list(folder.glob("seeds/*/*/metrics.json"))
-        if finished and any(steps_of(p) >= 960 for p in folder.glob("seeds/*/*/progress.json")):
+        if finished and any(steps_kept(seed) >= 960 for seed in folder.glob("seeds/*/*")):
             break
         assert process.poll() is None
         time.sleep(0.01)
