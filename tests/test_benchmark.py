@@ -17,7 +17,7 @@ from excite.files import json_ready
 from excite.information import best_possible
 from excite.plant import EMPS, Aero2, draw_params
 from excite.study import evaluation as benchmark
-from excite.study.run import run_study
+from excite.study.run import _locked, opened, run_study
 from excite.study.spec import Study, study_from
 from excite.study.statistics import wilson
 from excite.study.table import finished_table
@@ -339,6 +339,48 @@ def test_a_run_folder_is_resumed_by_its_study_and_replaced_where_asked(tmp_path)
     table = run_study(tiny(), folder, seed=6, overwrite=True)
     assert finished_table(folder) == table
     assert table.study.seed == 6
+
+
+def trained(folder: Path) -> tuple[Study, Path]:
+    """A study with an agent, and a file of its run."""
+    folder.mkdir()
+    for name in ("run.json", "study.json"):
+        (folder / name).write_text("{}")
+    kept = folder / "seeds" / "A" / "0" / "metrics.json"
+    kept.parent.mkdir(parents=True)
+    kept.write_text("{}")
+    return tiny(agents={"A": {"method": "ppo"}}, seeds=1), kept
+
+
+def test_nothing_is_removed_where_a_study_cannot_be_trained(tmp_path, monkeypatch):
+    study, kept = trained(tmp_path / "run")
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
+    with pytest.raises(ValueError, match="training needs stable_baselines3"):
+        run_study(study, tmp_path / "run", overwrite=True)
+    assert kept.exists()
+
+
+def test_nothing_is_removed_where_another_process_works_on_the_study(tmp_path):
+    study, kept = trained(tmp_path / "run")
+    with _locked(tmp_path / "run"), pytest.raises(ValueError, match="another process"):
+        run_study(study, tmp_path / "run", overwrite=True, workers=1)
+    assert kept.exists()
+
+
+def test_nothing_is_removed_where_no_scheduler_answers(tmp_path):
+    study, kept = trained(tmp_path / "run")
+    with pytest.raises(ValueError, match="no Dask scheduler"):
+        run_study(
+            study, tmp_path / "run", overwrite=True, engine="dask", address="tcp://127.0.0.1:9"
+        )
+    assert kept.exists()
+
+
+def test_an_overwritten_run_begins_anew(tmp_path):
+    study, kept = trained(tmp_path / "run")
+    with opened(study, tmp_path / "run", overwrite=True) as tasks:
+        assert not kept.exists()
+        assert len(tasks) == 2
 
 
 def test_a_study_with_signals_to_design_needs_a_run_folder():

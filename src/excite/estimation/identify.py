@@ -348,7 +348,8 @@ def _to_hold(plant: AbstractPlant, fit: _Fit, start: Params) -> tuple[int, float
         return None
     value = float(start[unseen[0]])
     why = f"{unseen[1]}; {names[unseen[0]]} was held at {value:g}"
-    return unseen[0], value, why + (", and the rest holds for that" if "separately" in why else "")
+    only = "; the others hold only for this value" if "separately" in why else ""
+    return unseen[0], value, why + only
 
 
 def _residuals(
@@ -397,9 +398,11 @@ def _confidence(
         robust = robust_covariance(np.asarray(S), np.asarray(residual))
         robust = np.outer(size, size) * robust[: len(names), : len(names)]
         covariance = widened(covariance, robust)
-        remarks = ("the intervals allow for coloured noise, not for another plant",)
+        remarks = (
+            "the intervals allow for coloured noise, not for an error in the plant's equations",
+        )
     elif coloured:
-        remarks = ("the intervals assume that it is, and are too narrow",)
+        remarks = ("the intervals assume white noise, and are too narrow",)
     remarks = tuple(
         f"the residual of {' and '.join(coloured)} is not white: {remark}" for remark in remarks
     )

@@ -185,7 +185,7 @@ def _column(
     if name not in table:
         raise ValueError(
             f"{path}: no column {name!r}; the file has {', '.join(table) or 'none'} "
-            f"(name it so, or where files are identified map one with --column {meaning}=NAME)"
+            f"(rename it, or where files are identified give --column {meaning}=NAME)"
         )
     column = table[name]
     if isinstance(column, np.ndarray):
@@ -196,7 +196,7 @@ def _column(
             values[row] = float(text)
         except ValueError:
             found = f"is {text!r}, not a number" if text else "is missing"
-            found += "; below the names there are only numbers" * (row == 0)
+            found += "; every row below the names must hold numbers" * (row == 0)
             raise ValueError(f"{path}: sample {row + 1} of {name!r} {found}") from None
     return values
 

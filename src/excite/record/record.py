@@ -148,7 +148,10 @@ def require_record_path(path: Path, overwrite: bool) -> None:
     require_record_ending(path)
     sidecar = path.with_suffix(".json")
     if sidecar.is_file() and not read_sidecar(path):
-        raise ValueError(f"{sidecar} is no sidecar of a record and would be lost; rename one")
+        raise ValueError(
+            f"{sidecar} was not written by excite and would be lost; choose another name for the "
+            "record"
+        )
     require_new_file(path, overwrite)
 
 

@@ -123,12 +123,13 @@ def run_study(
         machine = None
         if overwrite or not folder.exists():  # the folder appears when it is complete
             place = new_run_folder(folder, overwrite)
-    elif overwrite and folder.exists():
-        shutil.rmtree(folder)
+    replaced = overwrite and machine is not None
     if machine is not None and engine == "local":
-        _require_trainer(chosen, folder)
+        _require_trainer(chosen, None if replaced else folder)
+    elif machine is not None and replaced:
+        machine(1).close(is_done=True)  # the scheduler answers
     with place as where:
-        failures = run_tasks(chosen, where, machine, progress, on_done, command)
+        failures = run_tasks(chosen, where, machine, progress, on_done, command, replaced)
         if failures:
             raise _failed(failures, folder)
         return write_table(chosen, where)
@@ -152,11 +153,22 @@ def _engine(
     return local_engine(workers or num_cores(), Path(cache) if cache else None)
 
 
-def _require_trainer(study: Study, folder: Path) -> None:
-    """Raises ValueError where seeds must be trained and a library is missing."""
-    agents = [name for name, agent in study.agents.items() if agent.method == "ppo"]
-    folders = [seed_folder(folder, a, seed) for a in agents for seed in range(study.seeds)]
-    if all((folder / "metrics.json").is_file() for folder in folders):
+def _require_trainer(study: Study, folder: Path | None) -> None:
+    """Raises ValueError where seeds must be trained and a library is missing.
+
+    Args:
+        folder: with the seeds that are finished; None if all must be trained.
+    """
+    seeds = [
+        (name, seed)
+        for name, agent in study.agents.items()
+        for seed in range(study.seeds)
+        if agent.method == "ppo"
+    ]
+    if not seeds or (
+        folder is not None
+        and all((seed_folder(folder, *seed) / "metrics.json").is_file() for seed in seeds)
+    ):
         return
     missing = [
         n
@@ -212,10 +224,15 @@ def write_table(study: Study, folder: Path) -> StudyTable:
 
 
 @contextlib.contextmanager
-def opened(study: Study, folder: Path, command: str = "") -> Iterator[dict[str, dict[str, Any]]]:
+def opened(
+    study: Study, folder: Path, command: str = "", overwrite: bool = False
+) -> Iterator[dict[str, dict[str, Any]]]:
     """A new or existing run folder of this study, for one process at a time.
 
     Yields the arguments of each unfinished task by its name.
+
+    Args:
+        overwrite: whether the run in the folder is removed first.
 
     Raises:
         ValueError: where the folder is not a run folder, holds another study, or is in use.
@@ -228,7 +245,9 @@ def opened(study: Study, folder: Path, command: str = "") -> Iterator[dict[str, 
     with _locked(folder):
         plant, text = study.build_plant(), _plant_text(study)
         marker = {**_marker(study, plant, text), "command": command}
-        if is_begun:
+        if overwrite:
+            _clear(folder)
+        elif is_begun:
             _require_same_study(study, marker, folder)
         tasks = _missing(study, plant, folder, every)
         # All checks are done.
@@ -240,6 +259,15 @@ def opened(study: Study, folder: Path, command: str = "") -> Iterator[dict[str, 
             if "folder" in own:
                 Path(own["folder"]).mkdir(parents=True, exist_ok=True)
         yield {name: {**shared, **own} for name, own in tasks.items()}
+
+
+def _clear(folder: Path) -> None:
+    """Removes everything in a locked run folder but the lock."""
+    for path in folder.iterdir():
+        if path.is_dir():
+            shutil.rmtree(path)
+        elif path.name != ".lock":
+            path.unlink()
 
 
 @contextlib.contextmanager
@@ -356,6 +384,7 @@ def run_tasks(
     progress: Progress = lambda *_: None,
     on_done: Callable[[str], None] = lambda _: None,
     command: str = "",
+    overwrite: bool = False,
 ) -> dict[str, Exception]:
     """Computes what is missing in the run folder.
 
@@ -364,11 +393,12 @@ def run_tasks(
         progress: called about once a second, in thousandths of a task.
         on_done: called with the name of every task that was finished.
         command: that runs it, stored in `run.json`.
+        overwrite: whether the run in the folder is removed first.
 
     Returns:
         The error of each task that failed after all tries.
     """
-    with opened(study, folder, command) as tasks:
+    with opened(study, folder, command, overwrite) as tasks:
         targets = _names(study)
         if tasks:  # an earlier table is outdated
             (folder / "table.json").unlink(missing_ok=True)
