@@ -132,7 +132,7 @@ def design(
 ) -> Design:
     """Designs an open-loop input within a plant's limits, safe for uncertain parameters.
 
-    A robust design takes some four minutes; with `updates=100`, half a minute.
+    A robust design takes about four minutes on two cores; fewer `updates` shorten it.
 
         >>> import excite as ex
         >>> signal = ex.design("aero2", "clairvoyant", steps=60, starts=1, updates=3)
