@@ -154,7 +154,7 @@ def test_data_that_are_not_a_number_are_not_finite():
 
 
 def test_a_search_cut_short_says_so():
-    estimate = aero2_fit(NLS(horizons=(1.0,), max_steps=2))
+    estimate = aero2_fit(NLS(max_steps=1))
     assert estimate.status == Status.ITERATIONS_EXHAUSTED
 
 

@@ -442,10 +442,14 @@ BAD_STUDIES: dict[str, tuple[str, tuple[str, ...]]] = {
     ),
     "no steps of a search": (inserted("max_steps = 0", 'kind = "nls"'), ("max_steps", "0")),
     "negative tolerance": (inserted("tolerance = -1", 'kind = "nls"'), ("tolerance", "-1")),
-    "no horizons": (inserted("horizons = []", 'kind = "nls"'), ("horizons",)),
-    "horizons as one number": (inserted("horizons = 0.5", 'kind = "nls"'), ("horizons",)),
-    "horizons that end before the data": (
-        inserted("horizons = [0.1, 0.5]", 'kind = "nls"'), ("horizons",),
+    "an option of earlier versions": (
+        inserted("horizons = [0.1, 1.0]", 'kind = "nls"'), ("horizons", "segment_length"),
+    ),
+    "segments of no length": (
+        inserted("segment_length = 0", 'kind = "nls"'), ("segment_length", "0"),
+    ),
+    "segments of half a sample": (
+        inserted("segment_length = 20.5", 'kind = "nls"'), ("segment_length", "a whole number"),
     ),
     "reference of an unknown parameter": (
         FULL.replace("J_p = [1, 2]", "J_q = [1, 2]"), ("J_q", "J_p"),

@@ -61,9 +61,11 @@ def estimator_named(name: str, options: Mapping[str, Any] | None = None) -> Abst
     if not options:
         return default
     estimator = with_options(default, name, options)
-    for option in ("start_covariance", "forgetting_factor", "tolerance", "max_steps"):
-        value = float(getattr(estimator, option, 1.0))
-        if not 0 < value < math.inf:
+    for option in (
+        "start_covariance", "forgetting_factor", "tolerance", "max_steps", "segment_length",
+    ):  # fmt: skip
+        value = getattr(estimator, option, None)
+        if value is not None and not 0 < float(value) < math.inf:
             raise ValueError(f"{option} of {name!r} must be positive: got {options[option]!r}")
     if float(getattr(estimator, "forgetting_factor", 1.0)) > 1:
         got = options["forgetting_factor"]

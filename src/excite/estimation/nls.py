@@ -1,15 +1,13 @@
 """Continuous-time output-error estimation by nonlinear least squares.
 
 The parameters whose simulated outputs come closest to the measured ones, in the norm of
-the sensor's noise, are found by Levenberg-Marquardt on exact sensitivities. For Gaussian
+the sensor's noise, are found by multiple shooting with exact derivatives. For Gaussian
 noise that is the maximum-likelihood estimate (Ljung, System Identification, ch. 7).
-
-With a wrong resonance frequency, simulation and measurement are out of phase after many
-periods, and the sum of squares has other minima. The search therefore uses a growing part
-of the experiment: each part determines the frequency well enough for the next, longer one.
 """
 
 from __future__ import annotations
+
+import math
 
 import equinox as eqx
 import jax
@@ -17,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ..description import names_of
-from ..information import marginal_information, relative_size
+from ..information import fisher_information, marginal_information, relative_size
 from ..plant import AbstractPlant, Params, require_double_precision
 from .contract import (
     AbstractEstimator,
@@ -29,23 +27,23 @@ from .contract import (
     simulate_experiments,
     to_search,
 )
-from .levenberg_marquardt import least_squares
+from .multiple_shooting import MultipleShooting, Segments, Solution
 
 
 class NLS(AbstractEstimator):
-    """Output-error nonlinear least squares with a growing horizon.
+    """Output-error nonlinear least squares by multiple shooting.
 
     Attributes:
-        horizons: parts of the experiment that the search uses one after the other.
-        tolerance: of the last search, in search coordinates and relative to the residual;
-            the first searches stop at 0.1.
-        max_steps: of each search.
+        tolerance: the search ends before a step that would change the estimate by less than
+            this part of its standard error.
+        max_steps: of the search.
+        segment_length: of multiple shooting [samples], default one for the record's length.
         known: names of parameters that are held where the search starts.
     """
 
-    horizons: tuple[float, ...] = eqx.field(static=True, default=(0.08, 0.16, 0.32, 0.6, 1.0))
-    tolerance: float = eqx.field(static=True, default=1e-5)
-    max_steps: int = eqx.field(static=True, default=200)
+    tolerance: float = eqx.field(static=True, default=1e-4)
+    max_steps: int = eqx.field(static=True, default=100)
+    segment_length: int | None = eqx.field(static=True, default=None)
     known: tuple[str, ...] = eqx.field(static=True, default=())
     name: str = eqx.field(static=True, default="nls", kw_only=True)
 
@@ -62,8 +60,7 @@ class NLS(AbstractEstimator):
         others = ~jnp.asarray(self.held(plant))
         free = others if free is None else free & others
         problem = _Problem(plant, experiments, plant.nominal if start is None else start, free)
-        unknowns, converged = self._search(problem)
-        return problem.estimate(unknowns, converged)
+        return problem.estimate(*self._search(problem))
 
     def held(self, plant: AbstractPlant) -> tuple[bool, ...]:
         """Which parameters of a plant are held; ValueError for a name it does not have."""
@@ -96,57 +93,45 @@ class NLS(AbstractEstimator):
         S = problem.sensitivity(estimate.params, estimate.initial_state)
         return S / sd[None, None, :, None], estimate.residual / sd[None, None]
 
-    def _search(self, problem: _Problem) -> tuple[Array, Bool[Array, ""]]:
-        """Unknowns at the minimum, and whether the last search converged."""
-        samples = problem.experiments.valid.shape[1]
-        stages = _stages(self, samples, reweighted=problem.num_outputs > 1)
+    def _search(self, problem: _Problem) -> tuple[Solution, Float[Array, " output"]]:
+        """The minimum, its rows by sample, and the standard deviation of each output's noise."""
+        experiments, plant = problem.experiments, problem.plant
+        num_samples = experiments.valid.shape[1]
+        segments = Segments.of(experiments, self._length(plant, num_samples))
 
-        def search(carry: tuple, stage: tuple) -> tuple[tuple, Array]:
-            unknowns, sd = carry
-            horizon, tolerance, boldness = stage
-            seen = jnp.arange(samples)[None, :, None] < horizon
+        def weighted(sd: Array) -> MultipleShooting:
+            is_free = not experiments.initial_state_known
+            return MultipleShooting(plant, segments, problem.params, is_free, sd)
 
-            def weighted(unknowns: Array) -> Array:
-                return jnp.where(seen, problem.residual(unknowns) / sd[None, None], 0.0)
-
-            # Relative to its size at the start, so that the damping does not depend on the data.
-            size = jnp.maximum(jnp.linalg.norm(weighted(unknowns)), 1e-6) / boldness
-            unknowns, converged = least_squares(
-                lambda z: (weighted(z) / size).ravel(),
-                unknowns,
-                problem.experiments.measured.size,
-                tolerance,
-                self.max_steps,
+        def search(last: tuple[Solution, Array], stage: Array) -> tuple[tuple, None]:
+            start, sd = last
+            found = weighted(sd).solve(
+                start,
+                is_refinement=stage > 0,
+                rounding=jnp.min(problem.rounding / sd),
+                tolerance=self.tolerance,
+                max_steps=self.max_steps,
             )
-            if problem.num_outputs > 1:
-                complete = horizon >= samples
-                sd = jnp.where(complete, problem.noise_sd(problem.residual(unknowns)), sd)
-            return (unknowns, sd), converged
+            residual = segments.joined(found.rows[..., -1], num_samples)
+            return (found, problem.noise_sd(residual)), None
 
-        start = problem.with_initial_state(problem.experiments.initial_state), problem.assumed_sd
-        (unknowns, _), converged = jax.lax.scan(search, start, stages)
-        return unknowns, converged[-1]
+        first = experiments.initial_state / problem.state_scales[None]
+        starts = jnp.tile(first[:, None], (1, segments.valid.shape[1], 1))
+        start = weighted(problem.assumed_sd).start(problem.start, starts)
+        # Several outputs: again, each weighted by its estimated noise.
+        stages = jnp.arange(2 if problem.num_outputs > 1 else 1)
+        (found, sd), _ = jax.lax.scan(search, (start, problem.assumed_sd), stages)
+        return found._replace(rows=segments.joined(found.rows, num_samples)), sd
 
-
-def _stages(nls: NLS, samples: int, reweighted: bool) -> tuple[Array, Array, Array]:
-    """Horizon [samples], tolerance and boldness (inverse damping) of each search.
-
-    The first searches start far away and take small steps. The last starts close to the
-    minimum and takes large ones, with damping 1 / boldness^2 of its initial misfit: small
-    steps would be slow in the narrow valleys that friction causes.
-    """
-    horizons = [max(part * samples, min(samples, 40)) for part in nls.horizons]
-    early = len(horizons) - 1
-    tolerances, boldness = [0.1] * early + [nls.tolerance], [1.0] * early + [100.0]
-    if reweighted:
-        # Again, with each output weighted by its estimated noise.
-        horizons, tolerances = [*horizons, horizons[-1]], [*tolerances, nls.tolerance]
-        boldness = [*boldness, boldness[-1]]
-    return jnp.asarray(horizons), jnp.asarray(tolerances), jnp.asarray(boldness)
+    def _length(self, plant: AbstractPlant, num_samples: int) -> int:
+        """Length of a segment: it is short, but determines its start state."""
+        needed = 4 * len(plant.definition.states)
+        usual = max(needed, min(math.isqrt(num_samples), 100))
+        return min(self.segment_length or usual, num_samples)
 
 
 class _Problem(eqx.Module):
-    """The residual as a function of one vector: parameters, then initial states."""
+    """A plant, experiments, and which parameters are free."""
 
     plant: AbstractPlant
     experiments: Experiments
@@ -162,16 +147,12 @@ class _Problem(eqx.Module):
 
     @property
     def num_outputs(self) -> int:
+        """Number of outputs."""
         return self.experiments.measured.shape[2]
 
-    def with_initial_state(self, initial_state: Array) -> Array:
-        """Unknowns at the start parameters and this initial state."""
-        if self.experiments.initial_state_known:
-            return self.start
-        return jnp.concatenate([self.start, (initial_state / self._state_scales[None]).ravel()])
-
     @property
-    def _state_scales(self) -> Array:
+    def state_scales(self) -> Array:
+        """Typical size of each state."""
         return jnp.asarray([s.scale for s in self.plant.definition.states])
 
     @property
@@ -180,31 +161,22 @@ class _Problem(eqx.Module):
         scales = jnp.asarray([o.scale for o in self.plant.definition.outputs])
         return jnp.where(self.plant.sensor.sd > 0, self.plant.sensor.sd, 1e-3 * scales)
 
-    def params(self, unknowns: Array) -> Array:
-        z = jnp.where(self.free, unknowns[: len(self.start)], self.start)
-        return from_search(self.plant.definition, z)
+    @property
+    def rounding(self) -> Float[Array, " output"]:
+        """A residual of each output that is nothing but rounding."""
+        return 1e-9 * jnp.asarray([o.scale for o in self.plant.definition.outputs])
 
-    def initial_state(self, unknowns: Array) -> Array:
-        if self.experiments.initial_state_known:
-            return self.experiments.initial_state
-        rest = unknowns[len(self.start) :].reshape(self.experiments.initial_state.shape)
-        return rest * self._state_scales[None]
-
-    def residual(self, unknowns: Array) -> Array:
-        params = self.plant.Params(*self.params(unknowns))
-        simulated = simulate_experiments(
-            self.plant, params, self.experiments, self.initial_state(unknowns)
-        )
-        return residual_of(self.experiments, simulated)
+    def params(self, z: Float[Array, " param"]) -> Float[Array, " param"]:
+        """Parameters at search coordinates; held ones stay at the start."""
+        return from_search(self.plant.definition, jnp.where(self.free, z, self.start))
 
     def noise_sd(self, residual: Array) -> Array:
         """Standard deviation of each output's residual, corrected for the number of unknowns."""
-        num_states = 0 if self.experiments.initial_state_known else self._state_scales.size
+        num_states = 0 if self.experiments.initial_state_known else self.state_scales.size
         spent = jnp.sum(self.free) + num_states * residual.shape[0]
         count = jnp.sum(self.experiments.valid) - spent / self.num_outputs
         sd = jnp.sqrt(jnp.sum(residual**2, axis=(0, 1)) / jnp.maximum(count, 1.0))
-        scales = jnp.asarray([o.scale for o in self.plant.definition.outputs])
-        return jnp.maximum(sd, 1e-9 * scales)  # noise-free data keep a finite weight
+        return jnp.maximum(sd, self.rounding)  # noise-free data keep a finite weight
 
     def sensitivity(self, params: Params, initial_state: Array) -> Array:
         """Derivative of the outputs with respect to relative parameters, then initial states."""
@@ -218,28 +190,38 @@ class _Problem(eqx.Module):
                 self.plant,
                 self.plant.Params(*values),
                 self.experiments,
-                initial_state + moved * self._state_scales[None],
+                initial_state + moved * self.state_scales[None],
             )
             return -residual_of(self.experiments, simulated)
 
         return jax.jacfwd(response)(jnp.zeros(len(size) + states))
 
-    def estimate(self, unknowns: Array, converged: Array) -> Estimate:
+    def estimate(self, found: Solution, sd: Float[Array, " output"]) -> Estimate:
         """The estimate at the end of the search, with its covariance from the estimated noise."""
-        params = self.plant.Params(*self.params(unknowns))
-        initial_state, residual = self.initial_state(unknowns), self.residual(unknowns)
-        S = self.sensitivity(params, initial_state)
-        S = S.reshape(-1, *S.shape[2:])  # experiments one after the other
-        information = marginal_information(S, self.noise_sd(residual), len(self.start))
+        values, slope = jax.jvp(self.params, (found.z,), (jnp.ones_like(found.z),))
+        params, num_params = self.plant.Params(*values), len(values)
+        size = relative_size(self.plant, params)
+        # From search coordinates to relative changes.
+        slope = jnp.where(self.free, slope / size, 1.0)
+        first, others = jnp.split(found.rows[..., :-1], [self.state_scales.size], axis=-1)
+        S = others / slope[None, None, None]
+        initial_state = self.experiments.initial_state
+        if self.experiments.initial_state_known:
+            each = jax.vmap(lambda own: fisher_information(own, sd))(S)
+        else:
+            S = jnp.concatenate([S, first], axis=-1)
+            each = jax.vmap(lambda own: marginal_information(own, sd, num_params))(S)
+            initial_state = found.starts[:, 0] * self.state_scales[None]
+        information = jnp.sum(each, axis=0)
         held = jnp.diag(jnp.where(self.free, 0.0, 1.0))
         active = jnp.outer(self.free, self.free)
         relative = jnp.where(active, jnp.linalg.inv(information + held), 0.0)
-        size = relative_size(self.plant, params)
+        residual = -found.rows[..., -1]
         return Estimate(
             params=params,
             covariance=relative * jnp.outer(size, size),
             information=jnp.where(active, information, 0.0),
-            status=_status(jnp.stack(params), residual, relative, converged),
+            status=_status(values, residual, relative, found.converged),
             initial_state=initial_state,
             residual=residual,
         )

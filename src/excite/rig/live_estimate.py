@@ -19,7 +19,7 @@ from ..estimation import NLS, Estimate, Experiments, Status
 from ..plant import AbstractPlant
 from .contract import Interval, Sample
 
-_FIRST = 40  # samples before the first fit, the shortest horizon of the estimator
+_FIRST = 40  # samples before the first estimate
 
 
 class LiveEstimate:

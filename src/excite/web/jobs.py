@@ -54,7 +54,7 @@ from .events import ExperimentRequest, IdentificationRequest, ParameterRow, Row
 from .events import JobEvent as Event
 
 NUM_ESTIMATES = 20
-_FIRST = 40  # samples before the first estimate, the shortest horizon of the estimator
+_FIRST = 40  # samples before the first estimate
 _RECORD = "record.csv"  # name of a simulated record
 _MAX_POINTS = 2000  # more cannot be seen on a screen
 _MAX_COLUMNS, _MAX_NAME = 500, 200  # of an uploaded file, and characters of a column's name

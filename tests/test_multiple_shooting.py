@@ -1,0 +1,120 @@
+"""Multiple shooting: the minimum is that of one simulation, and is found from far away."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.optimize
+from catalogue import FEW_AND_ALL, LONG, PLANTS
+
+from excite.estimation import NLS, Status, stack_experiments
+from excite.estimation.multiple_shooting import MultipleShooting, Segments
+from excite.excitation import PRBS, Chirp, Multisine, Random
+from excite.plant import Aero2, draw_params
+from excite.simulation import response, run_episode, step
+
+KEY = jax.random.key(5)
+NUM_STEPS = 150
+
+
+def noisy(plant, num_steps=NUM_STEPS, known=True):
+    """An experiment with sensor noise; the first state is that of the plant."""
+    params = draw_params(plant, KEY, 0.15)
+    episode = run_episode(plant, params, Multisine(), num_steps, KEY)
+    return stack_experiments(plant, [episode.inputs], [episode.measured], known)
+
+
+def shooting(plant, data, length, sd, known=True):
+    return MultipleShooting(
+        plant, Segments.of(data, length), lambda z: jnp.stack(plant.nominal) * jnp.exp(z),
+        not known, sd,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_rows_without_gaps_are_the_derivatives_of_one_simulation(known):
+    plant, length = Aero2(), 16
+    data = noisy(plant, known=known)
+    problem = shooting(plant, data, length, jnp.ones(1), known)
+    z, first = jnp.array([0.1, -0.05, 0.2]), plant.initial_state + 0.1
+
+    def outputs(unknowns):
+        params = plant.Params(*(jnp.stack(plant.nominal) * jnp.exp(unknowns[2:])))
+        start = first + unknowns[:2] * problem.scales
+        return response(plant, params, data.inputs[0], start)[:, 0]
+
+    params = plant.Params(*(jnp.stack(plant.nominal) * jnp.exp(z)))
+
+    def advance(x, u):
+        x = step(plant, x, u, params)
+        return x, x
+
+    _, states = jax.lax.scan(advance, first, data.inputs[0])
+    starts = jnp.concatenate([first[None], states[length - 1 :: length]])[None]
+    starts = starts / problem.scales[None, None]
+    found = problem.condensed(problem.shoot(z, starts), z, starts)
+    rows = problem.segments.joined(found.rows, NUM_STEPS + 1)[0, :, 0]
+    point = jnp.concatenate([jnp.zeros(2), z])
+    np.testing.assert_allclose(rows[:, -1], outputs(point) - data.measured[0, :, 0], atol=1e-12)
+    expected = np.array(jax.jacfwd(outputs)(point))
+    expected[:, :2] *= not known
+    np.testing.assert_allclose(rows[:, :-1], expected, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(found.moves[..., -1], 0.0, atol=1e-13)
+
+
+@pytest.mark.parametrize("name", FEW_AND_ALL)
+def test_the_estimate_is_the_minimum_that_scipy_finds_for_one_simulation(name):
+    plant = PLANTS[name]
+    data = noisy(plant)
+    estimate = NLS()(plant, data)
+    assert estimate.status == Status.SUCCESSFUL
+    names, size = plant.nominal._fields, np.abs(np.stack(estimate.params))
+    sd = np.sqrt(np.mean(np.asarray(estimate.residual[0]) ** 2, axis=0))
+
+    @jax.jit
+    def residual(change):
+        params = plant.Params(*(jnp.stack(estimate.params) + size * change))
+        simulated = response(plant, params, data.inputs[0])
+        return ((simulated - data.measured[0]) / sd[None]).ravel()
+
+    slope: Any = jax.jit(jax.jacfwd(residual))
+    start = np.full(len(names), 1e-3)
+    best = scipy.optimize.least_squares(residual, start, jac=slope, xtol=1e-14)
+    error = np.sqrt(np.diag(estimate.covariance)) / size
+    assert np.all(np.abs(best.x) < 0.01 * error), (best.x / error).round(4)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_the_length_of_segments_changes_nothing(known):
+    plant = Aero2()
+    data = noisy(plant, known=known)
+    first, *others = (
+        NLS(segment_length=length)(plant, data) for length in (30, 9, NUM_STEPS + 1, 1000)
+    )
+    error = np.sqrt(np.diag(first.covariance))
+    for other in others:
+        assert np.all(np.abs(np.subtract(first.params, other.params)) < 1e-3 * error)
+        np.testing.assert_allclose(first.covariance, other.covariance, rtol=1e-3)
+
+
+@pytest.mark.parametrize("count", [20, LONG(1000)])
+@pytest.mark.parametrize("excitation", [Chirp(), PRBS(), Random()], ids=["chirp", "prbs", "random"])
+def test_plants_within_a_factor_of_three_are_found(excitation, count):
+    plant = Aero2()
+    draw, play = jax.random.split(KEY)
+    factors = 3.0 ** jax.random.uniform(draw, (3, count), float, -1.0, 1.0)
+    params = plant.Params(*(f * v for f, v in zip(factors, plant.nominal, strict=True)))
+    many = jax.vmap(run_episode, in_axes=(None, 0, None, None, 0))
+    episodes = many(plant, params, excitation, 500, jax.random.split(play, count))
+
+    @jax.jit
+    @jax.vmap
+    def fit(inputs, measured):
+        estimate = NLS()(plant, stack_experiments(plant, [inputs], [measured], True))
+        return estimate.status, jnp.mean(estimate.residual**2)
+
+    status, power = fit(episodes.inputs, episodes.measured)
+    at_the_noise = np.asarray(power) < 1.6 * float(plant.sensor.sd[0]) ** 2
+    assert np.sum(~at_the_noise | (np.asarray(status) != Status.SUCCESSFUL)) == 0
