@@ -10,7 +10,7 @@ import scipy.optimize
 from catalogue import FEW_AND_ALL, LONG, PLANTS
 
 from excite.estimation import NLS, Status, stack_experiments
-from excite.estimation.multiple_shooting import MultipleShooting, Segments
+from excite.estimation.multiple_shooting import MultipleShooting, Point, Segments
 from excite.excitation import PRBS, Chirp, Multisine, Random
 from excite.plant import Aero2, draw_params
 from excite.simulation import response, run_episode, step
@@ -26,18 +26,19 @@ def noisy(plant, num_steps=NUM_STEPS, known=True):
     return stack_experiments(plant, [episode.inputs], [episode.measured], known)
 
 
-def shooting(plant, data, length, sd, known=True):
+def shooting(plant, data, segments, known=True):
     return MultipleShooting(
-        plant, Segments.of(data, length), lambda z: jnp.stack(plant.nominal) * jnp.exp(z),
-        not known, sd,
-    )  # fmt: skip
+        plant, segments, lambda z: jnp.stack(plant.nominal) * jnp.exp(z), not known
+    )
 
 
+@pytest.mark.parametrize("block", [40, 10_000], ids=["several blocks", "one block"])
 @pytest.mark.parametrize("known", [True, False])
-def test_rows_without_gaps_are_the_derivatives_of_one_simulation(known):
+def test_without_gaps_the_triangle_is_of_the_derivatives_of_one_simulation(known, block):
     plant, length = Aero2(), 16
     data = noisy(plant, known=known)
-    problem = shooting(plant, data, length, jnp.ones(1), known)
+    segments = Segments.of(data, length, block)
+    problem = shooting(plant, data, segments, known)
     z, first = jnp.array([0.1, -0.05, 0.2]), plant.initial_state + 0.1
 
     def outputs(unknowns):
@@ -52,16 +53,37 @@ def test_rows_without_gaps_are_the_derivatives_of_one_simulation(known):
         return x, x
 
     _, states = jax.lax.scan(advance, first, data.inputs[0])
-    starts = jnp.concatenate([first[None], states[length - 1 :: length]])[None]
-    starts = starts / problem.scales[None, None]
-    found = problem.condensed(problem.shoot(z, starts), z, starts)
-    rows = problem.segments.joined(found.rows, NUM_STEPS + 1)[0, :, 0]
+    starts = jnp.concatenate([first[None], states[length - 1 :: length]]) / problem.scales[None]
+    missing = segments.shape[1] - len(starts)
+    found = problem.sweep(Point(z, jnp.pad(starts, ((0, missing), (0, 0)))[None]))
     point = jnp.concatenate([jnp.zeros(2), z])
-    np.testing.assert_allclose(rows[:, -1], outputs(point) - data.measured[0, :, 0], atol=1e-12)
     expected = np.array(jax.jacfwd(outputs)(point))
     expected[:, :2] *= not known
-    np.testing.assert_allclose(rows[:, :-1], expected, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(found.moves[..., -1], 0.0, atol=1e-13)
+    misfit = np.asarray(outputs(point) - data.measured[0, :, 0])
+    np.testing.assert_allclose(found.misfit.ravel()[: NUM_STEPS + 1], misfit, atol=1e-12)
+    rows = np.column_stack([expected, misfit])
+    triangle = np.asarray(found.triangles[0, 0])
+    np.testing.assert_allclose(triangle.T @ triangle, rows.T @ rows, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(found.moves[0, : len(starts), :, -1], 0.0, atol=1e-13)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_blocks_change_nothing(known):
+    plant, sd = PLANTS["emps"], jnp.array([1e-3])
+    data = noisy(plant, known=known)
+    ends = []
+    for block in (40, 10_000):
+        segments = Segments.of(data, 10, block)
+        problem = shooting(plant, data, segments, known)
+        starts = jnp.zeros((*segments.shape, problem.num_states))
+        start = problem.matched(Point(0.1 * jnp.ones(len(plant.nominal)), starts), sd)
+        ends.append(
+            problem.solve(start, sd, rounding=jnp.asarray(1e-9), tolerance=1e-4, max_steps=50)
+        )
+    assert all(bool(converged) for *_, converged in ends)
+    np.testing.assert_allclose(ends[0][0].z, ends[1][0].z, atol=1e-8)
+    one, other = (end[1].misfit.ravel()[: NUM_STEPS + 1] for end in ends)
+    np.testing.assert_allclose(one, other, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", FEW_AND_ALL)
@@ -71,7 +93,7 @@ def test_the_estimate_is_the_minimum_that_scipy_finds_for_one_simulation(name):
     estimate = NLS()(plant, data)
     assert estimate.status == Status.SUCCESSFUL
     names, size = plant.nominal._fields, np.abs(np.stack(estimate.params))
-    sd = np.sqrt(np.mean(np.asarray(estimate.residual[0]) ** 2, axis=0))
+    sd = np.asarray(plant.sensor.sd)
 
     @jax.jit
     def residual(change):

@@ -96,8 +96,9 @@ class Estimate(eqx.Module):
     Attributes:
         params: estimated parameters.
         covariance: of `params` (held parameters: zero rows).
-        information: inverse covariance of relative changes: logarithms of positive
-            parameters, free ones over their scale.
+        information: of relative changes: logarithms of positive parameters, free ones over
+            their scale. The inverse of their covariance, where every output was weighted by
+            its noise.
         status: a `Status`.
         initial_state: known or estimated.
         residual: measured minus simulated outputs, zero where padded.

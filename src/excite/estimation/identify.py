@@ -320,7 +320,7 @@ def _fit_seen(
     known = _known(plant, estimator)
     free, reasons = ~known, ()
     while True:
-        estimate = jax.device_get(estimator(plant, experiments, start, jax.device_put(free)))
+        estimate = _estimate(plant, experiments, estimator, start, free)
         fit = _Fit(estimate, free, known, reasons)
         # ARX estimates all parameters or none.
         if not isinstance(estimator, NLS) or fit.has_ended_in(Status.NOT_FINITE):
@@ -334,6 +334,28 @@ def _fit_seen(
         reasons = (*reasons, why)
         if not free.any():
             raise ValueError(_NOTHING_SEEN)
+
+
+def _estimate(
+    plant: AbstractPlant,
+    experiments: Experiments,
+    estimator: AbstractEstimator,
+    start: Params,
+    free: np.ndarray,
+) -> Estimate:
+    """An estimate; a search that does not converge is repeated with longer segments."""
+    arguments = plant, experiments, start, jax.device_put(free)
+    estimate = jax.device_get(estimator(*arguments))
+    if not isinstance(estimator, NLS):
+        return estimate
+    num_samples = experiments.valid.shape[1]
+    length = estimator.length_of_segments(plant, num_samples)
+    while int(estimate.status) == Status.ITERATIONS_EXHAUSTED and length < num_samples:
+        length *= 4
+        longer = dataclasses.replace(estimator, segment_length=length)
+        again = jax.device_get(longer(*arguments))
+        estimate = again if int(again.status) == Status.SUCCESSFUL else estimate
+    return estimate
 
 
 def _to_hold(plant: AbstractPlant, fit: _Fit, start: Params) -> tuple[int, float, str] | None:

@@ -23,7 +23,7 @@ techniques for O.D.E.", Progress in Scientific Computing 2, 1983).
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -35,45 +35,89 @@ from ..plant import AbstractPlant
 from ..simulation import step
 from .contract import Experiments
 
-_MATCHES = 5
-"""Steps of the first phase."""
+Tree = TypeVar("Tree")
+
+_FIRST = 2
+"""Steps in which every segment finds its start state from its first samples."""
+_FIRST_WIDTH = 3.0  # how far that may be from the experiment's initial state, in state scales
+_MATCHES = 40
+"""Most steps of the first phase."""
+_SHRINKAGE, _LEAST_WIDTH = 0.01, 1e-8  # of the gaps' width: in one step at most, and its end
+_SMALL = 1e-2  # root mean square of the gaps, over state scales, that ends the first phase
+_LEAST_PART = 0.01  # of a step; a search that needs smaller ones has stalled
 _BOLD = 8
 """Steps of the second phase that are taken even if the sum of squares grows."""
 _LIMIT = 1e3
 """Largest growth of the sum of squares in one of them."""
-_ACCEPTED, _GOOD = 0.01, 0.75  # parts of the predicted reduction that a later step must reach
-_GROWTH, _SHRINKAGE = 10.0, 0.1  # of the radius after a good and after a refused step
-_LARGEST = 1.0  # change of a search coordinate in one step
-_WIDTH = 0.5  # how far a start state may be from the end of the segment before, in state scales
+_ACCEPTED, _GOOD = 0.01, 0.75  # parts of the predicted reduction that a step must reach
+_GROWTH, _SHRINKING = 10.0, 0.1  # of the radius after a good and after a refused step
+_LARGEST = {True: 1.0, False: 10.0}
+"""Change in one step of the logarithm of a positive parameter, of a free one over its scale."""
+_MOST = 1e3  # largest damping over the size of the rows
 _CLOSED = 1e-6  # a gap that is closed to first order leaves its square
+_BLOCK = 2**14
+"""Samples that are simulated side by side; longer records are simulated in blocks."""
 _EPS, _TINY = np.finfo(float).eps, np.finfo(float).tiny
 
 
 class Segments(eqx.Module):
-    """Experiments cut into segments of one length; `valid` is False for unused samples."""
+    """Experiments cut into blocks of segments of one length.
 
-    inputs: Float[Array, "experiment segment time input"]
-    measured: Float[Array, "experiment segment time output"]
-    valid: Bool[Array, "experiment segment time"]
+    `valid` is False for unused samples, `is_followed` where no samples follow a segment.
+    """
+
+    inputs: Float[Array, "block experiment segment time input"]
+    measured: Float[Array, "block experiment segment time output"]
+    valid: Bool[Array, "block experiment segment time"]
+    is_followed: Bool[Array, "block experiment segment"]
 
     @classmethod
-    def of(cls, experiments: Experiments, length: int) -> Segments:
-        """Segments of `length` samples; the last is padded."""
+    def of(cls, experiments: Experiments, length: int, block: int = _BLOCK) -> Segments:
+        """Segments of `length` samples, in blocks of about `block`; the last are padded."""
+        num_experiments, num_samples = experiments.valid.shape
+        needed = -(-num_samples // length)
+        num_blocks = -(-needed * length * num_experiments // block)
+        in_block = -(-needed // num_blocks)
 
         def cut(rows: Array) -> Array:
-            missing = -(-experiments.valid.shape[1] // length) * length - rows.shape[1]
+            missing = num_blocks * in_block * length - rows.shape[1]
             padded = jnp.pad(rows, [(0, 0), (0, missing), *[(0, 0)] * (rows.ndim - 2)])
-            return padded.reshape(len(rows), -1, length, *rows.shape[2:])
+            shape = (len(rows), num_blocks, in_block, length, *rows.shape[2:])
+            return jnp.moveaxis(padded.reshape(shape), 1, 0)
 
-        return cls(cut(experiments.inputs), cut(experiments.measured), cut(experiments.valid))
+        valid = cut(experiments.valid)
+        return cls(
+            cut(experiments.inputs),
+            cut(experiments.measured),
+            valid,
+            in_blocks(_next(over_segments(valid.any(axis=3))), num_blocks),
+        )
 
-    def joined(self, rows: Array, num_samples: int) -> Array:
-        """Values by experiment, segment and time as values by experiment and sample."""
-        return rows.reshape(len(rows), -1, *rows.shape[3:])[:, :num_samples]
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Number of experiments, and of segments in each."""
+        num_blocks, num_experiments, in_block, _ = self.valid.shape
+        return num_experiments, num_blocks * in_block
+
+
+def over_segments(values: Array) -> Array:
+    """Values by block, experiment and segment as values by experiment and segment."""
+    values = jnp.moveaxis(values, 0, 1)
+    return values.reshape(len(values), -1, *values.shape[3:])
+
+
+def in_blocks(values: Array, num_blocks: int) -> Array:
+    """Values by experiment and segment as values by block, experiment and segment."""
+    return jnp.moveaxis(values.reshape(len(values), num_blocks, -1, *values.shape[2:]), 1, 0)
+
+
+def _next(values: Array) -> Array:
+    """Values of the next segment, zero after the last; by experiment and segment."""
+    return jnp.concatenate([values[:, 1:], jnp.zeros_like(values[:, :1])], axis=1)
 
 
 class Shots(NamedTuple):
-    """All segments simulated from their start states, with derivatives.
+    """The segments of a block simulated from their start states, with derivatives.
 
     The derivatives are with respect to the start state, then the search coordinates of the
     parameters. States are over their scales.
@@ -81,41 +125,78 @@ class Shots(NamedTuple):
 
     misfit: Float[Array, "experiment segment time output"]  # simulated minus measured
     misfit_slope: Float[Array, "experiment segment time output state+param"]
-    gap: Float[Array, "experiment gap state"]  # end of a segment minus start of the next
-    end_slope: Float[Array, "experiment gap state state+param"]
+    gap: Float[Array, "experiment segment state"]  # end of a segment minus start of the next
+    end_slope: Float[Array, "experiment segment state state+param"]
 
 
-class Solution(NamedTuple):
-    """A point of the search, and the outputs near it as linear functions of the unknowns.
+class Sweep(NamedTuple):
+    """All segments at one point, with their gaps closed to first order.
+
+    Columns are the derivatives with respect to the first state and z, then the value.
 
     Attributes:
-        z: search coordinates of the parameters.
-        starts: start states over their scales.
-        rows: derivatives of the misfit with respect to the first state and z, then the misfit,
-            with all gaps closed to first order.
-        moves: the same for the start states: derivatives, then what closes the gaps.
-        converged: whether the search ended here.
+        moves: of the start states.
+        triangles: of the misfit of each output, reduced by an orthogonal factorisation.
+        misfit: simulated minus measured outputs.
     """
+
+    moves: Float[Array, "experiment segment state column"]
+    triangles: Float[Array, "experiment output column column"]
+    misfit: Float[Array, "experiment segment time output"]
+
+
+class Point(NamedTuple):
+    """Search coordinates of the parameters, and start states over their scales."""
 
     z: Float[Array, " param"]
     starts: Float[Array, "experiment segment state"]
-    rows: Float[Array, "experiment segment time output column"]
-    moves: Float[Array, "experiment segment state column"]
-    converged: Bool[Array, ""]
+
+
+class Linear(NamedTuple):
+    """Misfits and gaps near a point as linear functions, with the start states eliminated.
+
+    Attributes:
+        rows: triangular equations of each start state: its own change, that of the next one, of z,
+            and the value.
+        common: the triangle that is left for z, and the value.
+        misfits, gaps: sums of squares at the point, over the noise and over state scales.
+    """
+
+    rows: Float[Array, "experiment segment state column"]
+    common: Float[Array, "column column"]
+    misfits: Float[Array, ""]
+    gaps: Float[Array, ""]
+
+
+class _Match(NamedTuple):
+    """First phase: the best point so far, the step from it, and the next point."""
+
+    best: Point
+    change: Point
+    here: Point
+    misfits: Float[Array, ""]
+    gaps: Float[Array, ""]
+    hoped: Float[Array, ""]
+    width: Float[Array, ""]
+    next_width: Float[Array, ""]
+    damping: Float[Array, ""]
+    part: Float[Array, ""]
+    steps: Int[Array, ""]
+    is_closed: Bool[Array, ""]
 
 
 class _Search(NamedTuple):
-    """The best point so far, its weighted rows as a triangle, and the next point."""
+    """Second phase: the next point, and the best so far with its sweep."""
 
-    best: Solution
-    triangle: Float[Array, "experiment unknown unknown"]
+    here: Point
+    best: Point
+    sweep: Sweep
     cost: Float[Array, ""]
     predicted: Float[Array, ""]
-    z: Float[Array, " param"]
-    starts: Float[Array, "experiment segment state"]
     radius: Float[Array, ""]
     part: Float[Array, ""]
     steps: Int[Array, ""]
+    converged: Bool[Array, ""]
 
 
 class MultipleShooting:
@@ -124,7 +205,6 @@ class MultipleShooting:
     Args:
         params_at: parameters, as a vector, at search coordinates z.
         first_is_free: False where every experiment starts at its known initial state.
-        sd: standard deviation of each output's noise.
     """
 
     def __init__(
@@ -133,16 +213,17 @@ class MultipleShooting:
         segments: Segments,
         params_at: Callable[[Float[Array, " param"]], Float[Array, " param"]],
         first_is_free: bool,
-        sd: Float[Array, " output"],
     ) -> None:
         self.plant, self.segments, self.params_at = plant, segments, params_at
-        self.first_is_free, self.sd = first_is_free, sd
+        self.first_is_free = first_is_free
         self.scales = jnp.asarray([s.scale for s in plant.definition.states])
+        self.output_scales = jnp.asarray([o.scale for o in plant.definition.outputs])
         self.num_states = len(plant.definition.states)
+        self.largest = jnp.asarray([_LARGEST[p.positive] for p in plant.definition.parameters])
 
-    def shoot(self, z: Float[Array, " param"], starts: Array) -> Shots:
-        """Simulates all segments."""
-        n, segments = self.num_states, self.segments
+    def shoot(self, z: Array, starts: Array, next_starts: Array, block: Segments) -> Shots:
+        """Simulates the segments of one block."""
+        n = self.num_states
 
         def outputs_and_end(point: Array, inputs: Array) -> tuple[tuple, tuple]:
             params = self.plant.Params(*self.params_at(point[n:]))
@@ -157,80 +238,219 @@ class MultipleShooting:
             point = jnp.concatenate([start, z])
             return jax.jacfwd(outputs_and_end, has_aux=True)(point, inputs)
 
-        shape = segments.inputs.shape
-        flat = starts.reshape(-1, n), segments.inputs.reshape(-1, *shape[2:])
+        shape = block.inputs.shape
+        flat = starts.reshape(-1, n), block.inputs.reshape(-1, *shape[2:])
         (slope, end_slope), (outputs, end) = jax.tree.map(
             lambda a: a.reshape(*shape[:2], *a.shape[1:]), jax.vmap(differentiated)(*flat)
         )
-        used = segments.valid[..., None]
-        is_gap = segments.valid.any(axis=2)[:, 1:, None]  # before a segment with samples
+        used, is_followed = block.valid[..., None], block.is_followed[..., None]
         return Shots(
-            misfit=jnp.where(used, outputs - segments.measured, 0.0),
+            misfit=jnp.where(used, outputs - block.measured, 0.0),
             misfit_slope=jnp.where(used[..., None], slope, 0.0),
-            gap=jnp.where(is_gap, end[:, :-1] - starts[:, 1:], 0.0),
-            end_slope=jnp.where(is_gap[..., None], end_slope[:, :-1], 0.0),
+            gap=jnp.where(is_followed, end - next_starts, 0.0),
+            end_slope=jnp.where(is_followed[..., None], end_slope, 0.0),
         )
 
-    def matching_step(self, shots: Shots) -> tuple[Array, Array]:
-        """Changes of z and of the start states that make the gaps small (first phase).
+    def _blocks(self, starts: Array) -> tuple[Array, Array, Segments]:
+        """Start states, those of the next segments, and segments, by block."""
+        num_blocks = len(self.segments.valid)
+        return in_blocks(starts, num_blocks), in_blocks(_next(starts), num_blocks), self.segments
 
-        Every segment fits its start state to its own samples, for any z. The gaps are weighted
-        by the covariance of these fits.
-        """
-        n, sd = self.num_states, self.sd[None, None, None]
-        J, r = shots.misfit_slope / sd[..., None], shots.misfit / sd
-        others = jnp.concatenate([J[..., n:], r[..., None]], axis=-1)
-        information = jnp.einsum("eslon,eslom->esnm", J[..., :n], J[..., :n])
-        covariance = jnp.linalg.inv(information + jnp.eye(n)[None, None] / _WIDTH**2)
-        # The start states as functions of z: D (dz, 1).
-        right = jnp.einsum("eslon,eslop->esnp", J[..., :n], others)
-        D = -covariance @ right.at[:, 1:, :, -1].add(-shots.gap / _WIDTH**2)
-        if not self.first_is_free:
-            covariance, D = covariance.at[:, 0].set(0.0), D.at[:, 0].set(0.0)
-        A = shots.end_slope[..., :n]
-        own = jnp.concatenate([shots.end_slope[..., n:], shots.gap[..., None]], axis=-1)
-        gap = A @ D[:, :-1] + own - D[:, 1:]
-        spread = A @ covariance[:, :-1] @ jnp.swapaxes(A, -1, -2) + covariance[:, 1:]
-        gap = jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(spread), gap, lower=True)
-        M = jnp.einsum("esnp,esnq->pq", gap, gap)
-        damping = 1e-3 * M[-1, -1] + 1e-9 * jnp.trace(M) + _TINY
-        dz = -jnp.linalg.solve(M[:-1, :-1] + damping * jnp.eye(len(M) - 1), M[:-1, -1])
-        dz = jnp.clip(dz, -_LARGEST, _LARGEST)
-        return dz, D @ jnp.append(dz, 1.0)
-
-    def condensed(self, shots: Shots, z: Array, starts: Array) -> Solution:
-        """The point, with misfit and start states as functions of the first state and z."""
-        n = self.num_states
-        width = shots.misfit_slope.shape[-1] + 1
+    def sweep(self, point: Point) -> Sweep:
+        """Simulates all segments, and closes their gaps to first order."""
+        n, width = self.num_states, self.num_states + len(point.z) + 1
+        num_experiments, num_outputs = self.segments.shape[0], len(self.output_scales)
         first = jnp.eye(n, width) if self.first_is_free else jnp.zeros((n, width))
-        by_z = jnp.concatenate([shots.end_slope[..., n:], shots.gap[..., None]], axis=-1)
 
         def follow(moves: Array, parts: tuple[Array, Array]) -> tuple[Array, Array]:
             A, B = parts
-            moves = (A @ moves).at[:, n:].add(B)
-            return moves, moves
+            return (A @ moves).at[:, n:].add(B), moves
 
-        def chained(A: Array, B: Array) -> Array:
-            return jnp.concatenate([first[None], jax.lax.scan(follow, first, (A, B))[1]])
+        def simulate_block(carry: tuple, parts: tuple) -> tuple[tuple, tuple]:
+            moves, triangles = carry
+            shots = self.shoot(point.z, *parts)
+            A, B = shots.end_slope[..., :n], shots.end_slope[..., n:]
+            B = jnp.concatenate([B, shots.gap[..., None]], axis=-1)
+            chain = jax.vmap(lambda moves, A, B: jax.lax.scan(follow, moves, (A, B)))
+            moves, each = chain(moves, A, B)
+            rows = jnp.einsum("eslon,esnq->esloq", shots.misfit_slope[..., :n], each)
+            own = jnp.concatenate([shots.misfit_slope[..., n:], shots.misfit[..., None]], axis=-1)
+            rows = rows.at[..., n:].add(own)
+            by_output = jnp.moveaxis(rows, 3, 1).reshape(num_experiments, num_outputs, -1, width)
+            stacked = jnp.concatenate([triangles, by_output], axis=2)
+            return (moves, jnp.linalg.qr(stacked, mode="r")), (each, rows[..., -1])
 
-        moves = jax.vmap(chained)(shots.end_slope[..., :n], by_z)
-        rows = jnp.einsum("eslon,esnq->esloq", shots.misfit_slope[..., :n], moves)
-        own = jnp.concatenate([shots.misfit_slope[..., n:], shots.misfit[..., None]], axis=-1)
-        return Solution(z, starts, rows.at[..., n:].add(own), moves, jnp.asarray(False))
+        begin = (
+            jnp.tile(first[None], (num_experiments, 1, 1)),
+            jnp.zeros((num_experiments, num_outputs, width, width)),
+        )
+        (_, triangles), (moves, misfit) = jax.lax.scan(
+            simulate_block, begin, self._blocks(point.starts)
+        )
+        return Sweep(over_segments(moves), triangles, over_segments(misfit))
 
-    def triangle(self, found: Solution) -> Float[Array, "experiment unknown unknown"]:
-        """The weighted rows of each experiment, reduced by an orthogonal factorisation."""
-        rows = found.rows / self.sd[None, None, None, :, None]
-        rows = rows if self.first_is_free else rows[..., self.num_states :]
-        rows = rows.reshape(len(rows), -1, rows.shape[-1])
-        return jax.vmap(lambda own: jnp.linalg.qr(own, mode="r"))(rows)
+    def linearised(
+        self, point: Point, sd: Array, width: Array, damping: Array, is_first: Array
+    ) -> Linear:
+        """Simulates all segments; gaps count over `width` state scales.
+
+        At first every segment is fitted to its first samples alone, from which its start state
+        follows almost linearly.
+        """
+        n, p = self.num_states, len(point.z)
+        (num_experiments, _), num_outputs = self.segments.shape, len(self.output_scales)
+        length = self.segments.valid.shape[-1]
+        few = -(-2 * n // num_outputs) + 1
+        used = jnp.arange(length) < jnp.where(is_first, few, length)
+        weight = used[:, None] / sd[None]
+        prior = jnp.where(is_first, 1 / _FIRST_WIDTH, jnp.sqrt(damping + 1e-12))
+
+        def eliminate(carry: Array, parts: tuple) -> tuple[Array, Array]:
+            J, r, A, c = parts  # of one segment; J and A by its start state, then z
+            wide = jnp.zeros((len(carry), n))
+            rows = jnp.concatenate([
+                jnp.concatenate([carry[:, :n], wide, carry[:, n:]], axis=1),
+                prior * jnp.eye(n, 2 * n + p + 1),
+                jnp.concatenate([J[:, :n], jnp.zeros((len(J), n)), J[:, n:], r], axis=1),
+                jnp.concatenate([A[:, :n], -jnp.eye(n) / width, A[:, n:], c], axis=1),
+            ])  # fmt: skip
+            R = jnp.linalg.qr(rows, mode="r")
+            return R[n:, n:], R[:n]
+
+        def simulate_block(carry: tuple, parts: tuple) -> tuple[tuple, Array]:
+            triangle, misfits, gaps, index = carry
+            shots = self.shoot(point.z, *parts)
+            misfits += jnp.sum((shots.misfit / sd[None, None, None]) ** 2)
+            gaps += jnp.sum(shots.gap**2)
+            joined = num_experiments, shots.gap.shape[1], -1
+            J = (shots.misfit_slope * weight[None, None, ..., None]).reshape(*joined, n + p)
+            r = (shots.misfit * weight[None, None]).reshape(*joined, 1)
+            A = jnp.where(is_first, 0.0, shots.end_slope) / width
+            c = jnp.where(is_first, 0.0, shots.gap)[..., None] / width
+            if not self.first_is_free:
+                knows = (index == 0) & (jnp.arange(J.shape[1]) == 0)[None, :, None, None]
+                J = J.at[..., :n].multiply(~knows)
+                A = A.at[..., :n].multiply(~knows)
+            chain = jax.vmap(lambda own, *parts: jax.lax.scan(eliminate, own, parts))
+            triangle, rows = chain(triangle, J, r, A, c)
+            return (triangle, misfits, gaps, index + 1), rows
+
+        nothing = jnp.asarray(0.0)
+        begin = jnp.zeros((num_experiments, n + p + 1, n + p + 1)), nothing, nothing, 0
+        (triangle, misfits, gaps, _), rows = jax.lax.scan(
+            simulate_block, begin, self._blocks(point.starts)
+        )
+        common = jnp.linalg.qr(triangle[:, n:, n:].reshape(-1, p + 1), mode="r")
+        return Linear(over_segments(rows), common, misfits, gaps)
+
+    def step_of(self, found: Linear, damping: Array, is_first: Array) -> tuple[Array, Point]:
+        """The sum of squares that a Levenberg-Marquardt step would leave, and the step.
+
+        The damping is raised until no search coordinate changes too much.
+        """
+        n, p = self.num_states, len(found.common) - 1
+        scale = jnp.sum(found.common[:, :p] ** 2) + _TINY
+
+        def damped(damping: Array) -> Array:
+            extra = jnp.sqrt(damping) * jnp.eye(p, p + 1)
+            R = jnp.linalg.qr(jnp.concatenate([found.common, extra]), mode="r")
+            return -jax.scipy.linalg.solve_triangular(R[:p, :p], R[:p, p])
+
+        def longer(found: tuple[Array, Array]) -> tuple[Array, Array]:
+            damping = jnp.maximum(10 * found[0], 1e-9 * scale)
+            return damping, damped(damping)
+
+        _, dz = jax.lax.while_loop(
+            lambda found: (
+                (jnp.max(jnp.abs(found[1]) / self.largest) > 1) & (found[0] < 1e6 * scale)
+            ),
+            longer,
+            (damping, damped(damping)),
+        )
+        dz = jnp.where(is_first, 0.0, dz)
+        change = jnp.append(dz, 1.0)
+
+        def substitute(after: Array, row: Array) -> tuple[Array, Array]:
+            right = row[:, n : 2 * n] @ after + row[:, 2 * n :] @ change
+            own = -jax.scipy.linalg.solve_triangular(row[:, :n], right)
+            return own, own
+
+        backwards = jax.vmap(
+            lambda rows: jax.lax.scan(substitute, jnp.zeros(n), rows, reverse=True)[1]
+        )
+        left = jnp.sum((found.common @ change) ** 2)
+        return left, Point(dz, backwards(found.rows))
+
+    def matched(self, start: Point, sd: Array) -> Point:
+        """Where the segments fit and the gaps are closed, or as far as that succeeds."""
+        num_gaps = jnp.maximum(jnp.sum(self.segments.is_followed) * self.num_states, 1)
+
+        def match(s: _Match) -> _Match:
+            is_first = s.steps < _FIRST
+            before = jnp.where(is_first, 0.0, s.damping * s.misfits)
+            found = self.linearised(s.here, sd, s.next_width, before, is_first)
+            gained = s.misfits - found.misfits + (s.gaps - found.gaps) / s.width**2
+            accepted = (s.steps <= _FIRST) | (gained >= _ACCEPTED * s.part * s.hoped)
+            is_good = (s.part == 1) & (gained >= _GOOD * s.hoped)
+            factor = jnp.where(is_good, 0.01, jnp.where(s.part < 1, 10.0, 1.0))
+            damping = jnp.where(is_first, s.damping, jnp.clip(s.damping * factor, 1e-18, 1e3))
+            cost = found.misfits + found.gaps / s.next_width**2
+            left, change = self.step_of(found, damping * cost, is_first)
+            mean_square = found.gaps / num_gaps
+            moved = _Match(
+                best=s.here,
+                change=change,
+                here=jax.tree.map(jnp.add, s.here, change),
+                misfits=found.misfits,
+                gaps=found.gaps,
+                hoped=cost - left,
+                width=s.next_width,
+                next_width=_next_width(s.next_width, mean_square, is_first),
+                damping=damping,
+                part=jnp.asarray(1.0),
+                steps=s.steps + 1,
+                is_closed=~is_first & (mean_square < _SMALL**2),
+            )
+            part = 0.25 * s.part
+            nearer = jax.tree.map(lambda at, by: at + part * by, s.best, s.change)
+            stayed = s._replace(here=nearer, part=part, steps=s.steps + 1)
+            return _where(accepted, moved, stayed)
+
+        def goes_on(s: _Match) -> Array:
+            is_sound = (s.part > _LEAST_PART) & ((s.steps <= _FIRST) | jnp.isfinite(s.misfits))
+            return ~s.is_closed & is_sound & (s.steps < _MATCHES)
+
+        begin = _Match(
+            best=start,
+            change=jax.tree.map(jnp.zeros_like, start),
+            here=start,
+            misfits=jnp.asarray(jnp.inf),
+            gaps=jnp.asarray(jnp.inf),
+            hoped=jnp.asarray(0.0),
+            width=jnp.asarray(1.0),
+            next_width=jnp.asarray(1.0),
+            damping=jnp.asarray(1e-3),
+            part=jnp.asarray(1.0),
+            steps=jnp.asarray(0),
+            is_closed=jnp.asarray(False),
+        )
+        found = jax.lax.while_loop(goes_on, match, begin)
+        return _where(found.is_closed, found.here, found.best)
+
+    def weighted(self, sweep: Sweep, sd: Array) -> Float[Array, "experiment unknown unknown"]:
+        """The triangle of all outputs over their standard deviations; unknowns, then value."""
+        triangles = sweep.triangles / sd[None, :, None, None]
+        if not self.first_is_free:
+            triangles = triangles[..., self.num_states :]
+        stacked = triangles.reshape(len(triangles), -1, triangles.shape[-1])
+        return jnp.linalg.qr(stacked, mode="r")
 
     def newton_step(
-        self, found: Solution, triangle: Array, damping: Array
-    ) -> tuple[Array, Array, Array]:
-        """Damped Gauss-Newton step: changes of z, start states and weighted outputs."""
-        n, p = self.num_states, len(found.z)
-        k = n if self.first_is_free else 0
+        self, moves: Array, triangle: Array, damping: Array
+    ) -> tuple[Point, Float[Array, "experiment unknown"]]:
+        """Damped Gauss-Newton step: the change of the point, and of the weighted outputs."""
+        n, width = self.num_states, moves.shape[-1]
+        k, p = n if self.first_is_free else 0, width - n - 1
 
         def damped(rows: Array, count: int) -> Array:
             extra = jnp.sqrt(damping) * jnp.eye(count, rows.shape[-1])
@@ -239,96 +459,101 @@ class MultipleShooting:
         R = jax.vmap(lambda own: damped(own, k))(triangle) if k else triangle
         common = damped(R[:, k:, k:].reshape(-1, p + 1), p)
         dz = -jax.scipy.linalg.solve_triangular(common[:p, :p], common[:p, p])
-        dz = dz * _LARGEST / jnp.maximum(jnp.max(jnp.abs(dz)), _LARGEST)
-        change = jnp.zeros((len(R), n + p + 1)).at[:, n:].set(jnp.append(dz, 1.0)[None])
+        change = jnp.zeros((len(R), width)).at[:, n:].set(jnp.append(dz, 1.0)[None])
         if k:
             right = jnp.einsum("ekq,eq->ek", R[:, :k, k:], change[:, n:])
             first = -jax.vmap(jax.scipy.linalg.solve_triangular)(R[:, :k, :k], right)
             change = change.at[:, :n].set(first)
         outputs = jnp.einsum("erq,eq->er", triangle[..., :-1], change[:, n - k : -1])
-        return dz, jnp.einsum("esnq,eq->esn", found.moves, change), outputs
+        return Point(dz, jnp.einsum("esnq,eq->esn", moves, change)), outputs
 
-    def start(self, z: Float[Array, " param"], starts: Array) -> Solution:
-        """A point where a search begins; the start states are over their scales."""
-        width = self.num_states + len(z) + 1
-        rows = jnp.zeros((*self.segments.measured.shape, width))
-        return Solution(z, starts, rows, jnp.zeros((*starts.shape, width)), jnp.asarray(False))
+    def limited_step(
+        self, moves: Array, triangle: Array, damping: Array
+    ) -> tuple[Float[Array, ""], Point, Float[Array, "experiment unknown"]]:
+        """A step with the damping raised until no search coordinate changes too much."""
+        scale = jnp.sum(triangle[..., :-1] ** 2)
+
+        def is_too_long(found: tuple) -> Array:
+            damping, change, _ = found
+            return (jnp.max(jnp.abs(change.z) / self.largest) > 1) & (damping < _MOST * scale)
+
+        def shorter(found: tuple) -> tuple:
+            damping = jnp.maximum(10 * found[0], 1e-9 * scale)
+            return damping, *self.newton_step(moves, triangle, damping)
+
+        first = damping, *self.newton_step(moves, triangle, damping)
+        return jax.lax.while_loop(is_too_long, shorter, first)
 
     def solve(
         self,
-        start: Solution,
+        start: Point,
+        sd: Float[Array, " output"],
         *,
-        is_refinement: Bool[Array, ""],
         rounding: Float[Array, ""],
         tolerance: float,
         max_steps: int,
-    ) -> Solution:
-        """The minimum.
+    ) -> tuple[Point, Sweep, Bool[Array, ""]]:
+        """The minimum, its sweep, and whether the search converged.
 
         Args:
-            is_refinement: the start is near the minimum, so the first phase is left out.
+            start: near the minimum, or `matched`.
+            sd: standard deviation of each output's noise.
             rounding: a change of a weighted output that is nothing but rounding.
             tolerance: the search ends before a step that would change the estimate by less
                 than this part of its standard error.
             max_steps: of the second phase.
         """
-        count = jnp.sum(self.segments.valid) * self.segments.measured.shape[-1]
+        count = jnp.sum(self.segments.valid) * len(sd)
 
-        def advance(s: _Search) -> _Search:
-            shots = self.shoot(s.z, s.starts)
-            return jax.lax.cond(s.steps < _MATCHES, match, improve, s, shots)
-
-        def match(s: _Search, shots: Shots) -> _Search:
-            dz, moved = self.matching_step(shots)
-            # At first no segment knows more of its start than the one before.
-            follow = jnp.zeros_like(moved).at[:, 1:].set(shots.gap)
-            dz, moved = jnp.where(s.steps == 0, 0.0, dz), jnp.where(s.steps == 0, follow, moved)
-            is_finite = jnp.all(jnp.isfinite(dz)) & jnp.all(jnp.isfinite(moved))
-            z = jnp.where(is_finite, s.z + dz, start.z)
-            starts = jnp.where(is_finite, s.starts + moved, start.starts)
-            return s._replace(z=z, starts=starts, steps=s.steps + 1)
-
-        def improve(s: _Search, shots: Shots) -> _Search:
-            found = self.condensed(shots, s.z, s.starts)
-            triangle = self.triangle(found)
-            cost = jnp.sum(triangle[..., -1] ** 2)
+        def improve(s: _Search) -> _Search:
+            sweep = self.sweep(s.here)
+            cost = jnp.sum((sweep.triangles[..., -1] / sd[None, :, None]) ** 2)
             hoped, gained = s.cost - s.predicted, s.cost - cost
-            is_bold = (s.steps < _MATCHES + _BOLD) & (cost < _LIMIT * s.cost)
-            accepted = (gained >= _ACCEPTED * hoped) | is_bold | (s.steps == _MATCHES)
-            best, triangle, cost = jax.tree.map(
-                lambda new, old: jnp.where(accepted, new, old),
-                (found, triangle, cost), (s.best, s.triangle, s.cost),
-            )  # fmt: skip
+            is_bold = (s.steps < _BOLD) & (cost < _LIMIT * s.cost)
+            accepted = (gained >= _ACCEPTED * hoped) | is_bold | (s.steps == 0)
+            best, sweep, cost = _where(accepted, (s.here, sweep, cost), (s.best, s.sweep, s.cost))
+            triangle = self.weighted(sweep, sd)
             growth = jnp.where(gained > _GOOD * hoped, _GROWTH, 1.0)
-            radius = jnp.clip(s.radius * jnp.where(accepted, growth, _SHRINKAGE), 1e-9, 1e9)
+            radius = jnp.clip(s.radius * jnp.where(accepted, growth, _SHRINKING), 1e-9, 1e9)
             part = jnp.where(accepted, jnp.minimum(2 * s.part, 1.0), 0.5 * s.part)
             damping = cost / radius + _EPS**2 * jnp.sum(triangle**2) + _TINY
-            dz, moved, outputs = self.newton_step(best, triangle, damping)
+            damping, change, outputs = self.limited_step(sweep.moves, triangle, damping)
             reached = jnp.sum((triangle[..., -1] + outputs) ** 2)
             least = jnp.maximum(tolerance**2 * cost / count, rounding**2)
-            is_closed = jnp.max(jnp.abs(best.moves[..., -1])) < _CLOSED
+            is_closed = jnp.max(jnp.abs(sweep.moves[..., -1])) < _CLOSED
             settled = accepted & is_closed & (jnp.sum(outputs**2) <= least)
-            z, starts = best.z + part * dz, best.starts + part * moved
-            # The last step is taken too; it is too small for the rows to change.
-            last = best._replace(z=z, starts=starts, converged=settled)
-            best = jax.tree.map(lambda new, old: jnp.where(settled, new, old), last, best)
+            here = jax.tree.map(lambda at, by: at + part * by, best, change)
             predicted = cost + part * (reached - cost)
-            return _Search(best, triangle, cost, predicted, z, starts, radius, part, s.steps + 1)
+            return _Search(here, best, sweep, cost, predicted, radius, part, s.steps + 1, settled)
 
         def goes_on(s: _Search) -> Array:
-            is_sound = (s.steps <= _MATCHES) | jnp.isfinite(s.cost)
-            return ~s.best.converged & is_sound & (s.steps < max_steps + _MATCHES)
+            is_sound = (s.steps == 0) | (jnp.isfinite(s.cost) & (s.part > 1e-6))
+            return ~s.converged & is_sound & (s.steps < max_steps)
 
-        unknowns = start.rows.shape[-1] - (0 if self.first_is_free else self.num_states)
+        nothing = jax.eval_shape(self.sweep, start)
         search = _Search(
-            best=start._replace(converged=jnp.asarray(False)),
-            triangle=jnp.zeros((len(start.starts), unknowns, unknowns)),
+            here=start,
+            best=start,
+            sweep=jax.tree.map(lambda a: jnp.zeros(a.shape), nothing),
             cost=jnp.asarray(jnp.inf),
             predicted=jnp.asarray(0.0),
-            z=start.z,
-            starts=start.starts,
             radius=jnp.asarray(1e3),
             part=jnp.asarray(1.0),
-            steps=jnp.where(is_refinement, _MATCHES, 0),
+            steps=jnp.asarray(0),
+            converged=jnp.asarray(False),
         )
-        return jax.lax.while_loop(goes_on, advance, search).best
+        found = jax.lax.while_loop(goes_on, improve, search)
+        # The last step is taken too; it is too small for the sweep to change.
+        point = _where(found.converged, found.here, found.best)
+        return point, found.sweep, found.converged
+
+
+def _next_width(width: Array, mean_square: Array, is_first: Array) -> Array:
+    """Width of the gaps in the next step: it shrinks with the gaps, at last quadratically."""
+    least = jnp.maximum(_SHRINKAGE * width, _LEAST_WIDTH)
+    return jnp.where(is_first, 1.0, jnp.clip(mean_square, least, width / 3))
+
+
+def _where(condition: Array, new: Tree, old: Tree) -> Tree:
+    """One of two trees of arrays."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)

@@ -8,6 +8,7 @@ noise that is the maximum-likelihood estimate (Ljung, System Identification, ch.
 from __future__ import annotations
 
 import math
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ..description import names_of
-from ..information import fisher_information, marginal_information, relative_size
+from ..information import relative_size
 from ..plant import AbstractPlant, Params, require_double_precision
 from .contract import (
     AbstractEstimator,
@@ -27,7 +28,9 @@ from .contract import (
     simulate_experiments,
     to_search,
 )
-from .multiple_shooting import MultipleShooting, Segments, Solution
+from .multiple_shooting import MultipleShooting, Point, Segments
+
+Noise = Literal["declared", "known", "estimated"]
 
 
 class NLS(AbstractEstimator):
@@ -38,12 +41,16 @@ class NLS(AbstractEstimator):
             this part of its standard error.
         max_steps: of the search.
         segment_length: of multiple shooting [samples], default one for the record's length.
+        noise: "declared": an output's weight follows from its declared noise (without one, from
+            its scale), the size of the noise from the residual; "known": that follows from
+            the declaration, too; "estimated": the weights follow from the residual, too.
         known: names of parameters that are held where the search starts.
     """
 
     tolerance: float = eqx.field(static=True, default=1e-4)
     max_steps: int = eqx.field(static=True, default=100)
     segment_length: int | None = eqx.field(static=True, default=None)
+    noise: Noise = eqx.field(static=True, default="declared")
     known: tuple[str, ...] = eqx.field(static=True, default=())
     name: str = eqx.field(static=True, default="nls", kw_only=True)
 
@@ -60,7 +67,7 @@ class NLS(AbstractEstimator):
         others = ~jnp.asarray(self.held(plant))
         free = others if free is None else free & others
         problem = _Problem(plant, experiments, plant.nominal if start is None else start, free)
-        return problem.estimate(*self._search(problem))
+        return problem.estimate(self._search(problem), self.noise == "known")
 
     def held(self, plant: AbstractPlant) -> tuple[bool, ...]:
         """Which parameters of a plant are held; ValueError for a name it does not have."""
@@ -83,51 +90,59 @@ class NLS(AbstractEstimator):
     ) -> tuple[
         Float[Array, "experiment sample output unknown"], Float[Array, "experiment sample output"]
     ]:
-        """Sensitivity and residual at an estimate, over the noise's standard deviation.
+        """Sensitivity and residual at an estimate, over the standard deviation of the weights.
 
         The unknowns are relative changes of the parameters, then the initial states if they
         were estimated.
         """
         problem = _Problem(plant, experiments, estimate.params, free)
-        sd = problem.noise_sd(estimate.residual)
+        is_estimated = self.noise == "estimated"
+        sd = problem.noise_sd(estimate.residual) if is_estimated else problem.assumed_sd
         S = problem.sensitivity(estimate.params, estimate.initial_state)
         return S / sd[None, None, :, None], estimate.residual / sd[None, None]
 
-    def _search(self, problem: _Problem) -> tuple[Solution, Float[Array, " output"]]:
-        """The minimum, its rows by sample, and the standard deviation of each output's noise."""
+    def _search(self, problem: _Problem) -> _Found:
+        """The minimum."""
         experiments, plant = problem.experiments, problem.plant
         num_samples = experiments.valid.shape[1]
-        segments = Segments.of(experiments, self._length(plant, num_samples))
+        segments = Segments.of(experiments, self.length_of_segments(plant, num_samples))
+        is_free = not experiments.initial_state_known
+        shooting = MultipleShooting(plant, segments, problem.params, is_free)
 
-        def weighted(sd: Array) -> MultipleShooting:
-            is_free = not experiments.initial_state_known
-            return MultipleShooting(plant, segments, problem.params, is_free, sd)
-
-        def search(last: tuple[Solution, Array], stage: Array) -> tuple[tuple, None]:
-            start, sd = last
-            found = weighted(sd).solve(
+        def search(start: Point, sd: Array) -> _Found:
+            point, sweep, converged = shooting.solve(
                 start,
-                is_refinement=stage > 0,
+                sd,
                 rounding=jnp.min(problem.rounding / sd),
                 tolerance=self.tolerance,
                 max_steps=self.max_steps,
             )
-            residual = segments.joined(found.rows[..., -1], num_samples)
-            return (found, problem.noise_sd(residual)), None
+            misfit = sweep.misfit.reshape(len(segments.inputs[0]), -1, problem.num_outputs)
+            return _Found(point, converged, sweep.triangles, -misfit[:, :num_samples], sd)
 
         first = experiments.initial_state / problem.state_scales[None]
-        starts = jnp.tile(first[:, None], (1, segments.valid.shape[1], 1))
-        start = weighted(problem.assumed_sd).start(problem.start, starts)
-        # Several outputs: again, each weighted by its estimated noise.
-        stages = jnp.arange(2 if problem.num_outputs > 1 else 1)
-        (found, sd), _ = jax.lax.scan(search, (start, problem.assumed_sd), stages)
-        return found._replace(rows=segments.joined(found.rows, num_samples)), sd
+        starts = jnp.tile(first[:, None], (1, segments.shape[1], 1))
+        sd = problem.assumed_sd
+        found = search(shooting.matched(Point(problem.start, starts), sd), sd)
+        if self.noise == "estimated" and problem.num_outputs > 1:
+            found = search(found.point, problem.noise_sd(found.residual))
+        return found
 
-    def _length(self, plant: AbstractPlant, num_samples: int) -> int:
+    def length_of_segments(self, plant: AbstractPlant, num_samples: int) -> int:
         """Length of a segment: it is short, but determines its start state."""
         needed = 4 * len(plant.definition.states)
         usual = max(needed, min(math.isqrt(num_samples), 100))
         return min(self.segment_length or usual, num_samples)
+
+
+class _Found(NamedTuple):
+    """The end of a search: point, triangle of each output, residual, and the assumed noise."""
+
+    point: Point
+    converged: Bool[Array, ""]
+    triangles: Float[Array, "experiment output column column"]
+    residual: Float[Array, "experiment sample output"]
+    sd: Float[Array, " output"]
 
 
 class _Problem(eqx.Module):
@@ -196,35 +211,51 @@ class _Problem(eqx.Module):
 
         return jax.jacfwd(response)(jnp.zeros(len(size) + states))
 
-    def estimate(self, found: Solution, sd: Float[Array, " output"]) -> Estimate:
-        """The estimate at the end of the search, with its covariance from the estimated noise."""
-        values, slope = jax.jvp(self.params, (found.z,), (jnp.ones_like(found.z),))
-        params, num_params = self.plant.Params(*values), len(values)
+    def estimate(self, found: _Found, noise_is_known: bool) -> Estimate:
+        """The estimate at the end of the search, with its covariance."""
+        z = found.point.z
+        values, slope = jax.jvp(self.params, (z,), (jnp.ones_like(z),))
+        params, n = self.plant.Params(*values), self.state_scales.size
         size = relative_size(self.plant, params)
-        # From search coordinates to relative changes.
-        slope = jnp.where(self.free, slope / size, 1.0)
-        first, others = jnp.split(found.rows[..., :-1], [self.state_scales.size], axis=-1)
-        S = others / slope[None, None, None]
+        slope = jnp.where(self.free, slope / size, 1.0)  # of relative changes over z
+        sd = self.assumed_sd if noise_is_known else self.noise_sd(found.residual)
+        weighted = found.triangles[..., :-1] / found.sd[None, :, None, None]
+        columns = weighted[..., n:] / slope[None, None, None]
         initial_state = self.experiments.initial_state
-        if self.experiments.initial_state_known:
-            each = jax.vmap(lambda own: fisher_information(own, sd))(S)
-        else:
-            S = jnp.concatenate([S, first], axis=-1)
-            each = jax.vmap(lambda own: marginal_information(own, sd, num_params))(S)
-            initial_state = found.starts[:, 0] * self.state_scales[None]
-        information = jnp.sum(each, axis=0)
+        if not self.experiments.initial_state_known:
+            columns = jax.vmap(_without)(columns, weighted[..., :n])
+            initial_state = found.point.starts[:, 0] * self.state_scales[None]
+        # H of the weighted outputs, and V of their scores, whose sd is not the assumed one.
+        ratio = (sd / found.sd)[None, :, None, None]
+        each = jnp.einsum("eokp,eokq->opq", columns, columns)
+        H, V = jnp.sum(each, axis=0), jnp.einsum("o,opq->pq", ratio[0, :, 0, 0] ** 2, each)
         held = jnp.diag(jnp.where(self.free, 0.0, 1.0))
         active = jnp.outer(self.free, self.free)
-        relative = jnp.where(active, jnp.linalg.inv(information + held), 0.0)
-        residual = -found.rows[..., -1]
+        inverse = jnp.where(active, jnp.linalg.inv(jnp.where(active, H, 0.0) + held), 0.0)
+        relative = inverse @ V @ inverse
+        information = jnp.einsum("eokp,eokq->pq", columns / ratio, columns / ratio)
         return Estimate(
             params=params,
             covariance=relative * jnp.outer(size, size),
             information=jnp.where(active, information, 0.0),
-            status=_status(values, residual, relative, found.converged),
+            status=_status(values, found.residual, relative, found.converged),
             initial_state=initial_state,
-            residual=residual,
+            residual=found.residual,
         )
+
+
+def _without(
+    columns: Float[Array, "output row param"], others: Float[Array, "output row state"]
+) -> Array:
+    """Columns less what the other columns explain of them, all outputs together.
+
+    A direction of the others that is not determined explains nothing.
+    """
+    a, b = others.reshape(-1, others.shape[-1]), columns.reshape(-1, columns.shape[-1])
+    prior = 1e-6 * jnp.eye(a.shape[1])
+    q, _ = jnp.linalg.qr(jnp.concatenate([a, prior]))
+    b = jnp.concatenate([b, jnp.zeros((a.shape[1], b.shape[1]))])
+    return (b - q @ (q.T @ b))[: len(a)].reshape(columns.shape)
 
 
 def _status(params: Array, residual: Array, covariance: Array, converged: Array) -> Array:
