@@ -12,6 +12,7 @@ from catalogue import FEW_AND_ALL, LONG, PLANTS
 from excite.estimation import NLS, Status, stack_experiments
 from excite.estimation.multiple_shooting import MultipleShooting, Point, Segments
 from excite.excitation import PRBS, Chirp, Multisine, Random
+from excite.excitation.catalogue import excitation_and_origin
 from excite.plant import Aero2, draw_params
 from excite.simulation import response, run_episode, step
 
@@ -139,4 +140,35 @@ def test_plants_within_a_factor_of_three_are_found(excitation, count):
 
     status, power = fit(episodes.inputs, episodes.measured)
     at_the_noise = np.asarray(power) < 1.6 * float(plant.sensor.sd[0]) ** 2
+    assert np.sum(~at_the_noise | (np.asarray(status) != Status.SUCCESSFUL)) == 0
+
+
+@pytest.mark.science
+@pytest.mark.parametrize(
+    ("name", "excitation", "spread"),
+    [
+        ("dc_motor", "multisine", 0.6),
+        ("emps", "loop-multisine", 0.6),
+        ("cart_pole", "loop-square", 0.6),
+        ("cart_pole", "cart_pole", 0.3),  # the shipped policy: nearly chaotic
+    ],
+)
+def test_plants_far_from_the_start_are_found(name, excitation, spread):
+    plant, count = PLANTS[name], 50
+    draw, play = jax.random.split(KEY)
+    params = jax.vmap(draw_params, in_axes=(None, 0, None))(
+        plant, jax.random.split(draw, count), spread
+    )
+    played = excitation_and_origin(excitation, {}, plant)[0]
+    many = jax.vmap(run_episode, in_axes=(None, 0, None, None, 0))
+    episodes = many(plant, params, played, 500, jax.random.split(play, count))
+
+    @jax.jit
+    @jax.vmap
+    def fit(inputs, measured):
+        estimate = NLS()(plant, stack_experiments(plant, [inputs], [measured], True))
+        return estimate.status, jnp.mean(estimate.residual**2, axis=(0, 1))
+
+    status, power = fit(episodes.inputs, episodes.measured)
+    at_the_noise = np.all(np.asarray(power) < 1.6 * np.asarray(plant.sensor.sd) ** 2, axis=1)
     assert np.sum(~at_the_noise | (np.asarray(status) != Status.SUCCESSFUL)) == 0

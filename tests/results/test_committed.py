@@ -34,7 +34,7 @@ def test_every_shipped_policy_was_evaluated_as_it_is(name):
     assert seen["policy_hash"] == read_policy(shipped_policies()[name]).hash
     assert seen["study"]["spread"] == 0.3
     for row in seen["rows"]:
-        # Near chaos nonlinear least squares take half a minute for ten experiments.
+        # Near chaos nonlinear least squares take about a second an experiment.
         least = {"cart_pole": 200, **dict.fromkeys(PROMISED, 10_000)}
         assert row["evaluations"] >= least.get(name, 1000)
         # The agents by PPO are the paper's, which allows 5 of 1000.

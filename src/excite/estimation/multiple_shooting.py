@@ -4,12 +4,16 @@ A record is cut into segments, each with a start state of its own. All segments 
 derivatives are simulated side by side, so a simulation is only as deep as one segment. The
 search has two phases.
 
-First every segment fits its start state to its own samples, and the parameters make the gaps
-small between the end of a segment and the start of the next (weighted by what the segments
-know of their states). Segments are short, so this is almost a linear problem, and it succeeds
-from parameters that are several times too large or too small.
+First phase: start states and parameters minimise the sum of squares of all misfits, over the
+noise, and of all gaps between the end of a segment and the start of the next, over a width.
+The width begins at the states' scales and shrinks with the gaps. Segments are short, so this is
+almost a linear problem, and it succeeds from parameters that are several times too large or
+too small. A step of Levenberg-Marquardt eliminates the start states one after the other by
+orthogonal factorisations, as a square-root information filter does (G. J. Bierman,
+Factorization Methods for Discrete Sequential Estimation, 1977). In the very first steps every
+segment finds its start state from its own first samples, which is nearly linear, too.
 
-Then the gaps are closed. A step of Gauss-Newton closes them to first order,
+Second phase: the gaps are closed. A step of Gauss-Newton closes them to first order,
 
     dx_{s+1} = A_s dx_s + B_s dtheta + c_s
 
@@ -63,7 +67,7 @@ _EPS, _TINY = np.finfo(float).eps, np.finfo(float).tiny
 class Segments(eqx.Module):
     """Experiments cut into blocks of segments of one length.
 
-    `valid` is False for unused samples, `is_followed` where no samples follow a segment.
+    `valid` is False for unused samples, `is_followed` for a segment after which none are used.
     """
 
     inputs: Float[Array, "block experiment segment time input"]
@@ -349,7 +353,8 @@ class MultipleShooting:
         The damping is raised until no search coordinate changes too much.
         """
         n, p = self.num_states, len(found.common) - 1
-        scale = jnp.sum(found.common[:, :p] ** 2) + _TINY
+        scale = jnp.sum(found.common[:, :p] ** 2)
+        damping = damping + _EPS**2 * scale + _TINY
 
         def damped(damping: Array) -> Array:
             extra = jnp.sqrt(damping) * jnp.eye(p, p + 1)
