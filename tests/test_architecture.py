@@ -52,6 +52,8 @@ DOORS = {
     "safetensors": ["files"],
     "scipy.io": ["record/record"],
     "pandas": ["record/table"],
+    "h5py": ["record/formats"],
+    "pyarrow": ["record/formats"],
     "pydantic": ["study", "record/rows", "report/study_table"],
     "tomlkit": ["study"],
     "dask": ["study/cluster"],
@@ -114,8 +116,9 @@ def resolved(name: str) -> str | None:
     return None
 
 
-SHOWING = ("plot", "data_frame", "require_matlab")
-"""Functions that import Matplotlib's figures, or an optional package, when they are called."""
+SHOWING = ("plot", "require_pandas", "require_matlab", "_require_hdf5", "_require_parquet")
+"""Functions that import Matplotlib's figures, or a package that not every computer has, when they
+are called."""
 
 
 @cache

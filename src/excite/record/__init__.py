@@ -1,12 +1,13 @@
 """Experiment files: `record` defines and writes them, `read` reads and `prepare` checks them.
 
-`table` reads CSV text from any source. Nothing here needs JAX.
+`formats` has the kinds of files, `text` the text files from any source, `units` the words for
+units. Nothing here needs JAX, and to write and read excite's own CSV NumPy is enough.
 """
 
+from .formats import columns_in as columns_in
 from .prepare import require_columns as require_columns
 from .prepare import require_playable as require_playable
 from .read import SIGNAL_ENDINGS as SIGNAL_ENDINGS
-from .read import columns_in as columns_in
 from .read import read_record as read_record
 from .read import read_signal as read_signal
 from .record import RECORD_KIND as RECORD_KIND

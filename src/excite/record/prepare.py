@@ -86,6 +86,13 @@ def check_size(values: np.ndarray, part: Input | Output, path: Path) -> None:
     if excess > allowed:
         raise ValueError(
             f"{path}: {part.name!r} reaches {worst:g} {part.unit}, {expected}; "
-            f"is it in another unit? Give a scale, {part.name}=FACTOR (1 confirms that the unit is "
-            "right)"
+            f"is it in another unit? {unit_hint(part.name)}"
         )
+
+
+def unit_hint(name: str) -> str:
+    """What to do about a column in another unit."""
+    return (
+        f"Give a scale, {name}=FACTOR (1 confirms that the unit is right), or the unit, "
+        f"--unit {name}=UNIT"
+    )

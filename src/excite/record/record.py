@@ -24,6 +24,10 @@ if TYPE_CHECKING:
 
 RECORD_KIND = "excite record"
 
+TEXT_ENDINGS = (".csv", ".txt", ".dat", ".tsv")
+READ_ENDINGS = (*TEXT_ENDINGS, ".mat", ".h5", ".hdf5", ".parquet")
+_MAX_FILE = 2**30  # bytes
+
 
 @dataclass(frozen=True, repr=False)
 class Record:
@@ -138,9 +142,25 @@ class Record:
 
 
 def require_record_ending(path: Path) -> None:
-    """Raises ValueError for a file that is neither .csv nor .mat."""
+    """Raises ValueError for a file to write that is neither .csv nor .mat."""
     if path.suffix.lower() not in (".csv", ".mat"):
         raise ValueError(f"{path}: experiment files end in .csv or .mat")
+
+
+def require_readable(path: Path) -> None:
+    """Raises ValueError, before anything is read, for what is no experiment file."""
+    if path.suffix.lower() not in READ_ENDINGS:
+        *others, last = READ_ENDINGS
+        raise ValueError(f"{path}: experiment files end in {', '.join(others)} or {last}")
+    if not path.exists() or path.is_dir():
+        raise ValueError(f"{path}: no such file")
+    if not path.is_file():
+        raise ValueError(f"{path}: is a pipe or a device; only files can be read")
+    if (size := path.stat().st_size) > _MAX_FILE:
+        raise ValueError(
+            f"{path}: the file has {size / 2**20:.0f} MiB, more than {_MAX_FILE >> 20}; save it "
+            "with fewer rows or columns"
+        )
 
 
 def require_record_path(path: Path, overwrite: bool) -> None:
@@ -190,9 +210,7 @@ def read_sidecar(path: Path) -> Mapping[str, Any]:
 
 def described_in(path: Path) -> PlantDescription:
     """The plant that a record's sidecar names; ValueError without one."""
-    require_record_ending(path)
-    if not path.is_file():
-        raise ValueError(f"{path}: no such file")
+    require_readable(path)
     content = read_sidecar(path).get("plant")
     if not content:
         raise ValueError(f"{path} has no sidecar that names its plant: name the plant")
