@@ -110,7 +110,7 @@ MISTAKES = {
     "ex.identify([])": "no record is given",
     "ex.identify('missing.csv', 'aero2')": "missing.csv: no such file",
     "ex.identify('missing.csv')": "missing.csv: no such file",
-    "ex.identify('.')": ".: experiment files end in .csv or .mat",
+    "ex.identify('.')": ".: experiment files end in .csv, .txt, .dat, .tsv, .mat, .h5, .hdf5 or",
     "ex.identify(record, 'emps')": "is of plant 'aero2' and has voltage, pitch; plant 'emps' has",
     "ex.read_record(3)": "record must be a path: got int 3",
     "ex.read_study({'a': 1})": "study must be a name or a path: got dict {'a': 1}",

@@ -127,17 +127,14 @@ def test_names_may_hold_commas_between_semicolons(quote, tmp_path):
     np.testing.assert_array_equal(record.outputs[:, 0], [-0.25, 1])
 
 
-@pytest.mark.parametrize("first", ["0.1,0.2,-3e-4", "0.0,0.0,0.1"])
-def test_a_file_without_names_is_refused(first, tmp_path):
+@pytest.mark.parametrize("first", ["0.1,0.2,-3e-4", "0.1,nan,0.1", "", "\n0.1,1,2"])
+def test_columns_without_names_are_numbered(first, tmp_path):
     (tmp_path / "a.csv").write_text(f"{first}\n0.2,1,2\n0.3,1,2\n")
-    with pytest.raises(ValueError, match="the first line holds numbers"):
+    with pytest.raises(ValueError, match=r"no names, its columns are called 1, 2, 3 .*time=NAME"):
         read_record(tmp_path / "a.csv", AERO2)
-
-
-def test_an_empty_first_line_names_no_column(tmp_path):
-    (tmp_path / "a.csv").write_text("\n0.1,1,2\n")
-    with pytest.raises(ValueError, match="line 2 has 3 values where the header names 0"):
-        read_record(tmp_path / "a.csv", AERO2)
+    columns = {"time": "1", "voltage": "2", "pitch": "3"}
+    record = read_record(tmp_path / "a.csv", AERO2, columns, rows="-2:")
+    assert record.time.tolist() == [0.2, 0.3]
 
 
 def test_one_column_is_not_taken_for_two_things(tmp_path):
@@ -261,6 +258,12 @@ def bad_mat(path: Path) -> None:
     path.write_bytes(content[: len(content) // 2])
 
 
+def own_record_cut_off(path: Path) -> None:
+    """What excite writes ends with a line break."""
+    write_record(path, drawn(AERO2), AERO2)
+    path.write_bytes(path.read_bytes()[:-5])
+
+
 def hdf5_mat(path: Path) -> None:
     """The beginning of a MAT file of version 7.3."""
     text = b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(116)
@@ -296,7 +299,8 @@ BAD_FILES: dict[str, tuple[str, str | bytes | Callable[[Path], None], tuple[str,
         ("no column 'pitch'", "time, voltage, theta", "--column pitch=NAME"),
     ),
     "column named twice": (
-        "r.csv", text_of(table()).replace("pitch", "voltage"), ("twice", "voltage, voltage"),
+        "r.csv", text_of(table()).replace("pitch", "voltage"),
+        ("twice", "voltage (column 2) or voltage (column 3)", "--column voltage=NAME"),
     ),
     "missing sample": ("r.csv", spoiled(pitch={4: ""}), ("sample 5", "'pitch'", "is missing")),
     "blank sample": ("r.csv", spoiled(pitch={4: "  "}), ("sample 5", "'pitch'", "is missing")),
@@ -333,8 +337,9 @@ BAD_FILES: dict[str, tuple[str, str | bytes | Callable[[Path], None], tuple[str,
     "header only": ("r.csv", "time,voltage,pitch\n", ("0 samples", "at least two")),
     "one sample": ("r.csv", "time,voltage,pitch\n0,0,0\n", ("1 samples", "at least two")),
     "binary": ("r.csv", bytes(range(256)) * 40, ("cannot be read as CSV",)),
-    "binary that is text": ("r.csv", b"\x00\x01\x02\n\x03\n", ("no column 'time'",)),
-    "number cut in half": ("r.csv", text_of(table())[:-5], ("line 31", "line break", "truncated")),
+    "binary that is text": ("r.csv", b"\x00\x01\x02\n\x03\n", ("cannot be read as CSV",)),
+    "number cut in half": ("r.csv", own_record_cut_off, ("line 31", "line break", "truncated")),
+    "cell cut off": ("r.csv", text_of(table()).rpartition(",")[0] + ",", ("line 31", "truncated")),
     "one endless field": ("r.csv", b"a" * 200_000, ("cannot be read as CSV",)),
     "UTF-16": ("r.csv", text_of(table()).encode("utf-16"), ("cannot be read as CSV",)),
     "truncated MAT": ("r.mat", bad_mat, ("not a readable MAT file",)),
@@ -348,8 +353,8 @@ BAD_FILES: dict[str, tuple[str, str | bytes | Callable[[Path], None], tuple[str,
         "r.mat", mat_of(pitch=np.zeros(7)), ("'pitch' has 7 samples", "'time' 30"),
     ),
     "MAT with NaN": ("r.mat", mat_of(pitch=np.full(30, np.nan)), ("30 of 30", "finite")),
-    "wrong ending": ("r.txt", text_of(table()), (".csv or .mat",)),
-    "no ending": ("record", text_of(table()), (".csv or .mat",)),
+    "wrong ending": ("r.toml", text_of(table()), (".csv, .txt", "or .parquet")),
+    "no ending": ("record", text_of(table()), (".csv, .txt", "or .parquet")),
 }  # fmt: skip
 
 

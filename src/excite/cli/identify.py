@@ -73,6 +73,24 @@ from .options import (
     multiple=True,
     help="Factors from the file's units to the plant's: pitch=0.01745.",
 )
+@click.option(
+    "--unit",
+    type=NAMES,
+    multiple=True,
+    help="The file's units where they are not the plant's: time=ms,pitch=deg.",
+)
+@click.option(
+    "--set-input",
+    type=NUMBERS,
+    multiple=True,
+    help="Constant inputs that the file does not have: voltage=5.",
+)
+@click.option("--dt", type=float, metavar="SECONDS", help="Sampling time of a file without time.")
+@click.option(
+    "--rows",
+    metavar="START:STOP:STEP",
+    help="Rows to use, counted from 0 below the names: 100:1000:5.",
+)
 @click.option("--out", type=OUT_FILE, metavar="FOLDER", help="Run folder to write.")
 @click.option("--overwrite", is_flag=True, help="Replace the run folder if it exists.")
 @plot_option
@@ -81,9 +99,10 @@ from .options import (
 def identify(
     files: tuple[Path, ...], out: Path | None, plot: Path | None, as_json: bool, **options: Any
 ) -> int:
-    """Estimate PLANT's parameters from one or several records (.csv, .mat).
+    """Estimate PLANT's parameters from one or several records.
 
-    Several records are fitted together: they share the parameters, each has its initial state.
+    A record is a file .csv, .txt, .dat, .tsv, .mat, .h5, .hdf5 or .parquet. Several records are
+    fitted together: they share the parameters, each has its initial state.
     """
     from ..estimation.identify import identify as verb
     from ..estimation.result import write_run
@@ -101,6 +120,10 @@ def identify(
             validate=options["validate"],
             columns=merged(options["column"]),
             scales=merged(options["scale"]),
+            units=merged(options["unit"]),
+            set_inputs=merged(options["set_input"]),
+            dt=options["dt"],
+            rows=options["rows"],
         )
     if plot is not None:
         from ..record.figure import save

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal, TypeAlias, get_args
 
@@ -62,6 +63,10 @@ def identify(
     validate: RecordLike | Sequence[RecordLike] = (),
     columns: Mapping[str, str] | None = None,
     scales: Mapping[str, float] | None = None,
+    units: Mapping[str, str] | None = None,
+    set_inputs: Mapping[str, float] | None = None,
+    dt: float | None = None,
+    rows: slice | str | None = None,
 ) -> Identification:
     """Parameters of one plant from one or several records.
 
@@ -85,6 +90,10 @@ def identify(
         validate: records for which only the initial state is fitted.
         columns: names in the files where they are not the plant's: {"pitch": "qm"}.
         scales: factors from the files' units to the plant's: {"pitch": 0.01745}.
+        units: the files' units where they are not the plant's: {"time": "ms", "pitch": "deg"}.
+        set_inputs: values of constant inputs that the files do not have: {"voltage": 5.0}.
+        dt: sampling time of files without time [s].
+        rows: rows of the files to use, counted from 0: slice(100, 1000, 5) or "100:1000:5".
 
     Raises:
         ValueError: for records too short, of different sampling times, or in which no
@@ -99,8 +108,18 @@ def identify(
     estimator, begin = _chosen(estimator, plant, start, hold)
     if initial_state not in get_args(InitialState):
         raise ValueError(f"initial state {initial_state!r} is not one of: known, free, auto")
+    read = partial(
+        read_record,
+        description=plant.description,
+        columns=columns,
+        scales=scales,
+        units=units,
+        set_inputs=set_inputs,
+        dt=dt,
+        rows=rows,
+    )
     records, validation = (
-        [_read(r, plant.description, columns, scales) for r in group]
+        [_require_kind(r, plant.description) if isinstance(r, Record) else read(r) for r in group]
         for group in (given, _listed(validate, "validate"))
     )
     known = initial_state == "known" or (
@@ -171,15 +190,8 @@ def _plant_of(record: RecordLike) -> str:
     return name
 
 
-def _read(
-    record: RecordLike,
-    description: PlantDescription,
-    columns: Mapping[str, str] | None,
-    scales: Mapping[str, float] | None,
-) -> Record:
-    """A record that has the plant's inputs and outputs."""
-    if not isinstance(record, Record):
-        return read_record(record, description, columns, scales)
+def _require_kind(record: Record, description: PlantDescription) -> Record:
+    """The record; ValueError where it does not have the plant's inputs and outputs."""
     found = record.inputs.shape[1], record.outputs.shape[1]
     if found != (len(description.inputs), len(description.outputs)):
         raise ValueError(

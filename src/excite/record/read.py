@@ -84,7 +84,7 @@ def read_record(
         if scales.get(name, factor if name in units else None) == 1
     }
     needed = [name for name in unit_of if name not in set_inputs and (name != "time" or dt is None)]
-    cells = _cells(path, needed, columns, set_inputs)
+    cells = _cells(path, description, needed, columns, set_inputs)
     samples = {name: len(column) for name, column in cells.items()}
     first, num_samples = next(iter(samples.items()))
     if others := [name for name in samples if samples[name] != num_samples]:
@@ -184,7 +184,11 @@ def _text_of(rows: slice) -> str:
 
 
 def _cells(
-    path: Path, needed: list[str], columns: Mapping[str, str], set_inputs: Mapping[str, float]
+    path: Path,
+    description: PlantDescription,
+    needed: list[str],
+    columns: Mapping[str, str],
+    set_inputs: Mapping[str, float],
 ) -> dict[str, np.ndarray]:
     """The columns that are needed, as the file has them, by the plant's names."""
     given = [columns.get(name, name) for name in needed]
@@ -202,7 +206,10 @@ def _cells(
             own = [n for n in _SAMPLING_TIME if n in table and _is_in_first_row_only(table[n])]
             column = own[0] if own else column
         if column not in table:
-            raise _no_column(table, column, name, path)
+            other = ", or give a sampling time with --dt" if name == "time" else ""
+            if name in names_of(description.inputs):
+                other = f", or a constant value with --set-input {name}=VALUE"
+            raise _no_column(table, column, f"--column {name}=NAME{other}", path)
         found[name] = table[column]
     return found
 
@@ -214,23 +221,25 @@ def _nearest(name: str, names: Iterable[str]) -> str:
     return f"; did you mean {lower[near[0]]!r}?" if near else ""
 
 
-def _no_column(table: Mapping[str, np.ndarray], column: str, name: str, path: Path) -> ValueError:
+def _no_column(
+    table: Mapping[str, np.ndarray], column: str, options: str, path: Path
+) -> ValueError:
     """What the file has instead of a column, and the options that mend it."""
     names = list(table)
     several = [n for n in names if n.startswith(f"{column} (column ")]
     if several:
         return ValueError(
-            f"{path}: column {column!r} is there twice, with different values: choose "
-            f"{' or '.join(several)} with --column {name}=NAME"
+            f"{path}: column {column!r} is there twice, with different values: "
+            f"{' or '.join(several)} (choose one with {options})"
         )
     listed = ", ".join(names[:_MOST_NAMES]) or "none"
-    listed += f" and {len(names) - _MOST_NAMES} more" * (len(names) > _MOST_NAMES)
+    if len(names) > _MOST_NAMES:
+        listed += f" and {len(names) - _MOST_NAMES} more"
     if names and names == [str(i) for i in range(1, len(names) + 1)]:
         listed = f"no names, its columns are called {listed}"
-    hint = f"name it with --column {name}=NAME"
-    hint += ", or give a sampling time with --dt" * (name == "time")
     return ValueError(
-        f"{path}: no column {column!r}{_nearest(column, names)}; the file has {listed} ({hint})"
+        f"{path}: no column {column!r}{_nearest(column, names)}; the file has {listed} (name it "
+        f"with {options})"
     )
 
 
@@ -269,7 +278,7 @@ def _seconds(cells: np.ndarray, chosen: slice, factor: float, where: Path) -> np
     if (bad := np.flatnonzero(np.isnan(seconds))).size:
         raise ValueError(
             f"{where}: sample {bad[0] + 1} of 'time' is {str(column[bad[0]])!r}, neither a number "
-            f"nor a date{_FIRST_ROW * (bad[0] == 0)}"
+            f"nor a date{_FIRST_ROW if bad[0] == 0 else ''}"
         )
     if factor != 1:
         raise ValueError(
@@ -291,7 +300,9 @@ def _numbers(cells: np.ndarray, name: str, where: Path) -> np.ndarray:
     bad = next(k for k, cell in enumerate(cells) if _number(cell) is None)
     cell = cells[bad]
     found = f"is {str(cell)!r}, not a number" if _is_there(cell) else "is missing"
-    raise ValueError(f"{where}: sample {bad + 1} of {name!r} {found}{_FIRST_ROW * (bad == 0)}")
+    raise ValueError(
+        f"{where}: sample {bad + 1} of {name!r} {found}{_FIRST_ROW if bad == 0 else ''}"
+    )
 
 
 def _metadata(path: Path, description: PlantDescription) -> Mapping[str, Any]:

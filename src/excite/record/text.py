@@ -142,7 +142,7 @@ def _layout(first: Sequence[str]) -> tuple[str, list[str], bool]:
         rows = [_cells(line, delimiter) for line in first]
         numbers = sum(bool(_NUMBER.fullmatch(cell)) for cell in rows[-1])
         excess = len(rows[-1]) - len(rows[0])
-        is_alike = excess == 0 or (excess == 1 and not rows[-1][-1])
+        is_alike = excess == 0 or (abs(excess) == 1 and not rows[excess > 0][-1])  # an empty end
         return is_alike, numbers, 0 if numbers else len(rows[0])
 
     delimiter = max(_DELIMITERS, key=quality)
