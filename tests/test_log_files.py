@@ -61,6 +61,7 @@ TEXTS: dict[str, str | bytes] = {
     "tabs": "time\tu\ty\n0\t1.5\t-0.25\n0.1\t-2\t1\n0.2\t0.25\t3\n",
     "blanks": "  time   u    y\n  0.0  1.5  -0.25\n 0.1 -2   1\n0.2\t0.25 3  \n",
     "commas and blanks": "time , u, y\n0.0 ,  1.5, -0.25\n0.1 ,-2 ,1\n 0.2, 0.25, 3\n",
+    "whole numbers": "time, u, y\n0, 1.5, -0.25\n0.1, -2, 1\n0.2, 0.25, 3\n",
     "decimal commas": "time;u;y\n0,0;1,5;-0,25\n0,1;-2;1\n0,2;,25;3\n",
     "decimal commas and tabs": "time\tu\ty\n0,0\t1,5\t-0,25\n0,1\t-2\t1\n0,2\t0,25\t3\n",
     "decimal commas and blanks": "time u y\n0,0 1,5 -0,25\n0,1 -2 1\n0,2 2,5e-1 3\n",
@@ -94,6 +95,20 @@ def test_text_files_of_any_kind_hold_the_same_log(kind: str, ending: str, tmp_pa
     assert is_the_log(read(tmp_path / f"log.{ending}", TEXTS[kind]))
 
 
+@pytest.mark.parametrize(("text", "columns"), [
+    ("t, n\n1, 2\n3, 4\n", {"t": [1, 3], "n": [2, 4]}),
+    ("u\n1,5\n2,5\n", {"u": [1.5, 2.5]}),
+    ("1,5 2,5\n3,5 4\n", {"1": [1.5, 3.5], "2": [2.5, 4]}),
+    ("t;u\n0;1,000\n1;2,000\n", {"t": [0, 1], "u": [1, 2]}),
+    ("Time\tSpeed of it\n0\t1\n1\t2\n", {"Time": [0, 1], "Speed of it": [1, 2]}),
+    ("a,,\n0,1,2\n1,2,3\n", {"a": [0, 1], "column 2": [1, 2], "column 3": [2, 3]}),
+    ("t u\n", {"t": [], "u": []}),
+])  # fmt: skip
+def test_the_delimiter_is_the_one_that_gives_most_numbers(text, columns, tmp_path: Path):
+    (tmp_path / "log.csv").write_text(text)
+    assert {n: list(v) for n, v in columns_in(tmp_path / "log.csv").items()} == columns
+
+
 @pytest.mark.parametrize("text", [
     "0,1.5,-0.25\n0.1,-2,1\n0.2,0.25,3\n",
     "0;1,5;-0,25;\n0,1;-2;1;\n0,2;0,25;3;\n",
@@ -107,13 +122,13 @@ def test_columns_without_names_are_mapped_by_their_numbers(text: str, tmp_path: 
     assert list(columns_in(path)) == ["1", "2", "3"]
 
 
-def test_numbers_of_other_programs_are_read_to_the_last_digit(tmp_path: Path):
+def test_numbers_of_other_programs_are_read_to_twelve_digits(tmp_path: Path):
     values = np.random.default_rng(0).normal(size=1000) * 10.0 ** np.arange(-50, 50).repeat(10)
     text = "u;y\n" + "".join(f"{float(v)!r};{float(v):.17e}\n" for v in values)
     (tmp_path / "log.csv").write_text(text)
     found = columns_in(tmp_path / "log.csv")
-    np.testing.assert_allclose(found["u"], values, rtol=1e-15)
-    np.testing.assert_allclose(found["y"], values, rtol=1e-15)
+    np.testing.assert_allclose(found["u"], values, rtol=1e-12)
+    np.testing.assert_allclose(found["y"], values, rtol=1e-12)
 
 
 @pytest.mark.parametrize(("text", "fragments"), [
@@ -122,6 +137,7 @@ def test_numbers_of_other_programs_are_read_to_the_last_digit(tmp_path: Path):
     ("time,u,y\n0,1.5,-0.25\n0.1,-2,", ("line 3", "line break", "truncated?")),
     ("time;u;y\n0;1.5;-0.25\n0.1;-2;1;7\n0.2;1;1\n", ("line 3", "4 values", "3")),
     ("time;u;y\n0;1.5;-0.25\n\n0.1;-2\n0.2;1;1\n", ("sample 2 of 'y' is missing",)),
+    ("Time [s]  Input [V]\n0 1\n0.1 2\n", ("2 values", "names 4", "blanks in quotes")),
     ("time,u,y\n[s],[V],[m]\n0,1,1\n0.1,2,1\n", ("sample 1 of 'time' is '[s]'", "--rows 1:")),
     ("time,u,y\n0,1,1\n0.1,on,1\n", ("sample 2 of 'u' is 'on', not a number",)),
     ("time,u,y\n0,1,1\n0.1,\"1,5\",1\n", ("sample 2 of 'u' is '1,5', not a number",)),
@@ -414,6 +430,15 @@ def test_rows_outside_are_not_looked_at_and_a_message_counts_within_them(tmp_pat
         read(tmp_path / "log.csv", text, rows="50:60")
 
 
+def test_a_record_of_later_rows_does_not_start_at_the_initial_state(tmp_path: Path):
+    own = Record(0.1 * np.arange(9), np.ones((9, 1)), np.ones((9, 1)),
+                 {"starts_at_initial_state": True})  # fmt: skip
+    write_record(tmp_path / "own.csv", own, plant())
+    for rows, is_start in ((None, True), (":5", True), ("0:8:2", True), ("1:", False)):
+        record = read_record(tmp_path / "own.csv", plant(), rows=rows)
+        assert record.starts_at_initial_state is is_start
+
+
 # Constant inputs
 
 
@@ -432,6 +457,8 @@ def test_a_constant_input_need_not_be_in_the_file(tmp_path: Path):
             read_record(path, two, set_inputs=set_inputs)
     with pytest.raises(ValueError, match="input 'load' is a column or a set value"):
         read_record(path, two, {"load": "y"}, set_inputs={"load": 1.0})
+    with pytest.raises(ValueError, match="nothing is left to read"):
+        read_record(path, plant("load"), set_inputs={"load": 1.0}, dt=0.1, inputs_only=True)
     with pytest.raises(ValueError, match=r"no column 'load'.*--set-input load=VALUE"):
         read_record(path, two)
 
@@ -501,11 +528,11 @@ Columns = Sequence[np.ndarray]
 
 
 def compare(
-    record: Record, time: object, inputs: Sequence[object], outputs: Sequence[object]
+    record: Record, time: Sequence[float] | np.ndarray, inputs: Columns, outputs: Columns
 ) -> None:
     np.testing.assert_allclose(record.time, time, rtol=1e-12)
-    np.testing.assert_array_equal(record.inputs, np.column_stack(inputs))
-    np.testing.assert_array_equal(record.outputs, np.column_stack(outputs))
+    np.testing.assert_allclose(record.inputs, np.column_stack(inputs), rtol=1e-12)
+    np.testing.assert_allclose(record.outputs, np.column_stack(outputs), rtol=1e-12)
 
 
 def test_the_tanks_have_their_sampling_time_in_the_first_row():

@@ -85,6 +85,8 @@ def read_record(
     }
     needed = [name for name in unit_of if name not in set_inputs and (name != "time" or dt is None)]
     cells = _cells(path, description, needed, columns, set_inputs)
+    if not cells:
+        raise ValueError(f"{path}: with all inputs set and --dt nothing is left to read")
     samples = {name: len(column) for name, column in cells.items()}
     first, num_samples = next(iter(samples.items()))
     if others := [name for name in samples if samples[name] != num_samples]:
@@ -118,7 +120,7 @@ def read_record(
         time=time,
         inputs=np.stack([values[name] for name in inputs], axis=1),
         outputs=np.array([values[name] for name in outputs]).reshape(-1, len(time)).T,
-        metadata=_metadata(path, description),
+        metadata=_metadata(path, description, chosen.indices(num_samples)[0]),
         source=str(path),
     )
 
@@ -305,9 +307,11 @@ def _numbers(cells: np.ndarray, name: str, where: Path) -> np.ndarray:
     )
 
 
-def _metadata(path: Path, description: PlantDescription) -> Mapping[str, Any]:
+def _metadata(path: Path, description: PlantDescription, first_row: int) -> Mapping[str, Any]:
     """The sidecar; with `columns`, where the file's were mapped to those of another plant."""
     sidecar = read_sidecar(path)
+    if sidecar and first_row > 0:
+        sidecar = {**sidecar, "starts_at_initial_state": False}
     if not sidecar.get("plant"):
         return sidecar
     own = PlantDescription.from_dict(sidecar["plant"]).columns

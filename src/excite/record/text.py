@@ -22,8 +22,9 @@ from .table import require_pandas
 _LONGEST = 64 * 2**10  # bytes of a line
 _SKIPPED = (b"#", b"%", b"sep=")  # comments, and Excel's note about its delimiter
 _DELIMITERS = (";", "\t", " ", ",")  # a blank stands for a run of blanks and tabs
-_NUMBER = re.compile(r"[+-]?(\d+[.,]?\d*|[.,]\d+)([eE][+-]?\d+)?|nan", re.IGNORECASE)
+_NUMBER = re.compile(r"[+-]?(\d+(\.\d*|,\d+)?|[.,]\d+)([eE][+-]?\d+)?|nan", re.IGNORECASE)
 _DATE = re.compile(r"\d{1,4}([-./])\d{1,2}\1\d{1,4}\b.*")
+_TRUNCATED = "is the file truncated?"
 _CLOCK = re.compile(r"(\d+ days? )?\d{1,2}:\d\d:\d\d\b.*")
 
 
@@ -65,11 +66,12 @@ def read_text(path: Path, is_own: bool = False) -> dict[str, np.ndarray]:
     look = _look(path)
     delimiter, names, is_named = _layout(look.first)
     header = _cells(look.first[0], delimiter)
-    _require_whole(path, look, delimiter, names, is_own)
     if is_named and len(look.first) > 1:
         found = len(_cells(look.first[1], delimiter))
         if not len(names) - (not names[-1]) <= found <= len(names):
-            raise _wrong_width(path, look.start + 2, found, len(header))
+            why = "put names that hold blanks in quotes" if delimiter == " " else _TRUNCATED
+            raise _wrong_width(path, look.start + 2, found, len(header), why)
+    _require_whole(path, look, delimiter, names, is_own)
     is_plain = delimiter == "," and is_named and not (look.comments or look.start)
     if is_plain and len(look.first) > 1 and len(set(names)) == len(names) and all(names):
         # anything that NumPy cannot read is read, or explained, below
@@ -114,10 +116,11 @@ def _no_text(path: Path, why: str) -> ValueError:
     return ValueError(f"{path}: cannot be read as CSV text ({why}); save it as UTF-8 text")
 
 
-def _wrong_width(path: Path, line: int, found: int, named: int) -> ValueError:
+def _wrong_width(
+    path: Path, line: int, found: int, named: int, why: str = _TRUNCATED
+) -> ValueError:
     return ValueError(
-        f"{path}: line {line} has {found} values where the header names {named}; is the file "
-        "truncated?"
+        f"{path}: line {line} has {found} values where the header names {named}; {why}"
     )
 
 
@@ -138,12 +141,12 @@ def _layout(first: Sequence[str]) -> tuple[str, list[str], bool]:
     names may hold commas between semicolons, the numbers decimal commas.
     """
 
-    def quality(delimiter: str) -> tuple[bool, int, int]:
+    def quality(delimiter: str) -> tuple[bool, int, bool, int]:
         rows = [_cells(line, delimiter) for line in first]
         numbers = sum(bool(_NUMBER.fullmatch(cell)) for cell in rows[-1])
         excess = len(rows[-1]) - len(rows[0])
         is_alike = excess == 0 or (abs(excess) == 1 and not rows[excess > 0][-1])  # an empty end
-        return is_alike, numbers, 0 if numbers else len(rows[0])
+        return is_alike and numbers > 0, numbers, is_alike, 0 if numbers else len(rows[0])
 
     delimiter = max(_DELIMITERS, key=quality)
     names, *rest = (_cells(line, delimiter) for line in first)
