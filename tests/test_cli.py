@@ -552,6 +552,24 @@ def test_foreign_names_and_units_are_mapped(run, here):
         assert other.json["params"][name]["estimate"] == pytest.approx(p["estimate"], rel=1e-9)
 
 
+def test_a_log_of_another_program_gives_the_same_parameters(run, here):
+    rows = list(csv.DictReader((here / "good.csv").read_text().splitlines()))
+    lines = ["# a log; of 3 columns", "t;u;w", "[ms];[mV];[deg]"] + [
+        f"{1000 * float(r['time'])!r};{1000 * float(r['voltage'])!r};"
+        f"{math.degrees(float(r['pitch']))!r}".replace(".", ",")
+        for r in rows
+    ]
+    (here / "log.txt").write_text("\n".join(lines), encoding="utf-8")
+    options = ["--plant", "aero2", "--initial-state", "free", "--json"]
+    own = run("identify", "good.csv", "--rows", ":150", *options)
+    words = "identify log.txt --column voltage=u,pitch=w --unit voltage=mV,pitch=deg --rows 1:151"
+    for clock in ("--column time=t --unit time=ms", "--dt 0.1"):
+        other = run(*words.split(), *clock.split(), *options)
+        assert other.code == 0, other.err
+        for name, p in own.json["params"].items():
+            assert other.json["params"][name]["estimate"] == pytest.approx(p["estimate"], rel=1e-6)
+
+
 def test_a_run_folder_and_a_figure_are_left(run, here):
     words = "identify foreign.csv --plant aero2 --validate good.csv --out runs/one --plot fit.svg"
     answer = run(*words.split(), "--json")
@@ -751,6 +769,18 @@ BAD: dict[str, tuple[str, tuple[str, ...]]] = {
     "start that is no number": ("identify good.csv --plant aero2 --start J_p=x", ("'x'", "J_p")),
     "column that the plant has not": (
         "identify good.csv --plant aero2 --column theta=pitch", ("'theta'", "time, voltage, pitch"),
+    ),
+    "unit of another quantity": (
+        "identify good.csv --plant aero2 --unit pitch=mm", ("'mm' of 'pitch'", "'rad'", "deg"),
+    ),
+    "rows that are no slice": (
+        "identify good.csv --plant aero2 --rows 5", ("rows '5'", "START:STOP:STEP"),
+    ),
+    "set input that the file has": (
+        "identify good.csv --plant aero2 --set-input voltage=1", ("a column 'voltage'",),
+    ),
+    "sampling time of zero": (
+        "identify good.csv --plant aero2 --dt 0", ("sampling time 0 s", "positive"),
     ),
     "unknown output": ("simulate aero2 --noise pich=0.1", ("'pich'", "'pitch'?")),
     "negative noise": ("simulate aero2 --noise pitch=-1", ("'pitch'", "-1")),

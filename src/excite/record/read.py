@@ -220,7 +220,7 @@ def _nearest(name: str, names: Iterable[str]) -> str:
     """A question with the nearest name, upper and lower case alike; empty where none is near."""
     lower = {known.lower(): known for known in names}
     near = difflib.get_close_matches(name.lower(), lower, n=1)
-    return f"; did you mean {lower[near[0]]!r}?" if near else ""
+    return f" (did you mean {lower[near[0]]!r}?)" if near else ""
 
 
 def _no_column(

@@ -19,10 +19,12 @@ import numpy as np
 
 from .table import require_pandas
 
+_FIRST = 20  # lines that show the layout
 _LONGEST = 64 * 2**10  # bytes of a line
 _SKIPPED = (b"#", b"%", b"sep=")  # comments, and Excel's note about its delimiter
 _DELIMITERS = (";", "\t", " ", ",")  # a blank stands for a run of blanks and tabs
 _NUMBER = re.compile(r"[+-]?(\d+(\.\d*|,\d+)?|[.,]\d+)([eE][+-]?\d+)?|nan", re.IGNORECASE)
+_DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
 _DATE = re.compile(r"\d{1,4}([-./])\d{1,2}\1\d{1,4}\b.*")
 _TRUNCATED = "is the file truncated?"
 _CLOCK = re.compile(r"(\d+ days? )?\d{1,2}:\d\d:\d\d\b.*")
@@ -33,7 +35,7 @@ class _Look:
     """What a pass over the lines of a text file shows.
 
     Attributes:
-        first: its first lines that are neither empty nor a comment, at most two.
+        first: its first lines that are neither empty nor a comment, at most twenty.
         start: index of the first of them.
         comments: indices of the lines to skip.
         last: its last line, likewise.
@@ -64,7 +66,7 @@ def read_text(path: Path, is_own: bool = False) -> dict[str, np.ndarray]:
         ValueError: one sentence for a file that is no such table, or may be truncated.
     """
     look = _look(path)
-    delimiter, names, is_named = _layout(look.first)
+    delimiter, names, is_named = _layout(look.first[:2])
     header = _cells(look.first[0], delimiter)
     if is_named and len(look.first) > 1:
         found = len(_cells(look.first[1], delimiter))
@@ -102,7 +104,7 @@ def _look(path: Path) -> _Look:
                 except UnicodeDecodeError:
                     encoding = "cp1252"  # of a program that knows no UTF-8
                 start = start if first else i
-                first, last, count = [*first, text] if len(first) < 2 else first, text, i + 1
+                first, last, count = [*first, text] if len(first) < _FIRST else first, text, i + 1
     if not first:
         raise ValueError(f"{path}: the file is empty")
     try:
@@ -180,10 +182,9 @@ def _read_cells(
     pandas = require_pandas(
         f"{path}: a text file that is not plain CSV (names, commas, a number in every cell)"
     )
-    decimal = "."
-    if delimiter != "," and any(re.fullmatch(r"[+-]?\d*,\d+([eE].*)?", c)
-                                for c in _cells(look.first[-1], delimiter)):  # fmt: skip
-        decimal = ","
+    rows = [*look.first[is_named:], look.last]
+    has_commas = any(_DECIMAL_COMMA.fullmatch(c) for row in rows for c in _cells(row, delimiter))
+    decimal = "," if delimiter != "," and has_commas else "."
     header = [look.start] if is_named else []
     try:
         with warnings.catch_warnings(action="error", category=pandas.errors.ParserWarning):
