@@ -191,7 +191,7 @@ def special(kind: str, path: Path) -> None:
     ("zeros", "line 1 is longer than 64 KiB"),
     ("one long line", "line 1 is longer than 64 KiB"),
     ("a long line below", "line 3 is longer than 64 KiB"),
-    ("very large", "the file has 2048 MiB, more than 1024"),
+    ("very large", "the file has 2048 MiB, more than 512"),
 ])  # fmt: skip
 @pytest.mark.parametrize("ending", ["csv", "dat"])
 def test_what_cannot_be_read_is_refused_at_once(kind, sentence, ending, tmp_path: Path):
@@ -201,6 +201,12 @@ def test_what_cannot_be_read_is_refused_at_once(kind, sentence, ending, tmp_path
     with pytest.raises(ValueError, match=sentence):
         read_record(path, plant())
     assert time.monotonic() - began < 5
+
+
+def test_a_file_of_very_many_lines_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("excite.record.text._MOST_LINES", 10**6)
+    with pytest.raises(ValueError, match="more than 1 million lines; save it with fewer"):
+        read(tmp_path / "log.csv", "time,u,y\n" + "#\n" * 10**6)
 
 
 # Without pandas, h5py and pyarrow

@@ -26,7 +26,7 @@ RECORD_KIND = "excite record"
 
 TEXT_ENDINGS = (".csv", ".txt", ".dat", ".tsv")
 READ_ENDINGS = (*TEXT_ENDINGS, ".mat", ".h5", ".hdf5", ".parquet")
-_MAX_FILE = 2**30  # bytes
+_MAX_FILE = 2**29  # bytes
 
 
 @dataclass(frozen=True, repr=False)

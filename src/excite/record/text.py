@@ -21,6 +21,7 @@ from .table import require_pandas
 
 _FIRST = 20  # lines that show the layout
 _LONGEST = 64 * 2**10  # bytes of a line
+_MOST_LINES = 20_000_000
 _SKIPPED = (b"#", b"%", b"sep=")  # comments, and Excel's note about its delimiter
 _DELIMITERS = (";", "\t", " ", ",")  # a blank stands for a run of blanks and tabs
 _NUMBER = re.compile(r"[+-]?(\d+(\.\d*|,\d+)?|[.,]\d+)([eE][+-]?\d+)?|nan", re.IGNORECASE)
@@ -93,6 +94,9 @@ def _look(path: Path) -> _Look:
         for i, line in enumerate(iter(partial(file.readline, _LONGEST), b"")):
             if len(line) == _LONGEST:
                 raise _no_text(path, f"line {i + 1} is longer than {_LONGEST >> 10} KiB")
+            if i == _MOST_LINES:
+                millions = f"{_MOST_LINES // 10**6} million lines"
+                raise ValueError(f"{path}: the file has more than {millions}; save it with fewer")
             if b"\0" in line:
                 raise _no_text(path, f"line {i + 1} holds zero bytes")
             text = line.removeprefix(b"\xef\xbb\xbf") if i == 0 else line
