@@ -1,8 +1,10 @@
 """Files of other programs: formats, time, rows, units, constant inputs, and real recordings."""
 
 import csv
+import json
 import math
 import os
+import re
 import sys
 import time
 from collections.abc import Sequence
@@ -15,6 +17,7 @@ import pandas as pd
 import pyarrow
 import pyarrow.parquet
 import pytest
+import scipy.io
 from experiments import recording
 
 from excite.description import Input, Output, Parameter, PlantDescription, State
@@ -84,6 +87,10 @@ TEXTS: dict[str, str | bytes] = {
     "twice the same": "time,u,y,u\n0,1.5,-0.25,1.5\n0.1,-2,1,-2\n0.2,0.25,3,0.25\n",
     "twice the same, with gaps": "time,a,u,y,a\n0,,1.5,-0.25,\n0.1,1,-2,1,1\n0.2,,0.25,3,\n",
     "text beside": "time;note;u;y\n0;on, 1;1.5;-0.25\n0.1;;-2;1\n0.2;off;0.25;3\n",
+    "UTF-16": "time\tu\ty\r\n0\t1.5\t-0.25\r\n0.1\t-2\t1\r\n0.2\t0.25\t3\r\n".encode("utf-16"),
+    "UTF-16 of another order": (
+        "\ufefftime;größe;u;y\n0;;1,5;-0,25\n0,1;;-2;1\n0,2;;0,25;3\n".encode("utf-16-be")
+    ),
     "old encoding": "time,u,y,größe [°]\n0,1.5,-0.25,1\n0.1,-2,1,1\n0.2,0.25,3,1\n".encode(
         "cp1252"
     ),
@@ -124,6 +131,53 @@ def test_columns_without_names_are_mapped_by_their_numbers(text: str, tmp_path: 
     assert list(columns_in(path)) == ["1", "2", "3"]
 
 
+@pytest.mark.parametrize("comment", [
+    "# time,u,y", "#time;u;y", "% time\tu\ty", "# time u  y", "# made by x, y, z, w\n# time, u, y",
+])  # fmt: skip
+@pytest.mark.parametrize("rows", [
+    "0,1.5,-0.25\n0.1,-2,1\n0.2,0.25,3\n", "0 1.5 -0.25\n0.1 -2 1\n0.2 0.25 3\n",
+    "0;1,5;-0,25;\n0,1;-2;1;\n0,2;0,25;3;\n",
+])  # fmt: skip
+def test_names_may_stand_in_a_comment_above_the_numbers(comment, rows, tmp_path: Path):
+    path = tmp_path / "log.txt"
+    assert is_the_log(read(path, f"{comment}\n{rows}"))
+    assert list(columns_in(path)) == ["time", "u", "y"]
+
+
+def test_names_that_numpy_writes_are_read(tmp_path: Path):
+    values = np.column_stack([TIME, U, Y])
+    for delimiter in (" ", ",", ";", "\t"):
+        header = f"pendulum of 2026\n{delimiter.join(['time', 'u', 'y'])}"
+        np.savetxt(tmp_path / "log.dat", values, header=header, delimiter=delimiter)
+        assert is_the_log(read_record(tmp_path / "log.dat", plant()))
+
+
+@pytest.mark.parametrize("comment", ["# time,u", "# 1,2,3", "# time,u,y\n\n", "# time,,y", ""])
+def test_another_comment_is_not_the_names(comment: str, tmp_path: Path):
+    (tmp_path / "log.csv").write_text(f"{comment}\n0,1,2\n1,2,3\n")
+    assert list(columns_in(tmp_path / "log.csv")) == ["1", "2", "3"]
+
+
+@pytest.mark.parametrize("cell", [
+    "1,234.5", "1.234,5", "1,234,567", "1.234.567", "1 234,5", "1'234.5", "-12,345.0",
+])  # fmt: skip
+@pytest.mark.parametrize("decimal", [".", ","])
+def test_thousands_separators_are_refused(cell: str, decimal: str, tmp_path: Path):
+    text = f"time;u;y\n0;{cell};1.5\n0.1;999.5;1\n".replace("1.5", f"1{decimal}5")
+    text = text.replace("0.1;999.5", f"0{decimal}1;999{decimal}5")
+    with pytest.raises(ValueError, match=r"log\.csv: .*without thousands separators") as error:
+        read(tmp_path / "log.csv", text)
+    assert cell in str(error.value)
+
+
+@pytest.mark.parametrize("text", [
+    "time;u;y\n0.0;999;1\n0.1;1,234;1\n", "time;u;y\n0;1,5;1\n0,1;1.234;1\n",
+])  # fmt: skip
+def test_a_comma_that_may_separate_thousands_is_refused(text: str, tmp_path: Path):
+    with pytest.raises(ValueError, match=r"has decimal commas, and '.*' with a point; save it"):
+        read(tmp_path / "log.csv", text)
+
+
 def test_numbers_of_other_programs_are_read_to_twelve_digits(tmp_path: Path):
     values = np.random.default_rng(0).normal(size=1000) * 10.0 ** np.arange(-50, 50).repeat(10)
     text = "u;y\n" + "".join(f"{float(v)!r};{float(v):.17e}\n" for v in values)
@@ -139,7 +193,7 @@ def test_numbers_of_other_programs_are_read_to_twelve_digits(tmp_path: Path):
     ("time,u,y\n0,1.5,-0.25\n0.1,-2,", ("line 3", "line break", "truncated?")),
     ("time;u;y\n0;1.5;-0.25\n0.1;-2;1;7\n0.2;1;1\n", ("line 3", "4 values", "3")),
     ("time;u;y\n0;1.5;-0.25\n\n0.1;-2\n0.2;1;1\n", ("sample 2 of 'y' is missing",)),
-    ("Time [s]  Input [V]\n0 1\n0.1 2\n", ("2 values", "names 4", "blanks in quotes")),
+    ("Time [s]  Input [V]\n0 1\n0.1 2\n", ("2 values", "has 4", "blanks in quotes")),
     ("time,u,y\n[s],[V],[m]\n0,1,1\n0.1,2,1\n", ("sample 1 of 'time' is '[s]'", "--rows 1:")),
     ("time,u,y\n0,1,1\n0.1,on,1\n", ("sample 2 of 'u' is 'on', not a number",)),
     ("time,u,y\n0,1,1\n0.1,\"1,5\",1\n", ("sample 2 of 'u' is '1,5', not a number",)),
@@ -188,9 +242,9 @@ def special(kind: str, path: Path) -> None:
 @pytest.mark.parametrize(("kind", "sentence"), [
     ("pipe", "is a pipe or a device; only files can be read"),
     ("device", "is a pipe or a device; only files can be read"),
-    ("zeros", "line 1 is longer than 64 KiB"),
-    ("one long line", "line 1 is longer than 64 KiB"),
-    ("a long line below", "line 3 is longer than 64 KiB"),
+    ("zeros", "line 1 is longer than 65536 characters"),
+    ("one long line", "line 1 is longer than 65536 characters"),
+    ("a long line below", "line 3 is longer than 65536 characters"),
     ("very large", "the file has 2048 MiB, more than 512"),
 ])  # fmt: skip
 @pytest.mark.parametrize("ending", ["csv", "dat"])
@@ -207,6 +261,78 @@ def test_a_file_of_very_many_lines_is_not_read(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr("excite.record.text._MOST_LINES", 10**6)
     with pytest.raises(ValueError, match="more than 1 million lines; save it with fewer"):
         read(tmp_path / "log.csv", "time,u,y\n" + "#\n" * 10**6)
+
+
+LONG = "7" * 5000
+BAD_TEXTS: dict[str, tuple[str | bytes, dict[str, object], str]] = {
+    "time backwards": ("time,u,y\n0.1,1,1\n0,1,1\n", {}, "'time' "),
+    "one time twice": ("time,u,y\n0,1,1\n0.1,1,1\n0.1,1,1\n0.2,1,1\n", {}, "samples 2 and 3"),
+    "no progress": ("time,u,y\n0,1,1\n0,1,1\n", {}, "'time' "),
+    "digits in a cell": (f"time,u,y\n0,{LONG},1\n0.1,1,1\n", {}, "sample 1 of 'u' is inf"),
+    "digits in a time": (f"time;u;y\n0;1;1\n{LONG};1;1\n", {}, "sample 2 of 'time' is inf"),
+    "digits in a name": (f"time,{LONG},y\n0,1,1\n0.1,1,1\n", {}, "no column 'u'"),
+    "text of many letters": ("time;u;y\n0;1;1\n1;" + "a" * 9000 + ";1\n", {}, "sample 2 of 'u'"),
+    "digits in rows": ("time,u,y\n", {"rows": f"{LONG}:"}, "rows '77.* are not allowed"),
+    "digits in a column": ("time,u,y\n0,1,1\n", {"columns": {"u": LONG}}, "no column '77"),
+    "surrogate in a column": ("time,u,y\n0,1,1\n", {"columns": {"u": "\udcff"}}, "no column '"),
+    "surrogate in a cell": (b"time,u,y\n0,\xed\xb3\xbf,1\n0.1,1,1\n", {}, "sample 1 of 'u' is"),
+    "half of a UTF-16 pair": (
+        "\ufefftime,\ud83d".encode("utf-16-le", "surrogatepass"),
+        {},
+        "UTF-8",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", BAD_TEXTS)
+def test_bad_text_is_one_short_sentence(kind: str, tmp_path: Path):
+    text, options, sentence = BAD_TEXTS[kind]
+    with pytest.raises(ValueError, match=sentence) as error:
+        read(tmp_path / "log.csv", text, **options)
+    told = str(error.value).replace(str(tmp_path), "")
+    assert "\n" not in told
+    assert len(told) < 400
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root reads all files")
+@pytest.mark.parametrize("ending", ["csv", "mat", "h5", "parquet"])
+def test_a_file_without_permission_is_refused(ending: str, tmp_path: Path):
+    path = tmp_path / f"log.{ending}"
+    path.write_text("time,u,y\n")
+    path.chmod(0)
+    with pytest.raises(ValueError, match="you are not allowed to read this file"):
+        read_record(path, plant())
+
+
+SIDECARS: dict[str, tuple[str, str]] = {
+    "nested": ('{"kind":"excite record","a":' + "[" * 100_000 + "]" * 100_000 + "}", "too deeply"),
+    "nested and cut off": ("[" * 100_000, "too deeply"),
+    "digits": ('{"kind":"excite record","dt":' + LONG + "}", "a number is too long"),
+    "digits in the plant": (
+        '{"kind":"excite record","plant":{PLANT,"dt":' + "7" * 400 + "}}",
+        "dt|int",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", SIDECARS)
+def test_a_bad_sidecar_is_one_short_sentence(kind: str, tmp_path: Path):
+    content, sentence = SIDECARS[kind]
+    own = json.dumps(plant().to_dict())[1:-1]
+    (tmp_path / "log.json").write_text(content.replace("PLANT", own))
+    (tmp_path / "log.csv").write_text("time,u,y\n0,1,1\n0.1,1,1\n")
+    for description in (None, plant()):
+        with pytest.raises(ValueError, match=rf"log\.json: .*({sentence})") as error:
+            read_record(tmp_path / "log.csv", description)
+        assert len(str(error.value).replace(str(tmp_path), "")) < 400
+
+
+def test_a_very_large_sidecar_is_not_read(tmp_path: Path):
+    (tmp_path / "log.csv").write_text("time,u,y\n0,1,1\n0.1,1,1\n")
+    with (tmp_path / "log.json").open("wb") as file:
+        file.truncate(2**31)
+    with pytest.raises(ValueError, match=r"log\.json: has more than 16 MiB .*; rename it"):
+        read_record(tmp_path / "log.csv", plant())
 
 
 # Without pandas, h5py and pyarrow
@@ -263,15 +389,15 @@ def test_binary_formats_hold_the_same_log(name: str, tmp_path: Path):
 
 @pytest.mark.parametrize("name", ["log.mat", "log.h5"])
 def test_datasets_in_groups_are_named_by_their_paths(name: str, tmp_path: Path):
-    write_binary(tmp_path / name, {"drive/time": TIME, "drive/u": U, "drive/y": Y, "one": [1.0]})
+    write_binary(tmp_path / name, {"drive/time": TIME, "drive/u": U, "drive/y": Y, "none": []})
     columns = {name: f"drive/{name}" for name in ("time", "u", "y")}
     assert is_the_log(read_record(tmp_path / name, plant(), columns))
     assert list(columns_in(tmp_path / name)) == ["drive/time", "drive/u", "drive/y"]
 
 
 @pytest.mark.parametrize(("name", "content", "sentence"), [
-    ("log.h5", b"", "cannot be read as HDF5"),
-    ("log.hdf5", b"time,u,y\n0,1,1\n", "cannot be read as HDF5"),
+    ("log.h5", b"", "not a readable HDF5 file"),
+    ("log.hdf5", b"time,u,y\n0,1,1\n", "not a readable HDF5 file"),
     ("log.parquet", b"PAR1, but not more", "not a readable Parquet file"),
     ("log.parquet", b"", "not a readable Parquet file"),
 ])  # fmt: skip
@@ -345,7 +471,7 @@ def test_dates_are_seconds_since_the_first_row(kind: str, delimiter: str, tmp_pa
     if kind == "decimal commas":
         if delimiter == ",":
             return
-        text = text.replace("1.5", "1,5").replace("0.25", "0,25")
+        text = re.sub(r";(-?\d+)\.(\d+)", r";\1,\2", text)
     assert is_the_log(read(tmp_path / "log.csv", text))
 
 
@@ -362,7 +488,7 @@ def test_a_cell_that_is_no_date_is_named(tmp_path: Path):
     cells = [*DATES["ISO"][:2], "soon"]
     with pytest.raises(ValueError, match="sample 3 of 'time' is 'soon', neither a number nor a"):
         read(tmp_path / "log.csv", dated(cells))
-    with pytest.raises(ValueError, match="sample 2 of 'time' is '', neither a number nor a date"):
+    with pytest.raises(ValueError, match="sample 2 of 'time' is missing"):
         read(tmp_path / "log.csv", dated([cells[0], "", cells[1]]))
     with pytest.raises(ValueError, match=r"'time' holds dates, .* leave its unit and scale out"):
         read(tmp_path / "log.csv", dated(DATES["ISO"]), units={"time": "ms"})
@@ -387,6 +513,31 @@ def test_a_sampling_time_in_the_first_row_is_enough(name: str, tmp_path: Path):
     np.testing.assert_allclose(rows.time, [0.1, 0.2])
     if name != "step":
         assert is_the_log(read(tmp_path / "log.csv", text))
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (1, 1)])
+@pytest.mark.parametrize("ending", ["h5", "mat"])
+def test_a_single_number_is_the_sampling_time(shape: tuple, ending: str, tmp_path: Path):
+    path = tmp_path / f"log.{ending}"
+    for name, columns, units in (("Ts", None, None), ("step", {"time": "step"}, {"time": "ms"})):
+        number = np.full(shape, 0.1 if units is None else 100.0)
+        write_binary(path, {"u": U, "y": Y, "gain": 3.0})
+        with h5py.File(path, "r+") as file:
+            file[name] = number
+        assert is_the_log(read_record(path, plant(), columns, units=units))
+    with pytest.raises(ValueError, match="'y' has 1 samples, 'u' 3"):
+        read_record(path, plant(), {"y": "gain"}, dt=0.1)
+    scipy.io.savemat(tmp_path / "old.mat", {"dt": 0.1, "u": U, "y": Y})
+    assert is_the_log(read_record(tmp_path / "old.mat", plant()))
+
+
+def test_texts_and_empty_arrays_of_matlab_are_no_columns(tmp_path: Path):
+    write_binary(tmp_path / "log.mat", {"u": U, "name": np.array([[97], [98]], np.uint16)})
+    with h5py.File(tmp_path / "log.mat", "r+") as file:
+        file["name"].attrs["MATLAB_class"] = np.bytes_("char")
+        file["none"] = np.zeros(2, np.uint64)
+        file["none"].attrs["MATLAB_empty"] = 1
+    assert list(columns_in(tmp_path / "log.mat")) == ["u"]
 
 
 def test_a_file_without_time_needs_its_sampling_time(tmp_path: Path):
@@ -617,3 +768,14 @@ def test_the_building_has_dates():
     assert len(record.time) == 4181
     compare(record, seconds, columns[:3], columns[3:])
     assert list(columns_in(path)) == ["column 1", "t", "Ps", "Ta", "yTi", "Thm"]
+
+
+def test_the_signalling_proteins_are_measured_at_sixteen_times():
+    path = real("measurementData_Boehm_JProteomeRes2014.tsv")
+    header, rows = cells_of(path, "\t")
+    table = columns_in(path)
+    assert list(table) == header
+    for name in ("time", "measurement"):
+        np.testing.assert_allclose(table[name], [float(row[header.index(name)]) for row in rows])
+    assert table["observableId"].tolist() == [row[0] for row in rows]
+    assert [len(set(table[name])) for name in ("time", "observableId")] == [16, 3]

@@ -341,7 +341,9 @@ BAD_FILES: dict[str, tuple[str, str | bytes | Callable[[Path], None], tuple[str,
     "number cut in half": ("r.csv", own_record_cut_off, ("line 31", "line break", "truncated")),
     "cell cut off": ("r.csv", text_of(table()).rpartition(",")[0] + ",", ("line 31", "truncated")),
     "one endless field": ("r.csv", b"a" * 200_000, ("cannot be read as CSV",)),
-    "UTF-16": ("r.csv", text_of(table()).encode("utf-16"), ("cannot be read as CSV",)),
+    "UTF-16 without its mark": (
+        "r.csv", text_of(table()).encode("utf-16-le"), ("cannot be read as CSV", "zero bytes"),
+    ),
     "truncated MAT": ("r.mat", bad_mat, ("not a readable MAT file",)),
     "empty MAT": ("r.mat", b"", ("not a readable MAT file",)),
     "text as MAT": ("r.mat", text_of(table()), ("not a readable MAT file",)),
@@ -390,19 +392,23 @@ def test_of_a_mat_file_vectors_of_numbers_are_columns_and_nothing_else(tmp_path:
         "time": np.arange(3.0),
         "is_on": np.array([True, False, True]),
         "q": np.array([1, 2], np.int16),
+        "one": 1.0,
     }
-    others = {"log": {"x": np.arange(9)}, "note": "text", "one": 1.0, "matrix": np.eye(3)}
+    others = {"log": {"x": np.arange(9)}, "note": "text", "none": [], "matrix": np.eye(3)}
     scipy.io.savemat(tmp_path / "r.mat", {**vectors, **others})
     found = columns_in(tmp_path / "r.mat")
     assert found.keys() == vectors.keys()
     for name, values in vectors.items():
-        np.testing.assert_array_equal(np.asarray(found[name], float), values)
+        np.testing.assert_array_equal(np.asarray(found[name], float), np.ravel(values))
 
 
-@pytest.mark.parametrize("name", ["nowhere.csv", "nowhere.mat", "folder.csv"])
-def test_no_such_file_is_said(name, tmp_path):
+@pytest.mark.parametrize(("name", "sentence"), [
+    ("nowhere.csv", "no such file"), ("nowhere.mat", "no such file"),
+    ("folder.csv", "is a folder; only files can be read"),
+])  # fmt: skip
+def test_no_such_file_is_said(name, sentence, tmp_path):
     (tmp_path / "folder.csv").mkdir()
-    with pytest.raises(ValueError, match="no such file"):
+    with pytest.raises(ValueError, match=sentence):
         read_record(tmp_path / name, AERO2)
 
 

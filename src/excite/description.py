@@ -258,6 +258,8 @@ class PlantDescription:
     substeps: int = 1
 
     def __post_init__(self) -> None:
+        if not isinstance(self.name, str):
+            raise wrong_type("name of a plant", self.name, "a text")
         object.__setattr__(self, "dt", float(self.dt))
         object.__setattr__(self, "band", (float(self.band[0]), float(self.band[1])))
         _require(math.isfinite(self.dt) and self.dt > 0, f"dt must be positive: got {self.dt}")
@@ -322,7 +324,7 @@ class PlantDescription:
             parts = {k: tuple(kind(**entry) for entry in data[k]) for k, kind in kinds.items()}
             rest = {k: v for k, v in data.items() if k != "format" and k not in kinds}
             return cls(**{**rest, **parts, "band": tuple(data["band"])})
-        except (KeyError, TypeError) as error:
+        except (KeyError, TypeError, OverflowError) as error:
             raise ValueError(f"plant description is incomplete or malformed: {error}") from None
 
     @property

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -20,6 +22,8 @@ _MAT_NUMBERS = re.compile(r"double|single|u?int(8|16|32|64)|logical")
 def columns_in(path: Path) -> dict[str, np.ndarray]:
     """Columns of a file by name: numbers, dates, or where a cell is no number texts.
 
+    A single number, such as a sampling time, is a column of one sample.
+
     Raises:
         ValueError: one sentence for a file that cannot be read.
     """
@@ -28,11 +32,23 @@ def columns_in(path: Path) -> dict[str, np.ndarray]:
     try:
         if ending in TEXT_ENDINGS:
             return read_text(path, is_own=bool(read_sidecar(path)))
-        if ending == ".mat":
-            return _read_mat(path)
-        return _read_parquet(path) if ending == ".parquet" else _read_hdf5(path)
+        if ending == ".parquet":
+            return _read_parquet(path)
+        columns = _read_mat(path) if ending == ".mat" else _read_hdf5(path)
     except OSError as error:
-        raise ValueError(f"{path}: cannot be read ({error})") from None
+        raise ValueError(f"{path}: cannot be read ({error.strerror})") from None
+    return dict(sorted(columns.items(), key=lambda column: column[1].size == 1))  # vectors first
+
+
+@contextlib.contextmanager
+def _damage_reported(path: Path, kind: str, advice: str = "") -> Iterator[None]:
+    """One sentence for what a library raises, of any type, where a file is damaged."""
+    try:
+        yield
+    except NotImplementedError:
+        raise
+    except Exception as error:
+        raise ValueError(f"{path}: not a readable {kind} file ({error}){advice}") from None
 
 
 def _require_size(path: Path, size: int) -> None:
@@ -49,30 +65,31 @@ def _no_column(path: Path, kind: str, found: list[str]) -> ValueError:
 
 
 def _is_vector(shape: tuple[int, ...]) -> bool:
-    return max(shape, default=0) == math.prod(shape) > 1
+    """Whether at most one dimension is more than one; a single number is a vector, too."""
+    return max(shape, default=1) == math.prod(shape) > 0
 
 
 def _read_mat(path: Path) -> dict[str, np.ndarray]:
     """Vectors of numbers in a MAT file; nothing else of it is loaded."""
     reader = require_matlab(path)
     try:
-        listed = reader.whosmat(path)
-        names = [
-            n for n, shape, kind in listed if _MAT_NUMBERS.fullmatch(kind) and _is_vector(shape)
-        ]
-        size = 8 * sum(math.prod(shape) for name, shape, _ in listed if name in names)
-        is_small = size <= _MAX_UNPACKED
-        content = reader.loadmat(path, variable_names=names) if names and is_small else {}
+        with _damage_reported(path, "MAT"):
+            listed = reader.whosmat(path)
     except NotImplementedError:  # MAT files of version 7.3 are HDF5
         return _read_hdf5(path)
-    except Exception as error:  # for a damaged file the reader raises any type
-        raise ValueError(f"{path}: not a readable MAT file ({error})") from None
-    _require_size(path, size)
-    if not names:
+    shapes = {
+        name: shape
+        for name, shape, kind in listed
+        if _MAT_NUMBERS.fullmatch(kind) and _is_vector(shape)
+    }
+    if not shapes:
         found = [f"{name} ({'x'.join(map(str, shape))} {kind})" for name, shape, kind in listed]
         raise _no_column(path, "variable", found)
-    vectors = {name: content[name] for name in names if name in content}
-    return {n: np.asarray(v, float).ravel() for n, v in vectors.items() if v.dtype.kind in "fiu"}
+    _require_size(path, 8 * sum(map(math.prod, shapes.values())))
+    with _damage_reported(path, "MAT"):
+        content = reader.loadmat(path, variable_names=list(shapes))
+    vectors = {name: content[name] for name in shapes if name in content}
+    return {n: np.asarray(v, float).ravel() for n, v in vectors.items() if v.dtype.kind in "fiub"}
 
 
 def _require_hdf5(path: Path) -> ModuleType:
@@ -94,29 +111,27 @@ def _read_hdf5(path: Path) -> dict[str, np.ndarray]:
         if isinstance(part, h5py.Dataset) and not name.startswith("#"):  # MATLAB's own are #refs#
             found[name] = part
 
-    try:
-        with h5py.File(path, "r") as file:
-            file.visititems(collect)
-            vectors = {
-                name: part
-                for name, part in found.items()
-                if part.dtype.kind in "fiub" and _is_vector(part.shape)
-                and not (part.is_virtual or part.external)  # they are in another file
-            }  # fmt: skip
-            listed = [f"{name} ({part.dtype})" for name, part in found.items()]
-            size = 8 * sum(part.size for part in vectors.values())
-            is_small = size <= _MAX_UNPACKED
-            columns = {n: part[()].astype(float).ravel() for n, part in vectors.items() if is_small}
-    except Exception as error:  # for a damaged file the library raises any type
-        kind = "a MAT file of version 7.3" if path.suffix.lower() == ".mat" else "HDF5"
-        raise ValueError(
-            f"{path}: cannot be read as {kind} ({error}); save it again"
-            + (" with -v7 or as CSV" if path.suffix.lower() == ".mat" else "")
-        ) from None
+    is_mat = path.suffix.lower() == ".mat"
+    kind = ("MAT 7.3", "; save it again with -v7 or as CSV") if is_mat else ("HDF5",)
+    with _damage_reported(path, *kind), h5py.File(path, "r") as file:
+        file.visititems(collect)
+        vectors = {name: part for name, part in found.items() if _is_vector_of_numbers(part)}
+        listed = [f"{name} ({part.dtype})" for name, part in found.items()]
+        size = 8 * sum(part.size for part in vectors.values())
+        is_small = size <= _MAX_UNPACKED
+        columns = {n: part[()].astype(float).ravel() for n, part in vectors.items() if is_small}
     _require_size(path, size)
     if not columns:
         raise _no_column(path, "dataset", listed)
     return columns
+
+
+def _is_vector_of_numbers(part: Any) -> bool:
+    """Whether a dataset is a column: in this file, and neither MATLAB's text nor its empty []."""
+    is_text = part.attrs.get("MATLAB_class") == b"char" or "MATLAB_empty" in part.attrs
+    is_elsewhere = part.is_virtual or part.external
+    is_number = part.dtype.kind in "fiub" and not is_text
+    return is_number and not is_elsewhere and part.shape is not None and _is_vector(part.shape)
 
 
 def _require_parquet(path: Path) -> ModuleType:
@@ -126,19 +141,22 @@ def _require_parquet(path: Path) -> ModuleType:
         raise ValueError(
             f"{path}: Parquet files need the extra: pip install 'excite[logs]'"
         ) from None
-    return pyarrow.parquet
+    return pyarrow
 
 
 def _read_parquet(path: Path) -> dict[str, np.ndarray]:
-    parquet = _require_parquet(path)
-    try:
-        with parquet.ParquetFile(path) as file:
-            size = 8 * file.metadata.num_rows * file.metadata.num_columns
-            table = file.read() if size <= _MAX_UNPACKED else file.schema_arrow.empty_table()
-    except Exception as error:  # for a damaged file the library raises any type
-        raise ValueError(f"{path}: not a readable Parquet file ({error})") from None
+    """Columns of numbers and dates in a Parquet file; texts, which may unpack to much, are not."""
+    arrow = _require_parquet(path)
+    with _damage_reported(path, "Parquet"), arrow.parquet.ParquetFile(path) as file:
+        kinds = {part.name: part.type for part in file.schema_arrow}
+        is_kind = arrow.types.is_primitive, arrow.types.is_decimal
+        names = [name for name, kind in kinds.items() if any(test(kind) for test in is_kind)]
+        size = 8 * file.metadata.num_rows * len(names)
+        table = file.read(names if size <= _MAX_UNPACKED else [])
+        frame = table.to_pandas(ignore_metadata=True)  # an index is a column, too
     _require_size(path, size)
-    frame = table.to_pandas(ignore_metadata=True)  # an index is a column, too
+    if not names:
+        raise _no_column(path, "column", [f"{name} ({kind})" for name, kind in kinds.items()])
     return {str(name): _of_frame(column) for name, column in frame.items()}
 
 

@@ -12,22 +12,25 @@ import difflib
 import math
 import os
 import re
-from collections.abc import Iterable, Mapping
+import reprlib
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..description import PlantDescription, names_of, path_from
+from ..description import Input, Output, PlantDescription, names_of, path_from
+from .dates import seconds_of
 from .formats import columns_in
 from .prepare import TIMES_DT, check_finite, check_size, check_time, require_playable, unit_hint
 from .record import Record, described_in, read_sidecar
-from .text import seconds_of
 from .units import unit_factor
 
 SIGNAL_ENDINGS = (".csv", ".mat")
-_SAMPLING_TIME = ("Ts", "dt")  # columns that hold it in their first row
-_MOST_NAMES = 30  # of a file's columns in a message
+_SAMPLING_TIME = ("Ts", "dt")  # columns that may hold it in their first row
+_THOUSANDS = re.compile(r"[+-]?\d{1,3}([,.' \u2019\u00a0\u202f]\d{3})+([.,]\d+)?")
+_MOST_NAMES, _LONGEST_NAME = 30, 100  # of a file's columns in a message
 
 
 def read_record(
@@ -69,101 +72,98 @@ def read_record(
             truncated file, a missing column or sample, a value that is not finite,
             uneven sampling, values far outside what the plant can do.
     """
-    path, columns, scales = path_from("record", path), columns or {}, scales or {}
-    units, set_inputs, chosen = units or {}, set_inputs or {}, _slice_of(rows)
-    if description is None:
-        description = described_in(path)
-    _check_options(description, columns, scales, units, set_inputs, dt)
-    quantities = (*description.inputs, *(() if inputs_only else description.outputs))
-    unit_of = {"time": "s", **{part.name: part.unit for part in quantities}}
-    unit_factors = {n: unit_factor(n, units.get(n, unit), unit) for n, unit in unit_of.items()}
-    factors = {name: scales.get(name, 1.0) * factor for name, factor in unit_factors.items()}
-    confirmed = {  # a factor of one says that the unit is right, whatever the size
-        name
-        for name, factor in unit_factors.items()
-        if scales.get(name, factor if name in units else None) == 1
-    }
-    needed = [name for name in unit_of if name not in set_inputs and (name != "time" or dt is None)]
-    cells = _cells(path, description, needed, columns, set_inputs)
-    if not cells:
-        raise ValueError(f"{path}: with all inputs set and --dt nothing is left to read")
-    samples = {name: len(column) for name, column in cells.items()}
-    first, num_samples = next(iter(samples.items()))
-    if others := [name for name in samples if samples[name] != num_samples]:
-        raise ValueError(
-            f"{path}: {others[0]!r} has {samples[others[0]]} samples, {first!r} {num_samples}"
-        )
+    path, chosen = path_from("record", path), _slice_of(rows)
+    description = described_in(path) if description is None else description
+    options = _Options(description, columns or {}, scales or {}, units or {}, set_inputs or {}, dt)
+    signals = (*description.inputs, *(() if inputs_only else description.outputs))
+    cells, dt = _cells(path, options, names_of(signals))
+    num_samples = _num_samples(path, cells)
+    cells |= {name: np.full(num_samples, value) for name, value in options.set_inputs.items()}
     where = path if rows is None else Path(f"{path} (rows {_text_of(chosen)} of {num_samples})")
     if dt is None:
-        time = _seconds(cells["time"], chosen, factors["time"], where)
+        time = _seconds(cells["time"][chosen], options, where)
     else:
         time = dt * np.arange(num_samples)[chosen]
     check_time(time, where)
-    step = float(time[1] - time[0])
-    if dt is None and step > TIMES_DT * description.dt and "time" not in confirmed:
-        raise ValueError(
-            f"{path}: sampled every {step:g} s, where {description.name!r} is every "
-            f"{description.dt:g} s; is 'time' in another unit? {unit_hint('time')}"
-        )
-    values: dict[str, np.ndarray] = {}
-    for part in quantities:
-        if part.name in set_inputs:
-            column = np.full(len(time), float(set_inputs[part.name]))
-        else:
-            column = _numbers(cells[part.name][chosen], part.name, where)
-        values[part.name] = column * factors[part.name]
-        check_finite(values[part.name], part.name, where)
-        if part.name not in confirmed:
-            check_size(values[part.name], part, where)
-    inputs, outputs = names_of(description.inputs), names_of(quantities)[len(description.inputs) :]
+    if options.dt is None:
+        _check_unit_of_time(time, options, where)
+    values = [_values(cells[part.name][chosen], part, options, where) for part in signals]
+    num_inputs = len(description.inputs)
     return Record(
         time=time,
-        inputs=np.stack([values[name] for name in inputs], axis=1),
-        outputs=np.array([values[name] for name in outputs]).reshape(-1, len(time)).T,
+        inputs=np.stack(values[:num_inputs], axis=1),
+        outputs=np.reshape(values[num_inputs:], (-1, len(time))).T,
         metadata=_metadata(path, description, chosen.indices(num_samples)[0]),
         source=str(path),
     )
 
 
-def _check_options(
-    description: PlantDescription,
-    columns: Mapping[str, str],
-    scales: Mapping[str, float],
-    units: Mapping[str, str],
-    set_inputs: Mapping[str, float],
-    dt: float | None,
-) -> None:
-    """Raises ValueError for a name that the plant does not have, or a value that is not allowed."""
-    for name in (*columns, *scales, *units):
-        if name not in description.columns:
+@dataclass(frozen=True)
+class _Options:
+    """What `read_record` is told about the file.
+
+    Raises:
+        ValueError: for a name that the plant does not have, or a value that is not allowed.
+    """
+
+    description: PlantDescription
+    columns: Mapping[str, str]
+    scales: Mapping[str, float]
+    units: Mapping[str, str]
+    set_inputs: Mapping[str, float]
+    dt: float | None
+
+    def __post_init__(self) -> None:
+        for name in (*self.columns, *self.scales, *self.units):
+            self._require_known(name, "column", self.description.columns)
+        for name, factor in self.scales.items():
+            if not (np.isfinite(factor) and factor != 0):
+                raise ValueError(
+                    f"scale {factor:g} of {name!r} is not allowed: finite and not zero"
+                )
+        for name in self.units:
+            self.factor(name)
+        for name, value in self.set_inputs.items():
+            self._require_known(name, "input", names_of(self.description.inputs))
+            if not np.isfinite(value):
+                raise ValueError(
+                    f"value {value:g} of input {name!r} is not allowed: a finite number"
+                )
+            if name in self.columns:
+                raise ValueError(f"input {name!r} is a column or a set value; give one of them")
+        if self.dt is not None and not (np.isfinite(self.dt) and self.dt > 0):
+            raise ValueError(f"sampling time {self.dt:g} s is not allowed: finite and positive")
+        if self.dt is not None and "time" in {*self.columns, *self.scales, *self.units}:
             raise ValueError(
-                f"plant {description.name!r} has no column {name!r}"
-                f"{_nearest(name, description.columns)}; it has {', '.join(description.columns)}"
+                "--dt is the sampling time in seconds of a file without time; give it, or column, "
+                "unit and scale of 'time'"
             )
-    for name, factor in scales.items():
-        if not (np.isfinite(factor) and factor != 0):
-            raise ValueError(f"scale {factor:g} of {name!r} is not allowed: finite and not zero")
-    inputs = names_of(description.inputs)
-    for name, value in set_inputs.items():
-        if name not in inputs:
+
+    def _require_known(self, name: str, kind: str, known: Collection[str]) -> None:
+        if name not in known:
             raise ValueError(
-                f"plant {description.name!r} has no input {name!r}{_nearest(name, inputs)}; it has "
-                f"{', '.join(inputs)}"
+                f"plant {self.description.name!r} has no {kind} {name!r}{_nearest(name, known)}; "
+                f"it has {', '.join(known)}"
             )
-        if not np.isfinite(value):
-            raise ValueError(f"value {value:g} of input {name!r} is not allowed: a finite number")
-        if name in columns:
-            raise ValueError(f"input {name!r} is a column or a set value; give one of them")
-    if dt is not None and not (np.isfinite(dt) and dt > 0):
-        raise ValueError(f"sampling time {dt:g} s is not allowed: finite and positive")
-    if dt is not None and "time" in {*columns, *scales, *units}:
-        raise ValueError(
-            "--dt is the sampling time in seconds of a file without time; give it, or column, unit "
-            "and scale of 'time'"
-        )
+
+    def column(self, name: str) -> str:
+        """The file's name of a quantity."""
+        return str(self.columns.get(name, name))
+
+    def factor(self, name: str) -> float:
+        """The factor from the file's unit of a quantity to the plant's."""
+        parts = (*self.description.inputs, *self.description.outputs)
+        unit = next((part.unit for part in parts if part.name == name), "s")
+        return self.scales.get(name, 1.0) * unit_factor(name, self.units.get(name, unit), unit)
+
+    def confirms(self, name: str) -> bool:
+        """Whether a factor of 1, or the plant's own unit, says that the unit is right."""
+        if name in self.scales:
+            return self.scales[name] == 1
+        return name in self.units and self.factor(name) == 1
 
 
-_ROWS = re.compile(r"(-?\d+)?:(-?\d+)?(?::(\d+)?)?")
+_ROWS = re.compile(r"(-?\d{1,18})?:(-?\d{1,18})?(?::(\d{1,18})?)?")
 
 
 def _slice_of(rows: slice | str | None) -> slice:
@@ -174,8 +174,8 @@ def _slice_of(rows: slice | str | None) -> slice:
     rows = slice(None) if rows is None else rows
     if not isinstance(rows, slice) or (rows.step is not None and rows.step < 1):
         raise ValueError(
-            f"rows {rows!r} are not allowed: START:STOP or START:STOP:STEP, counted from 0 below "
-            "the names, such as 100:1000:5"
+            f"rows {reprlib.repr(rows)} are not allowed: START:STOP or START:STOP:STEP, counted "
+            "from 0 below the names, such as 100:1000:5"
         )
     return rows
 
@@ -186,34 +186,42 @@ def _text_of(rows: slice) -> str:
 
 
 def _cells(
-    path: Path,
-    description: PlantDescription,
-    needed: list[str],
-    columns: Mapping[str, str],
-    set_inputs: Mapping[str, float],
-) -> dict[str, np.ndarray]:
-    """The columns that are needed, as the file has them, by the plant's names."""
-    given = [columns.get(name, name) for name in needed]
+    path: Path, options: _Options, signals: Sequence[str]
+) -> tuple[dict[str, np.ndarray], float | None]:
+    """The file's columns by the plant's names, with `time`; or without it the sampling time [s]."""
+    needed = [name for name in ("time", *signals) if name not in options.set_inputs]
+    if options.dt is not None:
+        needed.remove("time")
+    given = [options.column(name) for name in needed]
     if twice := [n for n, column in zip(needed, given, strict=True) if given.count(column) > 1]:
         raise ValueError(f"{path}: {' and '.join(map(repr, twice))} cannot be the same column")
     table = columns_in(path)
-    if is_there := [name for name in set_inputs if name in table]:
+    if in_file := [name for name in options.set_inputs if name in table]:
         raise ValueError(
-            f"{path}: the file has a column {is_there[0]!r}; --set-input is for inputs that it "
-            "does not have"
+            f"{path}: the file has a column {in_file[0]!r}; --set-input is for inputs that it does "
+            "not have"
         )
-    found = {}
-    for name, column in zip(needed, given, strict=True):
-        if name == "time" and column not in table and name not in columns:
-            own = [n for n in _SAMPLING_TIME if n in table and _is_in_first_row_only(table[n])]
-            column = own[0] if own else column
-        if column not in table:
-            other = ", or give a sampling time with --dt" if name == "time" else ""
-            if name in names_of(description.inputs):
-                other = f", or a constant value with --set-input {name}=VALUE"
-            raise _no_column(table, column, f"--column {name}=NAME{other}", path)
-        found[name] = table[column]
-    return found
+    if "time" in needed and options.column("time") not in table and "time" not in options.columns:
+        for name in _SAMPLING_TIME:
+            if name in table and _is_in_first_row_only(table[name]):
+                table["time"] = table[name]
+    if missing := [name for name in needed if options.column(name) not in table]:
+        raise _no_column(table, missing[0], options, path)
+    cells = {name: table[options.column(name)] for name in needed}
+    if "time" not in cells or not _is_in_first_row_only(cells["time"]):
+        return cells, options.dt
+    return cells, options.factor("time") * float(cells.pop("time")[0])
+
+
+def _num_samples(path: Path, cells: Mapping[str, np.ndarray]) -> int:
+    """The number of samples, the same in all columns."""
+    if not cells:
+        raise ValueError(f"{path}: with all inputs set and a sampling time nothing is left to read")
+    (first, num_samples), *others = ((name, len(column)) for name, column in cells.items())
+    for name, found in others:
+        if found != num_samples:
+            raise ValueError(f"{path}: {name!r} has {found} samples, {first!r} {num_samples}")
+    return num_samples
 
 
 def _nearest(name: str, names: Iterable[str]) -> str:
@@ -224,34 +232,41 @@ def _nearest(name: str, names: Iterable[str]) -> str:
 
 
 def _no_column(
-    table: Mapping[str, np.ndarray], column: str, options: str, path: Path
+    table: Mapping[str, np.ndarray], name: str, options: _Options, path: Path
 ) -> ValueError:
     """What the file has instead of a column, and the options that mend it."""
-    names = list(table)
-    several = [n for n in names if n.startswith(f"{column} (column ")]
-    if several:
+    column, names = options.column(name), list(table)
+    ways = f"--column {name}=NAME"
+    if name == "time":
+        ways += ", or give a sampling time with --dt"
+    elif name in names_of(options.description.inputs):
+        ways += f", or a constant value with --set-input {name}=VALUE"
+    if several := [known for known in names if known.startswith(f"{column} (column ")]:
         return ValueError(
             f"{path}: column {column!r} is there twice, with different values: "
-            f"{' or '.join(several)} (choose one with {options})"
+            f"{' or '.join(several)} (choose one with {ways})"
         )
-    listed = ", ".join(names[:_MOST_NAMES]) or "none"
+    listed = ", ".join(map(_short, names[:_MOST_NAMES])) or "none"
     if len(names) > _MOST_NAMES:
         listed += f" and {len(names) - _MOST_NAMES} more"
     if names and names == [str(i) for i in range(1, len(names) + 1)]:
         listed = f"no names, its columns are called {listed}"
     return ValueError(
-        f"{path}: no column {column!r}{_nearest(column, names)}; the file has {listed} (name it "
-        f"with {options})"
+        f"{path}: no column {_short(column)!r}{_nearest(column, names)}; the file has {listed} "
+        f"(name it with {ways})"
     )
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= _LONGEST_NAME else f"{text[:_LONGEST_NAME]}..."
 
 
 def _is_in_first_row_only(cells: np.ndarray) -> bool:
     """Whether a column has a number in its first row, and nothing below."""
-    if cells.dtype.kind == "f":
-        return len(cells) > 1 and bool(np.isfinite(cells[0]) and np.isnan(cells[1:]).all())
-    if cells.dtype.kind != "O" or len(cells) < 2 or any(map(_is_there, cells[1:])):
+    if not cells.size or _number(cells[0]) is None:
         return False
-    return _number(cells[0]) is not None
+    below = cells[1:]
+    return all(np.isnan(below)) if below.dtype.kind == "f" else not any(map(_is_there, below))
 
 
 def _is_there(cell: object) -> bool:
@@ -266,45 +281,61 @@ def _number(cell: Any) -> float | None:
         return None
 
 
-def _seconds(cells: np.ndarray, chosen: slice, factor: float, where: Path) -> np.ndarray:
-    """The time of the chosen rows [s]: from numbers, dates, or one sampling time in the first."""
-    if _is_in_first_row_only(cells):
-        return factor * float(cells[0]) * np.arange(len(cells))[chosen]
-    column = cells[chosen]
-    is_date = column.dtype.kind == "M"
-    if column.dtype.kind == "O" and column.size:
-        is_date = _is_there(column[0]) and _number(column[0]) is None
-    if not is_date:
-        return _numbers(column, "time", where) * factor
-    seconds = seconds_of(column)
+def _seconds(cells: np.ndarray, options: _Options, where: Path) -> np.ndarray:
+    """Time in seconds, from numbers or dates."""
+    has_dates = cells.dtype.kind == "M"
+    if cells.dtype.kind == "O" and cells.size:
+        has_dates = _is_there(cells[0]) and _number(cells[0]) is None
+    if not has_dates:
+        return _numbers(cells, "time", where) * options.factor("time")
+    seconds = seconds_of(cells)
     if (bad := np.flatnonzero(np.isnan(seconds))).size:
-        raise ValueError(
-            f"{where}: sample {bad[0] + 1} of 'time' is {str(column[bad[0]])!r}, neither a number "
-            f"nor a date{_FIRST_ROW if bad[0] == 0 else ''}"
-        )
-    if factor != 1:
+        raise _bad_cell(cells, int(bad[0]), "time", "neither a number nor a date", where)
+    if options.factor("time") != 1:
         raise ValueError(
             f"{where}: 'time' holds dates, which are read as seconds; leave its unit and scale out"
         )
     return seconds
 
 
-_FIRST_ROW = "; every row below the names must hold numbers (--rows 1: leaves out the first)"
+def _check_unit_of_time(time: np.ndarray, options: _Options, where: Path) -> None:
+    step, plant = float(time[1] - time[0]), options.description
+    if step > TIMES_DT * plant.dt and not options.confirms("time"):
+        raise ValueError(
+            f"{where}: sampled every {step:g} s, where {plant.name!r} is every {plant.dt:g} s; is "
+            f"'time' in another unit? {unit_hint('time')}"
+        )
+
+
+def _values(cells: np.ndarray, part: Input | Output, options: _Options, where: Path) -> np.ndarray:
+    """A column in the plant's unit; ValueError where its size shows that the unit is wrong."""
+    values = _numbers(cells, part.name, where) * options.factor(part.name)
+    check_finite(values, part.name, where)
+    if not options.confirms(part.name):
+        check_size(values, part, where)
+    return values
 
 
 def _numbers(cells: np.ndarray, name: str, where: Path) -> np.ndarray:
     """The numbers of a column; ValueError names the first cell that is none."""
-    try:
-        if cells.dtype.kind != "M":
+    if cells.dtype.kind != "M":
+        try:
             return cells.astype(float)
-    except (TypeError, ValueError):
-        pass
+        except (TypeError, ValueError):
+            pass
     bad = next(k for k, cell in enumerate(cells) if _number(cell) is None)
-    cell = cells[bad]
-    found = f"is {str(cell)!r}, not a number" if _is_there(cell) else "is missing"
-    raise ValueError(
-        f"{where}: sample {bad + 1} of {name!r} {found}{_FIRST_ROW if bad == 0 else ''}"
-    )
+    raise _bad_cell(cells, bad, name, "not a number", where)
+
+
+def _bad_cell(cells: np.ndarray, k: int, name: str, what: str, where: Path) -> ValueError:
+    """What a cell holds that cannot be read, and what mends it."""
+    text = str(cells[k]).strip()
+    found = f"is {_short(text)!r}, {what}" if _is_there(cells[k]) else "is missing"
+    if _THOUSANDS.fullmatch(text):
+        found += "; save the file without thousands separators"
+    elif k == 0:
+        found += "; every row below the names must hold numbers (--rows 1: leaves out the first)"
+    return ValueError(f"{where}: sample {k + 1} of {name!r} {found}")
 
 
 def _metadata(path: Path, description: PlantDescription, first_row: int) -> Mapping[str, Any]:

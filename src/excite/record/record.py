@@ -26,7 +26,7 @@ RECORD_KIND = "excite record"
 
 TEXT_ENDINGS = (".csv", ".txt", ".dat", ".tsv")
 READ_ENDINGS = (*TEXT_ENDINGS, ".mat", ".h5", ".hdf5", ".parquet")
-_MAX_FILE = 2**29  # bytes
+_MAX_FILE, _MAX_SIDECAR = 2**29, 2**24  # bytes
 
 
 @dataclass(frozen=True, repr=False)
@@ -152,8 +152,12 @@ def require_readable(path: Path) -> None:
     if path.suffix.lower() not in READ_ENDINGS:
         *others, last = READ_ENDINGS
         raise ValueError(f"{path}: experiment files end in {', '.join(others)} or {last}")
-    if not path.exists() or path.is_dir():
+    if path.is_dir():
+        raise ValueError(f"{path}: is a folder; only files can be read")
+    if not path.exists():
         raise ValueError(f"{path}: no such file")
+    if not os.access(path, os.R_OK):
+        raise ValueError(f"{path}: you are not allowed to read this file")
     if not path.is_file():
         raise ValueError(f"{path}: is a pipe or a device; only files can be read")
     if (size := path.stat().st_size) > _MAX_FILE:
@@ -191,10 +195,20 @@ def read_sidecar(path: Path) -> Mapping[str, Any]:
     sidecar = path.with_suffix(".json")
     if not sidecar.is_file():
         return {}
+    if sidecar.stat().st_size > _MAX_SIDECAR:
+        raise ValueError(
+            f"{sidecar}: has more than {_MAX_SIDECAR >> 20} MiB and is no sidecar of a record; "
+            "rename it"
+        )
     try:
         content = json.loads(sidecar.read_text(encoding="utf-8"))
-    except (ValueError, OSError) as error:
+    except (json.JSONDecodeError, UnicodeError, OSError) as error:
         raise ValueError(f"{sidecar}: cannot be read as JSON ({error})") from None
+    except (ValueError, RecursionError):
+        raise ValueError(
+            f"{sidecar}: cannot be read as JSON (a number is too long, or lists are nested too "
+            "deeply)"
+        ) from None
     if not (isinstance(content, dict) and content.get("kind") == RECORD_KIND):
         return {}
     plant = content.get("plant", {})

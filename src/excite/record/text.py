@@ -6,7 +6,7 @@ CSV, as excite writes it, is then read by NumPy, and everything else by pandas.
 
 from __future__ import annotations
 
-import contextlib
+import codecs
 import csv
 import re
 import warnings
@@ -17,18 +17,19 @@ from pathlib import Path
 
 import numpy as np
 
+from .dates import DATE
 from .table import require_pandas
 
 _FIRST = 20  # lines that show the layout
-_LONGEST = 64 * 2**10  # bytes of a line
+_LONGEST = 2**16  # characters of a line
 _MOST_LINES = 20_000_000
-_SKIPPED = (b"#", b"%", b"sep=")  # comments, and Excel's note about its delimiter
+_SKIPPED = ("#", "%", "sep=")  # comments, and Excel's note about its delimiter
 _DELIMITERS = (";", "\t", " ", ",")  # a blank stands for a run of blanks and tabs
 _NUMBER = re.compile(r"[+-]?(\d+(\.\d*|,\d+)?|[.,]\d+)([eE][+-]?\d+)?|nan", re.IGNORECASE)
+_DECIMAL_POINT = re.compile(r"[+-]?\d*\.\d+([eE][+-]?\d+)?")
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
-_DATE = re.compile(r"\d{1,4}([-./])\d{1,2}\1\d{1,4}\b.*")
+_COMMA_OF_SECONDS = re.compile(r"(?<=:\d\d),(?=\d)")
 _TRUNCATED = "is the file truncated?"
-_CLOCK = re.compile(r"(\d+ days? )?\d{1,2}:\d\d:\d\d\b.*")
 
 
 @dataclass(frozen=True)
@@ -36,21 +37,39 @@ class _Look:
     """What a pass over the lines of a text file shows.
 
     Attributes:
-        first: its first lines that are neither empty nor a comment, at most twenty.
-        start: index of the first of them.
+        rows: its first lines that are neither empty nor a comment, at most twenty, each with
+            its index.
+        last: its last such line, with its index.
         comments: indices of the lines to skip.
-        last: its last line, likewise.
-        num_lines: up to that line.
+        above: the comment directly above the first row; empty where there is none.
         ends: whether the file ends with a line break.
     """
 
-    first: list[str]
-    start: int
+    rows: list[tuple[int, str]]
+    last: tuple[int, str]
     comments: list[int]
-    last: str
-    num_lines: int
+    above: str
     ends: bool
     encoding: str
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """How the rows of a text file are read.
+
+    Attributes:
+        names: of the columns; empty for one without a name.
+        is_named: whether the first row has the names.
+    """
+
+    delimiter: str
+    names: list[str]
+    is_named: bool
+
+    @property
+    def width(self) -> int:
+        """Cells that every row has; one in a last column without a name may be missing."""
+        return len(self.names) - (not self.names[-1])
 
 
 def read_text(path: Path, is_own: bool = False) -> dict[str, np.ndarray]:
@@ -67,72 +86,60 @@ def read_text(path: Path, is_own: bool = False) -> dict[str, np.ndarray]:
         ValueError: one sentence for a file that is no such table, or may be truncated.
     """
     look = _look(path)
-    delimiter, names, is_named = _layout(look.first[:2])
-    header = _cells(look.first[0], delimiter)
-    if is_named and len(look.first) > 1:
-        found = len(_cells(look.first[1], delimiter))
-        if not len(names) - (not names[-1]) <= found <= len(names):
-            why = "put names that hold blanks in quotes" if delimiter == " " else _TRUNCATED
-            raise _wrong_width(path, look.start + 2, found, len(header), why)
-    _require_whole(path, look, delimiter, names, is_own)
-    is_plain = delimiter == "," and is_named and not (look.comments or look.start)
-    if is_plain and len(look.first) > 1 and len(set(names)) == len(names) and all(names):
-        # anything that NumPy cannot read is read, or explained, below
-        with contextlib.suppress(ValueError):
-            values = np.loadtxt(
-                path, delimiter=",", skiprows=1, ndmin=2, comments=None, encoding=look.encoding
-            )
-            return dict(zip(names, values.T.copy(), strict=True))
-    return _named(names, _read_cells(path, look, delimiter, len(names), is_named))
+    layout = _layout(look)
+    _require_whole(path, look, layout, is_own)
+    columns = _read_plain(path, look, layout)
+    if columns is None:
+        columns = _read_cells(path, look, layout)
+    return _named(layout.names, columns)
 
 
 def _look(path: Path) -> _Look:
     """One pass over the lines, in little memory."""
-    first, start, comments, last, count, encoding = [], 0, [], b"", 0, "utf-8-sig"
-    line = b"\n"
     with path.open("rb") as file:
-        for i, line in enumerate(iter(partial(file.readline, _LONGEST), b"")):
+        is_utf16 = file.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+    reason = ""
+    for encoding in ("utf-16",) if is_utf16 else ("utf-8-sig", "cp1252"):  # cp1252: old Windows
+        try:
+            return _look_in(path, encoding)
+        except UnicodeDecodeError as error:
+            reason = str(error)
+    raise _no_text(path, reason)
+
+
+def _look_in(path: Path, encoding: str) -> _Look:
+    rows, last, comments, comment, above = [], (0, ""), [], "", ""
+    line = "\n"
+    with path.open(encoding=encoding) as file:
+        for i, line in enumerate(iter(partial(file.readline, _LONGEST), "")):
             if len(line) == _LONGEST:
-                raise _no_text(path, f"line {i + 1} is longer than {_LONGEST >> 10} KiB")
+                raise _no_text(path, f"line {i + 1} is longer than {_LONGEST} characters")
             if i == _MOST_LINES:
                 millions = f"{_MOST_LINES // 10**6} million lines"
                 raise ValueError(f"{path}: the file has more than {millions}; save it with fewer")
-            if b"\0" in line:
+            if "\0" in line:
                 raise _no_text(path, f"line {i + 1} holds zero bytes")
-            text = line.removeprefix(b"\xef\xbb\xbf") if i == 0 else line
-            if text.lstrip().startswith(_SKIPPED):
+            if line.lstrip().startswith(_SKIPPED):
                 comments.append(i)
-            elif text.strip():
-                try:
-                    text.decode()
-                except UnicodeDecodeError:
-                    encoding = "cp1252"  # of a program that knows no UTF-8
-                start = start if first else i
-                first, last, count = [*first, text] if len(first) < _FIRST else first, text, i + 1
-    if not first:
+                comment = line
+            elif line.strip():
+                last = i, line
+                if not rows and comments and comments[-1] == i - 1:
+                    above = comment
+                if len(rows) < _FIRST:
+                    rows.append(last)
+    if not rows:
         raise ValueError(f"{path}: the file is empty")
-    try:
-        lines = [text.decode(encoding) for text in (*first, last)]
-    except UnicodeDecodeError as error:
-        raise _no_text(path, str(error)) from None
-    return _Look(lines[:-1], start, comments, lines[-1], count, line.endswith(b"\n"), encoding)
+    return _Look(rows, last, comments, above, line.endswith("\n"), encoding)
 
 
 def _no_text(path: Path, why: str) -> ValueError:
     return ValueError(f"{path}: cannot be read as CSV text ({why}); save it as UTF-8 text")
 
 
-def _wrong_width(
-    path: Path, line: int, found: int, named: int, why: str = _TRUNCATED
-) -> ValueError:
-    return ValueError(
-        f"{path}: line {line} has {found} values where the header names {named}; {why}"
-    )
-
-
 def _cells(line: str, delimiter: str) -> list[str]:
     """The cells of a line, without the blanks around them."""
-    line = " ".join(line.split()) if delimiter == " " else line.strip("\r\n")
+    line = " ".join(line.split()) if delimiter == " " else line.strip("\n")
     try:
         [row] = csv.reader([line], delimiter=delimiter, skipinitialspace=True)
     except (csv.Error, ValueError):
@@ -140,66 +147,96 @@ def _cells(line: str, delimiter: str) -> list[str]:
     return [cell.strip() for cell in row]
 
 
-def _layout(first: Sequence[str]) -> tuple[str, list[str], bool]:
-    """The delimiter, the names of the columns, and whether the file names them.
+def _layout(look: _Look) -> _Layout:
+    """The delimiter and the names, from the first two rows and the comment above them."""
+    first = [row for _, row in look.rows[:2]]
+    delimiter = max(_DELIMITERS, key=lambda delimiter: _fitness(delimiter, first))
+    cells, *rest = (_cells(row, delimiter) for row in first)
+    if any(cell and not (_NUMBER.fullmatch(cell) or DATE.fullmatch(cell)) for cell in cells):
+        has_empty_end = bool(rest) and len(rest[0]) == len(cells) + 1 and not rest[0][-1]
+        return _Layout(delimiter, [*cells, *[""] * has_empty_end], True)
+    empty_end = [""] if not cells[-1] else []
+    numbers = [str(i) for i in range(1, len(cells) + 1 - len(empty_end))]
+    names = _names_in_comment(look.above, len(numbers)) or numbers
+    return _Layout(delimiter, [*names, *empty_end], False)
 
-    The delimiter is the one that splits the first two lines alike, and into most numbers. The
-    names may hold commas between semicolons, the numbers decimal commas.
+
+def _fitness(delimiter: str, first: Sequence[str]) -> tuple[bool, int, bool, int]:
+    """How well a delimiter splits the first rows: alike, and the second into most numbers.
+
+    The names may hold commas between semicolons, the numbers decimal commas.
     """
-
-    def quality(delimiter: str) -> tuple[bool, int, bool, int]:
-        rows = [_cells(line, delimiter) for line in first]
-        numbers = sum(bool(_NUMBER.fullmatch(cell)) for cell in rows[-1])
-        excess = len(rows[-1]) - len(rows[0])
-        is_alike = excess == 0 or (abs(excess) == 1 and not rows[excess > 0][-1])  # an empty end
-        return is_alike and numbers > 0, numbers, is_alike, 0 if numbers else len(rows[0])
-
-    delimiter = max(_DELIMITERS, key=quality)
-    names, *rest = (_cells(line, delimiter) for line in first)
-    if all(not cell or _NUMBER.fullmatch(cell) or _DATE.fullmatch(cell) for cell in names):
-        return delimiter, [str(i) if name else "" for i, name in enumerate(names, 1)], False
-    if rest and len(rest[0]) == len(names) + 1 and not rest[0][-1]:
-        names = [*names, ""]  # every line but the first ends with a delimiter
-    return delimiter, names, True
+    rows = [_cells(row, delimiter) for row in first]
+    numbers = sum(bool(_NUMBER.fullmatch(cell)) for cell in rows[-1])
+    excess = len(rows[-1]) - len(rows[0])
+    is_alike = excess == 0 or (abs(excess) == 1 and not rows[excess > 0][-1])  # an empty end
+    return is_alike and numbers > 0, numbers, is_alike, 0 if numbers else len(rows[0])
 
 
-def _require_whole(
-    path: Path, look: _Look, delimiter: str, names: Sequence[str], is_own: bool
-) -> None:
-    """Raises ValueError where the last line seems to be cut off."""
-    row = _cells(look.last, delimiter)
-    width = len(names) - (not names[-1])  # a column without name may be missing
-    if look.num_lines > look.start + 1 and len(row) < width:
-        raise _wrong_width(path, look.num_lines, len(row), width)
-    if not look.ends and (is_own or not row[width - 1]):
+def _names_in_comment(comment: str, width: int) -> list[str]:
+    """The names in a comment such as `# t,u,y`, where it has one for each column."""
+    for delimiter in (";", "\t", ",", " "):
+        names = _cells(comment.lstrip("#% \t"), delimiter)
+        if len(names) == width and all(names) and not any(map(_NUMBER.fullmatch, names)):
+            return names
+    return []
+
+
+def _require_whole(path: Path, look: _Look, layout: _Layout, is_own: bool) -> None:
+    """Raises ValueError where the second or the last row has too few cells or too many."""
+    for i, row in (*look.rows[1:2], look.last):
+        num_cells = len(_cells(row, layout.delimiter))
+        if not layout.width <= num_cells <= len(layout.names):
+            may_be_blanks = layout.delimiter == " " and layout.is_named and i != look.last[0]
+            why = "put names that hold blanks in quotes" if may_be_blanks else _TRUNCATED
+            raise _wrong_width(path, i + 1, num_cells, layout.width, why)
+    last_cell = _cells(look.last[1], layout.delimiter)[layout.width - 1]
+    if not look.ends and (is_own or not last_cell):
         # A truncated number is still a number: only the line's end shows that it is complete.
         raise ValueError(
-            f"{path}: line {look.num_lines} does not end with a line break; is the file truncated? "
-            "(add one if it is complete)"
+            f"{path}: line {look.last[0] + 1} does not end with a line break; {_TRUNCATED} (add "
+            "one if it is complete)"
         )
 
 
-def _read_cells(
-    path: Path, look: _Look, delimiter: str, width: int, is_named: bool
-) -> list[np.ndarray]:
+def _wrong_width(path: Path, line: int, found: int, width: int, why: str) -> ValueError:
+    return ValueError(
+        f"{path}: line {line} has {found} values where the first row has {width}; {why}"
+    )
+
+
+def _read_plain(path: Path, look: _Look, layout: _Layout) -> list[np.ndarray] | None:
+    """The columns of names, commas and numbers, by NumPy; None for any other file."""
+    has_names_first = layout.is_named and look.rows[0][0] == 0 and len(look.rows) > 1
+    if layout.delimiter != "," or look.comments or not has_names_first:
+        return None
+    try:
+        values = np.loadtxt(
+            path, delimiter=",", skiprows=1, ndmin=2, comments=None, encoding=look.encoding
+        )
+    except ValueError:  # a cell that is no number
+        return None
+    return list(values.T.copy()) if values.shape[1] == len(layout.names) else None
+
+
+def _read_cells(path: Path, look: _Look, layout: _Layout) -> list[np.ndarray]:
     """The columns, by pandas."""
     pandas = require_pandas(
         f"{path}: a text file that is not plain CSV (names, commas, a number in every cell)"
     )
-    rows = [*look.first[is_named:], look.last]
-    has_commas = any(_DECIMAL_COMMA.fullmatch(c) for row in rows for c in _cells(row, delimiter))
-    decimal = "," if delimiter != "," and has_commas else "."
-    header = [look.start] if is_named else []
+    header, rows = look.rows[: layout.is_named], look.rows[layout.is_named :]
+    cells = (cell for _, row in (*rows, look.last) for cell in _cells(row, layout.delimiter))
+    has_commas = layout.delimiter != "," and any(map(_DECIMAL_COMMA.fullmatch, cells))
     try:
         with warnings.catch_warnings(action="error", category=pandas.errors.ParserWarning):
             frame = pandas.read_csv(
                 path,
-                sep=r"\s+" if delimiter == " " else delimiter,
-                decimal=decimal,
+                sep=r"\s+" if layout.delimiter == " " else layout.delimiter,
+                decimal="," if has_commas else ".",
                 header=None,
-                names=range(width),
+                names=range(len(layout.names)),
                 index_col=False,
-                skiprows=[*look.comments, *header],
+                skiprows=[*look.comments, *(i for i, _ in header)],
                 skipinitialspace=True,
                 keep_default_na=False,
                 low_memory=False,
@@ -207,20 +244,28 @@ def _read_cells(
             )
     except (pandas.errors.ParserError, pandas.errors.ParserWarning) as error:
         if found := re.search(r"Expected (\d+) fields in line (\d+), saw (\d+)", str(error)):
-            named, line, cells = map(int, found.groups())
-            raise _wrong_width(path, line, cells, named) from None
+            width, line, saw = map(int, found.groups())
+            raise _wrong_width(path, line, saw, width, _TRUNCATED) from None
         raise _no_text(path, str(error).strip()) from None
     except (UnicodeError, OSError) as error:
         raise _no_text(path, str(error)) from None
-    columns = [frame[i].to_numpy() for i in frame]
-    return [_numbers_or_texts(column, decimal) for column in columns]
+    return [_numbers_or_texts(path, frame[i].to_numpy(), has_commas) for i in frame]
 
 
-def _numbers_or_texts(column: np.ndarray, decimal: str) -> np.ndarray:
+def _numbers_or_texts(path: Path, column: np.ndarray, has_commas: bool) -> np.ndarray:
+    """A column of pandas: numbers, or texts in which decimal commas are points."""
     if column.dtype.kind in "fiub":
         return column.astype(float)
-    texts = (str(cell).strip() for cell in column)
-    return np.array([text.replace(decimal, ".") for text in texts], object)
+    texts = [str(cell).strip() for cell in column]
+    if not has_commas:
+        return np.array(texts, object)
+    if points := [text for text in texts if _DECIMAL_POINT.fullmatch(text)]:
+        raise ValueError(
+            f"{path}: the file has decimal commas, and {points[0]!r} with a point; save it with "
+            "one of them, and without thousands separators"
+        )
+    numbers = (t.replace(",", ".") if _DECIMAL_COMMA.fullmatch(t) else t for t in texts)
+    return np.array([_COMMA_OF_SECONDS.sub(".", text) for text in numbers], object)
 
 
 def _named(names: Sequence[str], columns: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
@@ -242,29 +287,3 @@ def _named(names: Sequence[str], columns: Sequence[np.ndarray]) -> dict[str, np.
 def _is_equal(column: np.ndarray, other: np.ndarray) -> bool:
     both_numbers = column.dtype.kind == other.dtype.kind == "f"
     return np.array_equal(column, other, equal_nan=both_numbers)
-
-
-def seconds_of(dates: np.ndarray) -> np.ndarray:
-    """Seconds since the first of the dates or times of day, NaN for what is neither.
-
-    01/02/2026 is read month first or day first, whichever gives the shorter record.
-    """
-    pandas = require_pandas("dates as time")
-    if dates.dtype.kind == "O" and _CLOCK.fullmatch(str(dates[0])):
-        stamps = pandas.to_timedelta(pandas.Index(dates), errors="coerce")
-        return (stamps - stamps[0]).total_seconds().to_numpy()
-    ways = ({"format": "ISO8601"}, {"dayfirst": False}, {"dayfirst": True})
-    best = np.full(len(dates), np.nan)
-    with warnings.catch_warnings(action="ignore"):  # about the ways that do not fit
-        for way in ways:
-            stamps = pandas.to_datetime(pandas.Index(dates), utc=True, errors="coerce", **way)
-            seconds = (stamps - stamps[0]).total_seconds().to_numpy()
-            if _quality(seconds) > _quality(best):
-                best = seconds
-    return best
-
-
-def _quality(seconds: np.ndarray) -> tuple[int, float]:
-    """How many dates were understood, and how short the record is."""
-    known = seconds[np.isfinite(seconds)]
-    return known.size, -np.ptp(known) if known.size else -np.inf
