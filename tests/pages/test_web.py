@@ -19,8 +19,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import h5py
 import httpx2 as httpx
 import numpy as np
+import pandas
 import pytest
 import scipy.io
 from commands import PATIENCE, excite
@@ -29,6 +31,7 @@ from starlette.requests import Request
 from starlette.testclient import TestClient
 
 from excite.files import write_json
+from excite.record import READ_ENDINGS
 from excite.report.html import report_html
 from excite.study.objectives import OBJECTIVES
 from excite.web import application
@@ -218,6 +221,25 @@ def test_an_uploaded_mat_file_is_identified(client, told: Told, tmp_path: Path):
     [event] = streamed(client, "/api/identifications", asked).of("identified")
     own = told.of("result")[0]["identification"]
     assert event["identification"]["params"] == own["params"]
+
+
+@pytest.mark.parametrize("ending", READ_ENDINGS)
+def test_the_page_takes_every_file_that_is_read(ending: str, client, told: Told, tmp_path: Path):
+    del told
+    table, path = {"t": [0.0, 0.5], "a b": [1.0, 2.0]}, tmp_path / f"log{ending}"
+    if ending == ".mat":
+        scipy.io.savemat(path, {"t": table["t"], "a": table["a b"]})
+    elif ending in (".h5", ".hdf5"):
+        with h5py.File(path, "w") as file:
+            file.update(table)
+    elif ending == ".parquet":
+        pandas.DataFrame(table).to_parquet(path)
+    else:
+        path.write_text("# t;a b\n0,0;1,0\n0,5;2,0\n")
+    content = path.read_bytes()
+    answer = client.post(f"/api/uploads?name={path.name}", content=content).json()
+    assert answer["columns"] == {"t": 2, "a" if ending == ".mat" else "a b": 2}
+    assert ending in client.get("/").text.partition('accept="')[2].partition('"')[0].split(",")
 
 
 def test_an_initial_state_that_does_not_exist_is_refused(client, told: Told):
@@ -449,12 +471,12 @@ BAD_FILES = {
     "pickle.mat": (pickle.dumps({"time": os.system}), "not a readable MAT file"),
     "noise.mat": (bytes(range(256)) * 40, "not a readable MAT file"),
     "empty.csv": (b"", "empty"),
-    "binary.csv": (b"\xff\xfe\x00" * 30, "cannot be read as CSV text"),
+    "binary.csv": (b"\x00\xff\xfe" * 30, "cannot be read as CSV text"),
     "cut.csv": (b"time,pitch\n0,1\n1,", "does not end with a line break"),
     "ragged.csv": (b"time,pitch\n0,1\n1,2,3\n", "is the file truncated?"),
-    "program.py": (b"raise SystemExit\n", ".csv or .mat"),
-    "policy.safetensors": (b"{}", ".csv or .mat"),
-    "archive.csv.gz": (b"\x1f\x8b", ".csv or .mat"),
+    "program.py": (b"raise SystemExit\n", ".hdf5 or .parquet"),
+    "policy.safetensors": (b"{}", ".hdf5 or .parquet"),
+    "archive.csv.gz": (b"\x1f\x8b", ".hdf5 or .parquet"),
 }
 
 
@@ -763,7 +785,7 @@ def test_a_file_that_stops_coming_is_given_up(tmp_path: Path, monkeypatch: pytes
     [
         ("my log [2], a=1.csv", "my log [2], a=1.csv"), ("../../etc/x.csv", ".._.._etc_x.csv"),
         ("-rf.CSV", "-rf.CSV"), ("a\0b\n\u202e.mat", "a_b__.mat"), ("Größe.csv", "Größe.csv"),
-        (300 * "x" + ".csv", "file.csv"),
+        (300 * "x" + ".csv", "file.csv"), (300 * "x" + ".parquet", "file.parquet"),
     ],
 )  # fmt: skip
 def test_a_files_name_is_freed_of_what_could_be_mistaken(name: str, kept: str):

@@ -1,7 +1,7 @@
 """Experiment files: `record` defines and writes them, `read` reads and `prepare` checks them.
 
-`formats` has the kinds of files, `text` the text files from any source, `units` the words for
-units. Nothing here needs JAX, and to write and read excite's own CSV NumPy is enough.
+`formats` has the kinds of files, `text` the text files from any source, `dates` and `units` what
+cells mean. Nothing here needs JAX, and to write and read excite's own CSV NumPy is enough.
 """
 
 from .formats import columns_in as columns_in
@@ -10,7 +10,9 @@ from .prepare import require_playable as require_playable
 from .read import SIGNAL_ENDINGS as SIGNAL_ENDINGS
 from .read import read_record as read_record
 from .read import read_signal as read_signal
+from .record import READ_ENDINGS as READ_ENDINGS
 from .record import RECORD_KIND as RECORD_KIND
+from .record import WRONG_ENDING as WRONG_ENDING
 from .record import Record as Record
 from .record import described_in as described_in
 from .record import require_record_path as require_record_path

@@ -26,6 +26,7 @@ RECORD_KIND = "excite record"
 
 TEXT_ENDINGS = (".csv", ".txt", ".dat", ".tsv")
 READ_ENDINGS = (*TEXT_ENDINGS, ".mat", ".h5", ".hdf5", ".parquet")
+WRONG_ENDING = f"experiment files end in {', '.join(READ_ENDINGS[:-1])} or {READ_ENDINGS[-1]}"
 _MAX_FILE, _MAX_SIDECAR = 2**29, 2**24  # bytes
 
 
@@ -150,8 +151,7 @@ def require_record_ending(path: Path) -> None:
 def require_readable(path: Path) -> None:
     """Raises ValueError, before anything is read, for what is no experiment file."""
     if path.suffix.lower() not in READ_ENDINGS:
-        *others, last = READ_ENDINGS
-        raise ValueError(f"{path}: experiment files end in {', '.join(others)} or {last}")
+        raise ValueError(f"{path}: {WRONG_ENDING}")
     if path.is_dir():
         raise ValueError(f"{path}: is a folder; only files can be read")
     if not path.exists():
@@ -202,7 +202,9 @@ def read_sidecar(path: Path) -> Mapping[str, Any]:
         )
     try:
         content = json.loads(sidecar.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeError, OSError) as error:
+    except OSError as error:
+        raise ValueError(f"{sidecar}: cannot be read ({error.strerror})") from None
+    except (json.JSONDecodeError, UnicodeError) as error:
         raise ValueError(f"{sidecar}: cannot be read as JSON ({error})") from None
     except (ValueError, RecursionError):
         raise ValueError(

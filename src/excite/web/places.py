@@ -12,6 +12,7 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
 
+from ..record import READ_ENDINGS, WRONG_ENDING
 from .events import JobEvent
 from .requests import MAX_UPLOAD, RefusedError
 from .sessions import MAX_STORED, Session
@@ -101,10 +102,11 @@ async def _reported(workers: Workers, session: Session, run: Path) -> Response:
 
 def _file_name(name: str) -> str:
     """The name of an uploaded file, without folders and control characters."""
-    if not name.lower().endswith((".csv", ".mat")):
-        raise RefusedError(415, "experiment files end in .csv or .mat")
+    ending = Path(name).suffix
+    if ending.lower() not in READ_ENDINGS:
+        raise RefusedError(415, WRONG_ENDING)
     plain = "".join(c if c.isprintable() and c not in "/\\" else "_" for c in name)
-    return plain if len(plain.encode()) <= _MAX_NAME else f"file{plain[-4:]}"
+    return plain if len(plain.encode()) <= _MAX_NAME else f"file{ending}"
 
 
 def _stored(scratch: Path) -> int:
