@@ -171,6 +171,10 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "empty.csv": "",
         "header.csv": good.splitlines()[0] + "\n",
         "long.csv": "a" * 200_000 + "\n",
+        "backwards.csv": scaled(good, time=-1.0),
+        "deep.csv": good,
+        "deep.json": "[" * 100_000,
+        "digits.csv": spoiled(good, pitch="7" * 5000),
         "sidecar.csv": good,
         "sidecar.json": '{"kind": "excite record", "plant',
         "hand.csv": good,
@@ -194,6 +198,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
         b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + bytes(400)
     )
     (folder / "binary.csv").write_bytes(bytes(range(256)) * 10)
+    (folder / "mine.csv").mkdir()
     (folder / "mine").mkdir()
     (folder / "mine" / "thesis.tex").write_text("years of work")
     return folder
@@ -731,6 +736,17 @@ BAD: dict[str, tuple[str, tuple[str, ...]]] = {
     "header only": (IDENTIFY.format("header.csv"), ("header.csv", "0 samples")),
     "binary": (IDENTIFY.format("binary.csv"), ("binary.csv", "cannot be read")),
     "endless line": (IDENTIFY.format("long.csv"), ("long.csv", "cannot be read")),
+    "time backwards": (IDENTIFY.format("backwards.csv"), ("backwards.csv", "'time'")),
+    "deep sidecar": (IDENTIFY.format("deep.csv"), ("deep.json", "nested too deeply")),
+    "digits in a cell": (IDENTIFY.format("digits.csv"), ("digits.csv", "sample 5", "is inf")),
+    "digits in rows": (
+        IDENTIFY.format("good.csv") + f" --rows {'7' * 5000}:", ("rows '777", "are not allowed"),
+    ),
+    "surrogate in a unit": (
+        IDENTIFY.format("good.csv") + " --unit pitch=\udcff", ("unit '\\udcff' of 'pitch'",),
+    ),
+    "time step NaN": (IDENTIFY.format("good.csv") + " --dt nan", ("time nan s is not allowed",)),
+    "folder as record": (IDENTIFY.format("mine.csv"), ("mine.csv", "is a folder")),
     "truncated MAT": (IDENTIFY.format("truncated.mat"), ("truncated.mat", "not a readable MAT")),
     "pickle as MAT": (IDENTIFY.format("pickle.mat"), ("pickle.mat", "not a readable MAT")),
     "HDF5 MAT": (IDENTIFY.format("hdf5.mat"), ("hdf5.mat", "-v7")),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
+from typing import Any
 
 import numpy as np
 
@@ -29,8 +30,8 @@ def seconds_of(dates: np.ndarray) -> np.ndarray:
     return max(map(_since_first, read), key=_fitness)
 
 
-def _since_first(stamps: object) -> np.ndarray:
-    return (stamps - stamps[0]).total_seconds().to_numpy()  # pyright: ignore
+def _since_first(stamps: Any) -> np.ndarray:
+    return (stamps - stamps[0]).total_seconds().to_numpy()
 
 
 def _fitness(seconds: np.ndarray) -> tuple[int, float]:

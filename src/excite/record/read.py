@@ -142,8 +142,8 @@ class _Options:
     def _require_known(self, name: str, kind: str, known: Collection[str]) -> None:
         if name not in known:
             raise ValueError(
-                f"plant {self.description.name!r} has no {kind} {name!r}{_nearest(name, known)}; "
-                f"it has {', '.join(known)}"
+                f"plant {self.description.name!r} has no {kind} {_short(name)!r}"
+                f"{_nearest(name, known)}; it has {', '.join(known)}"
             )
 
     def column(self, name: str) -> str:
@@ -263,7 +263,8 @@ def _short(text: str) -> str:
 
 def _is_in_first_row_only(cells: np.ndarray) -> bool:
     """Whether a column has a number in its first row, and nothing below."""
-    if not cells.size or _number(cells[0]) is None:
+    first = _number(cells[0]) if cells.size else None
+    if first is None or not math.isfinite(first):
         return False
     below = cells[1:]
     return all(np.isnan(below)) if below.dtype.kind == "f" else not any(map(_is_there, below))

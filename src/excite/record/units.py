@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import reprlib
 
 _TABLES: tuple[dict[str, float], ...] = (
     {"s": 1.0, "us": 1e-6, "µs": 1e-6, "ms": 1e-3, "min": 60.0, "h": 3600.0, "d": 86400.0},
@@ -46,7 +47,8 @@ def unit_factor(name: str, word: str, unit: str) -> float:
     if word not in table:
         allowed = ", ".join(known or "1" for known in table)
         raise ValueError(
-            f"unit {word!r} of {name!r} is not allowed: the plant has it in {unit or '1'!r}, and "
-            f"known are {allowed} (for another unit give a factor with --scale {name}=FACTOR)"
+            f"unit {reprlib.repr(word)} of {name!r} is not allowed: the plant has it in "
+            f"{unit or '1'!r}, and known are {allowed} (for another unit give a "
+            f"factor with --scale {name}=FACTOR)"
         )
     return table[word] / table[unit]
