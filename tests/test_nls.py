@@ -119,7 +119,7 @@ def test_padding_of_an_experiment_changes_nothing():
     inputs = Multisine().sequence(plant, NUM_STEPS, KEY)
     measured = noise_free(plant, inputs) + 0.001 * jax.random.normal(KEY, (NUM_STEPS + 1, 1))
     data = stack_experiments(plant, [inputs, inputs[:50]], [measured, measured[:51]], True)
-    other = jnp.where(data.valid[..., None], data.measured, 1e3)
+    other = jnp.where(data.valid, data.measured, 1e3)
     clean, dirty = (
         NLS()(plant, eqx.tree_at(lambda d: d.measured, data, m)) for m in (data.measured, other)
     )

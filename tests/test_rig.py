@@ -631,7 +631,7 @@ def _check_tracker(seen, record, result):
     experiments = Experiments(
         inputs=jnp.asarray(record.inputs[:-1])[None],
         measured=jnp.asarray(record.outputs)[None],
-        valid=jnp.asarray(np.arange(len(seen) + 1) < len(seen))[None],
+        valid=jnp.asarray(np.arange(len(seen) + 1) < len(seen))[None, :, None],
         initial_state=IDEAL.initial_state[None],
         initial_state_known=True,
     )

@@ -48,20 +48,31 @@ def step(
     state: Float[Array, " state"],
     input: Float[Array, " input"],
     params: Params,
+    dt: Float[Array, ""] | None = None,
+    next_input: Float[Array, " input"] | None = None,
 ) -> Float[Array, " state"]:
-    """State one sampling time later, the input held."""
-    h = plant.dt / plant.substeps
+    """State one sample later.
 
-    def substep(x: Array, _: None) -> tuple[Array, None]:
-        k1 = plant.derivative(x, input, params)
-        k2 = plant.derivative(x + h / 2 * k1, input, params)
-        k3 = plant.derivative(x + h / 2 * k2, input, params)
-        k4 = plant.derivative(x + h * k3, input, params)
+    Args:
+        dt: time between the samples [s]; default the plant's.
+        next_input: at the next sample, if the input is linear between them; default it is held.
+    """
+    n = plant.substeps
+    h = (plant.dt if dt is None else dt) / n
+
+    def at(fraction: Array | float) -> Array:
+        return input if next_input is None else input + fraction * (next_input - input)
+
+    def substep(x: Array, k: Array) -> tuple[Array, None]:
+        first, middle, last = at(k / n), at((k + 0.5) / n), at((k + 1) / n)
+        k1 = plant.derivative(x, first, params)
+        k2 = plant.derivative(x + h / 2 * k1, middle, params)
+        k3 = plant.derivative(x + h / 2 * k2, middle, params)
+        k4 = plant.derivative(x + h * k3, last, params)
         return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4), None
 
     # A few substeps are unrolled: an inner loop would cost more than they do.
-    unroll = min(plant.substeps, 4)
-    return jax.lax.scan(substep, state, None, length=plant.substeps, unroll=unroll)[0]
+    return jax.lax.scan(substep, state, jnp.arange(n), unroll=min(n, 4))[0]
 
 
 @eqx.filter_jit
@@ -70,15 +81,23 @@ def response(
     params: Params,
     inputs: Float[Array, "time input"],
     initial_state: Float[Array, " state"] | None = None,
+    dt: Float[Array, " time"] | None = None,
+    next_inputs: Float[Array, "time input"] | None = None,
 ) -> Float[Array, "time+1 output"]:
-    """Noise-free outputs at all samples, from the plant's initial state unless given."""
+    """Noise-free outputs at all samples, from the plant's initial state unless given.
+
+    Args:
+        dt: time from each sample to the next [s]; default the plant's sampling time.
+        next_inputs: see `step`.
+    """
     start = plant.initial_state if initial_state is None else initial_state
 
-    def advance(state: Array, input: Array) -> tuple[Array, Array]:
-        state = step(plant, state, input, params)
+    def advance(state: Array, now: tuple) -> tuple[Array, Array]:
+        input, dt, next_input = now
+        state = step(plant, state, input, params, dt, next_input)
         return state, plant.output(state, params)
 
-    _, outputs = jax.lax.scan(advance, start, inputs)
+    _, outputs = jax.lax.scan(advance, start, (inputs, dt, next_inputs))
     return jnp.concatenate([plant.output(start, params)[None], outputs])
 
 

@@ -150,7 +150,7 @@ def _regression(
     """Regressors and outputs of all experiments; each regressor is from one experiment."""
     y, u = experiments.measured[..., 0], experiments.inputs[..., 0]
     rows = regressor(y[:, 1:-1], y[:, :-2], u[:, 1:], u[:, :-1])
-    valid = experiments.valid[:, 2:]
+    valid = experiments.valid[:, 2:, 0]
     return rows.reshape(-1, 4), y[:, 2:].ravel(), valid.ravel()
 
 

@@ -51,18 +51,22 @@ class Experiments(eqx.Module):
     """One or several experiments of one plant, padded to one length.
 
     Attributes:
-        inputs: row k is held from sample k to k + 1.
+        inputs: row k acts from sample k to k + 1.
         measured: measured outputs.
-        valid: False where an experiment was padded.
+        valid: False where an output was not measured or an experiment was padded.
         initial_state: known, or the start of its search.
         initial_state_known: False where it is estimated too.
+        dt: time from each sample to the next [s]; None: the plant's sampling time.
+        next_inputs: inputs at sample k + 1, if they are linear in between; None: they are held.
     """
 
     inputs: Float[Array, "experiment time input"]
     measured: Float[Array, "experiment sample output"]
-    valid: Bool[Array, "experiment sample"]
+    valid: Bool[Array, "experiment sample output"]
     initial_state: Float[Array, "experiment state"]
     initial_state_known: bool = eqx.field(static=True)
+    dt: Float[Array, "experiment time"] | None = None
+    next_inputs: Float[Array, "experiment time input"] | None = None
 
 
 def stack_experiments(
@@ -70,23 +74,41 @@ def stack_experiments(
     inputs: Sequence[Float[Array, "_time input"] | Float[np.ndarray, "_time input"]],
     measured: Sequence[Float[Array, "_samples output"] | Float[np.ndarray, "_samples output"]],
     initial_state_known: bool,
+    *,
+    dt: Sequence[Float[np.ndarray, " _time"]] | None = None,
+    next_inputs: Sequence[Float[np.ndarray, "_time input"]] | None = None,
+    seen: Sequence[Bool[np.ndarray, "_samples output"]] | None = None,
 ) -> Experiments:
-    """Experiments of any lengths side by side; each has one more output than inputs."""
+    """Experiments of any lengths side by side; each has one more output than inputs.
+
+    Args:
+        dt, next_inputs: see `Experiments`.
+        seen: False where an output was not measured; its value is ignored.
+    """
     xp = jnp if any(isinstance(rows, jax.core.Tracer) for rows in (*inputs, *measured)) else np
     longest, counts = max(map(len, inputs)), xp.asarray([len(y) for y in measured])
 
     def stacked(records: Sequence[AnyArray], length: int) -> Array:
         padded = [
-            xp.pad(xp.asarray(rows, float), ((0, length - len(rows)), (0, 0))) for rows in records
+            xp.pad(rows, [(0, length - len(rows)), *[(0, 0)] * (rows.ndim - 1)])
+            for rows in (xp.asarray(rows, float) for rows in records)
         ]
         return jax.device_put(xp.stack(padded))
+
+    valid = xp.arange(longest + 1)[None, :, None] < counts[:, None, None]
+    valid = jax.device_put(xp.tile(valid, (1, 1, measured[0].shape[1])))
+    if seen is not None:
+        valid = valid & (stacked(seen, longest + 1) > 0)
+        measured = [xp.where(own, rows, 0.0) for own, rows in zip(seen, measured, strict=True)]
 
     return Experiments(
         inputs=stacked(inputs, longest),
         measured=stacked(measured, longest + 1),
-        valid=jax.device_put(xp.arange(longest + 1)[None] < counts[:, None]),
+        valid=valid,
         initial_state=jax.device_put(xp.tile(xp.asarray(plant.initial_state), (len(inputs), 1))),
         initial_state_known=initial_state_known,
+        dt=None if dt is None else stacked(dt, longest),
+        next_inputs=None if next_inputs is None else stacked(next_inputs, longest),
     )
 
 
@@ -146,8 +168,9 @@ def simulate_experiments(
     initial_state: Float[Array, "experiment state"],
 ) -> Float[Array, "experiment sample output"]:
     """Noise-free outputs of all experiments for one set of parameters."""
-    return jax.vmap(response, in_axes=(None, None, 0, 0))(
-        plant, params, experiments.inputs, initial_state
+    e = experiments
+    return jax.vmap(response, in_axes=(None, None, 0, 0, 0, 0))(
+        plant, params, e.inputs, initial_state, e.dt, e.next_inputs
     )
 
 
@@ -155,7 +178,7 @@ def residual_of(
     experiments: Experiments, simulated: Float[Array, "experiment sample output"]
 ) -> Float[Array, "experiment sample output"]:
     """Measured minus simulated outputs, zero where padded."""
-    return jnp.where(experiments.valid[..., None], experiments.measured - simulated, 0.0)
+    return jnp.where(experiments.valid, experiments.measured - simulated, 0.0)
 
 
 def status_of(plant: AbstractPlant, params: Params, status: Int[Array, ""]) -> Int[Array, ""]:

@@ -127,7 +127,7 @@ def _gain(
             simulate_experiments(plant, unit, silent, (rest + SMALL * away)[None])
             for away in jnp.eye(len(rest))
         ]
-    seen = experiments.valid[0]
+    seen = experiments.valid[0, :, 0]
     X = jnp.stack([jnp.where(seen, column[0, :, 0], 0.0) for column in columns], axis=1)
     inverse = jnp.linalg.inv(X.T @ X)
     factors = inverse @ (X.T @ jnp.where(seen, experiments.measured[0, :, 0], 0.0))
@@ -139,7 +139,7 @@ def _gain(
 def _decay(plant: AbstractPlant, experiments: Experiments) -> tuple[Line, Line, Array]:
     """Log of peaks over time, time of zero crossings over their number, complete half swings."""
     inputs, y = experiments.inputs[0], experiments.measured[0, :, 0]
-    valid = experiments.valid[0]
+    valid = experiments.valid[0, :, 0]
     num_inputs = jnp.sum(valid) - 1
     index = jnp.arange(len(y))
     last = inputs[num_inputs - 1]

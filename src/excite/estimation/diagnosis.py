@@ -15,7 +15,9 @@ from jaxtyping import Float
 def fit_percent(
     measured: Float[np.ndarray, " sample"], simulated: Float[np.ndarray, " sample"]
 ) -> float:
-    """100 (1 - |y - y_s| / |y - mean y|); NaN for a constant output."""
+    """100 (1 - |y - y_s| / |y - mean y|) of measured samples; NaN for a constant output."""
+    seen = np.isfinite(measured)
+    measured, simulated = measured[seen], simulated[seen]
     spread = np.linalg.norm(measured - measured.mean())
     if spread == 0:
         return float("nan")

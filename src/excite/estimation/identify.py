@@ -9,16 +9,25 @@ from functools import partial
 from pathlib import Path
 from typing import Literal, TypeAlias, get_args
 
+import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..description import RARE, Named, PlantDescription, names_of, wrong_type
 from ..files import json_ready
 from ..information import identifiability, worst_seen
 from ..plant import AbstractPlant, Params, floats, params_from
 from ..plant.catalogue import PLANTS, PlantLike, plant_from
-from ..record import Record, described_in, read_record, require_columns
+from ..record import (
+    Record,
+    described_in,
+    is_even,
+    read_record,
+    require_columns,
+    require_even,
+    unbroken,
+)
 from .catalogue import estimator_from
 from .contract import (
     AbstractEstimator,
@@ -40,6 +49,7 @@ from .nls import NLS
 from .result import Fitted, Identification
 
 InitialState = Literal["auto", "free", "known"]
+Hold = Literal["constant", "linear"]
 _NOTHING_SEEN = (
     "no parameter is identifiable from the data; are columns, signs and units right, and does the "
     "input move the plant beyond the noise? or did the search begin too far from the truth "
@@ -60,6 +70,7 @@ def identify(
     start: Mapping[str, float] | Params | None = None,
     hold: Mapping[str, float] | None = None,
     initial_state: InitialState = "auto",
+    hold_input: Hold | Mapping[str, Hold] = "constant",
     validate: RecordLike | Sequence[RecordLike] = (),
     columns: Mapping[str, str] | None = None,
     scales: Mapping[str, float] | None = None,
@@ -87,6 +98,8 @@ def identify(
         hold: values of parameters that are known and not estimated, by name.
         initial_state: "known" (the plant's), "free" (estimated too), or "auto": known
             where every sidecar says so.
+        hold_input: "constant": an input keeps its value until the next sample; "linear": it runs
+            straight to the next value; or one of them by the input's name.
         validate: records for which only the initial state is fitted.
         columns: names in the files where they are not the plant's: {"pitch": "qm"}.
         scales: factors from the files' units to the plant's: {"pitch": 0.01745}.
@@ -126,15 +139,19 @@ def identify(
         initial_state == "auto" and all(_starts_at(record, plant) for record in records)
     )
     _check_lengths(plant, [*records, *validation], known)
-    plant = plant.changed(dt=_common_dt(plant, [*records, *validation]))
-    experiments = _experiments(plant, records, known)
+    linear = _linear_inputs(plant, hold_input)
+    if not isinstance(estimator, NLS):
+        _require_complete(estimator, [*records, *validation], linear)
+    plant = _sampled_as([*records, *validation], plant)
+    known = known and all(len(unbroken(record.time)) == 1 for record in records)
+    experiments = _experiments(plant, records, known, linear)
     fit = _fit(plant, experiments, estimator, begin)
     residual = _residuals(plant, records, experiments, estimator, fit)
     fitted = tuple(_fitted(plant.definition, *pair) for pair in zip(records, residual, strict=True))
     if isinstance(estimator, NLS) and not fit.has_ended_in(Status.NOT_FINITE):
         _require_explanation(records, residual, int(fit.free.sum()))
     whiteness = {
-        name: _whiteness([r[:, i] for r in residual], plant.definition.outputs[i].scale)
+        name: _whiteness([_finite(r[:, i]) for r in residual], plant.definition.outputs[i].scale)
         for i, name in enumerate(names_of(plant.definition.outputs))
     }
     structure = {
@@ -160,7 +177,9 @@ def identify(
         structure=structure,
         verdict=verdict,
         fitted=fitted,
-        validation=tuple(_validated(plant, record, fit.estimate.params) for record in validation),
+        validation=tuple(
+            _validated(plant, record, linear, fit.estimate.params) for record in validation
+        ),
         initial_state_known=known,
     )
 
@@ -242,6 +261,47 @@ def _other_plant(record: Record, plant: AbstractPlant) -> tuple[str, ...]:
     return (f"{where} was made with other known constants of {name!r}",)
 
 
+def _linear_inputs(
+    plant: AbstractPlant, hold_input: Hold | Mapping[str, Hold]
+) -> Bool[np.ndarray, " input"]:
+    """Which inputs are linear between samples; ValueError for another word or name."""
+    names = names_of(plant.definition.inputs)
+    by_name = hold_input if isinstance(hold_input, Mapping) else dict.fromkeys(names, hold_input)
+    for name, word in by_name.items():
+        if name not in names:
+            raise ValueError(
+                f"plant {plant.definition.name!r} has no input {name!r} to hold; it has "
+                f"{', '.join(names)}"
+            )
+        if word not in get_args(Hold):
+            raise ValueError(f"hold_input of {name!r} must be constant or linear: got {word!r}")
+    return np.array([by_name.get(name) == "linear" for name in names])
+
+
+def _require_complete(
+    estimator: AbstractEstimator, records: Sequence[Record], linear: np.ndarray
+) -> None:
+    """Raises ValueError where an estimator in discrete time cannot use the records."""
+    for record in records:
+        require_even(record, f"{estimator.name} needs")
+        if not np.isfinite(record.outputs).all():
+            raise ValueError(
+                f"{record.source or 'the record'} has samples without a measurement; "
+                f"{estimator.name} needs them all (nls does not)"
+            )
+    if linear.any():
+        raise ValueError(
+            f"{estimator.name} takes inputs as constant between samples; nls can take them as linear"
+        )
+    first = records[0]
+    for record in records[1:]:
+        if abs(record.dt - first.dt) > 1e-3 * first.dt:
+            raise ValueError(
+                f"{record.source} is sampled every {record.dt:g} s and {first.source} every "
+                f"{first.dt:g} s; {estimator.name} needs one sampling time (nls does not)"
+            )
+
+
 def _check_lengths(plant: AbstractPlant, records: Sequence[Record], known: bool) -> None:
     d = plant.definition
     unknowns = len(d.parameters) + (0 if known else len(d.states))
@@ -254,21 +314,66 @@ def _check_lengths(plant: AbstractPlant, records: Sequence[Record], known: bool)
             )
 
 
-def _common_dt(plant: AbstractPlant, records: Sequence[Record]) -> float:
-    """The records' sampling time [s], rounded, because it enters the plant's hash."""
-    first, own = records[0], float(plant.dt)
-    for record in records[1:]:
-        if abs(record.dt - first.dt) > 1e-3 * first.dt:
-            raise ValueError(
-                f"{record.source} is sampled every {record.dt:g} s and {first.source} every "
-                f"{first.dt:g} s; records fitted together need one sampling time"
-            )
-    return own if abs(first.dt - own) < 1e-6 * own else float(f"{first.dt:.6g}")
+def _sampled_as(records: Sequence[Record], plant: AbstractPlant) -> AbstractPlant:
+    """The plant with the sampling time of the records.
+
+    It is rounded, because it enters the plant's hash. Where the steps differ, the longest
+    is integrated no more coarsely than in the definition.
+    """
+    first, own = records[0].dt, float(plant.dt)
+    usual = own if abs(first - own) < 1e-6 * own else float(f"{first:.6g}")
+    sampled = plant.changed(dt=usual)
+    if _are_even(records, usual):
+        return sampled
+    steps = [np.diff(r.time[part]).max() for r in records for part in unbroken(r.time)]
+    longest = plant.changed(dt=max(steps))
+    return eqx.tree_at(lambda p: p.dt, longest, sampled.dt)
 
 
-def _experiments(plant: AbstractPlant, records: Sequence[Record], known: bool) -> Experiments:
-    inputs = [record.inputs[:-1] for record in records]
-    return stack_experiments(plant, inputs, [record.outputs for record in records], known)
+def _are_even(records: Sequence[Record], dt: float) -> bool:
+    """Whether all parts of the records are sampled with this time."""
+    parts = [record.time[part] for record in records for part in unbroken(record.time)]
+    own = [(time[-1] - time[0]) / (time.size - 1) for time in parts]
+    return all(map(is_even, parts)) and bool(np.allclose(own, dt, rtol=1e-3, atol=0))
+
+
+def _experiments(
+    plant: AbstractPlant, records: Sequence[Record], known: bool, linear: np.ndarray
+) -> Experiments:
+    """The parts of all records without gaps, as experiments."""
+    parts = [(record, part) for record in records for part in unbroken(record.time)]
+    inputs = [record.inputs[part] for record, part in parts]
+    outputs = [record.outputs[part] for record, part in parts]
+    evenly = _are_even(records, float(plant.dt))
+    next_inputs = [np.where(linear, rows[1:], rows[:-1]) for rows in inputs]
+    seen = [np.isfinite(rows) for rows in outputs]
+    return stack_experiments(
+        plant,
+        [rows[:-1] for rows in inputs],
+        outputs,
+        known,
+        dt=None if evenly else [np.diff(record.time[part]) for record, part in parts],
+        next_inputs=next_inputs if linear.any() else None,
+        seen=None if all(rows.all() for rows in seen) else seen,
+    )
+
+
+def _by_record(
+    records: Sequence[Record], values: Float[np.ndarray, "experiment sample output"]
+) -> list[Float[np.ndarray, "sample output"]]:
+    """Values of the parts of records, joined; NaN where no output was measured."""
+    experiments, joined = iter(values), []
+    for record in records:
+        own = np.full(record.outputs.shape, np.nan)
+        for part in unbroken(record.time):
+            rows = part.stop - part.start
+            own[part] = next(experiments)[:rows]
+        joined.append(np.where(np.isfinite(record.outputs), own, np.nan))
+    return joined
+
+
+def _finite(values: np.ndarray) -> np.ndarray:
+    return values[np.isfinite(values)]
 
 
 def _known(plant: AbstractPlant, estimator: AbstractEstimator) -> np.ndarray:
@@ -398,8 +503,7 @@ def _residuals(
     knows_state = experiments.initial_state_known or isinstance(estimator, NLS)
     if fit.is_successful and not knows_state:  # ARX does not estimate the state
         estimate = _with_initial_state(plant, experiments, estimate.params)
-    residual = np.asarray(estimate.residual)
-    return [residual[i, : len(record.time)] for i, record in enumerate(records)]
+    return _by_record(records, np.asarray(estimate.residual))
 
 
 def _with_initial_state(plant: AbstractPlant, experiments: Experiments, params: Params) -> Estimate:
@@ -466,7 +570,11 @@ def _dependence(
     residual: Sequence[np.ndarray], records: Sequence[Record], output: int, scale: float
 ) -> float:
     """p-value of an output's residual not following the input; see `_whiteness`."""
-    pairs = [(r[:, output], record.inputs) for r, record in zip(residual, records, strict=True)]
+    pairs = [
+        (r[seen, output], record.inputs[seen])
+        for r, record in zip(residual, records, strict=True)
+        for seen in [np.isfinite(r[:, output])]
+    ]
     pairs = [(r, inputs) for r, inputs in pairs if _is_more_than_rounding(r, scale)]
     return input_dependence([r for r, _ in pairs], [inputs for _, inputs in pairs])
 
@@ -491,7 +599,7 @@ def _require_explanation(
 ) -> None:
     """Raises ValueError where the best simulation fits the outputs no better than chance."""
     chances = [
-        chance_of_fit(record.outputs[:, i], r[:, i], unknowns)
+        chance_of_fit(_finite(record.outputs[:, i]), _finite(r[:, i]), unknowns)
         for record, r in zip(records, residual, strict=True)
         for i in range(r.shape[1])
     ]
@@ -499,7 +607,7 @@ def _require_explanation(
         raise ValueError(_NOTHING_SEEN)
 
 
-def _validated(plant: AbstractPlant, record: Record, params: Params) -> Fitted:
+def _validated(plant: AbstractPlant, record: Record, linear: np.ndarray, params: Params) -> Fitted:
     """A record and its simulation; only its initial state is fitted."""
-    estimate = _with_initial_state(plant, _experiments(plant, [record], False), params)
-    return _fitted(plant.definition, record, np.asarray(estimate.residual[0]))
+    estimate = _with_initial_state(plant, _experiments(plant, [record], False, linear), params)
+    return _fitted(plant.definition, record, _by_record([record], np.asarray(estimate.residual))[0])

@@ -70,15 +70,15 @@ class Segments(eqx.Module):
     `valid` is False for unused samples, `is_followed` for a segment after which none are used.
     """
 
-    inputs: Float[Array, "block experiment segment time input"]
+    steps: tuple[Array, Array | None, Array | None]  # inputs, dt, next inputs
     measured: Float[Array, "block experiment segment time output"]
-    valid: Bool[Array, "block experiment segment time"]
+    valid: Bool[Array, "block experiment segment time output"]
     is_followed: Bool[Array, "block experiment segment"]
 
     @classmethod
     def of(cls, experiments: Experiments, length: int, block: int = _BLOCK) -> Segments:
         """Segments of `length` samples, in blocks of about `block`; the last are padded."""
-        num_experiments, num_samples = experiments.valid.shape
+        num_experiments, num_samples, _ = experiments.valid.shape
         needed = -(-num_samples // length)
         num_blocks = -(-needed * length * num_experiments // block)
         in_block = -(-needed // num_blocks)
@@ -91,16 +91,16 @@ class Segments(eqx.Module):
 
         valid = cut(experiments.valid)
         return cls(
-            cut(experiments.inputs),
+            jax.tree.map(cut, (experiments.inputs, experiments.dt, experiments.next_inputs)),
             cut(experiments.measured),
             valid,
-            in_blocks(_next(over_segments(valid.any(axis=3))), num_blocks),
+            in_blocks(_next(over_segments(valid.any(axis=(3, 4)))), num_blocks),
         )
 
     @property
     def shape(self) -> tuple[int, int]:
         """Number of experiments, and of segments in each."""
-        num_blocks, num_experiments, in_block, _ = self.valid.shape
+        num_blocks, num_experiments, in_block, *_ = self.valid.shape
         return num_experiments, num_blocks * in_block
 
 
@@ -229,28 +229,30 @@ class MultipleShooting:
         """Simulates the segments of one block."""
         n = self.num_states
 
-        def outputs_and_end(point: Array, inputs: Array) -> tuple[tuple, tuple]:
+        def outputs_and_end(point: Array, steps: tuple) -> tuple[tuple, tuple]:
             params = self.plant.Params(*self.params_at(point[n:]))
 
-            def advance(x: Array, u: Array) -> tuple[Array, Array]:
-                return step(self.plant, x, u, params), self.plant.output(x, params)
+            def advance(x: Array, now: tuple) -> tuple[Array, Array]:
+                input, dt, next_input = now
+                after = step(self.plant, x, input, params, dt, next_input)
+                return after, self.plant.output(x, params)
 
-            end, outputs = jax.lax.scan(advance, point[:n] * self.scales, inputs)
+            end, outputs = jax.lax.scan(advance, point[:n] * self.scales, steps)
             return (found := (outputs, end / self.scales)), found
 
-        def differentiated(start: Array, inputs: Array) -> tuple:
+        def differentiated(start: Array, steps: tuple) -> tuple:
             point = jnp.concatenate([start, z])
-            return jax.jacfwd(outputs_and_end, has_aux=True)(point, inputs)
+            return jax.jacfwd(outputs_and_end, has_aux=True)(point, steps)
 
-        shape = block.inputs.shape
-        flat = starts.reshape(-1, n), block.inputs.reshape(-1, *shape[2:])
+        shape = starts.shape[:2]
+        flat = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), (starts, block.steps))
         (slope, end_slope), (outputs, end) = jax.tree.map(
-            lambda a: a.reshape(*shape[:2], *a.shape[1:]), jax.vmap(differentiated)(*flat)
+            lambda a: a.reshape(*shape, *a.shape[1:]), jax.vmap(differentiated)(*flat)
         )
-        used, is_followed = block.valid[..., None], block.is_followed[..., None]
+        is_followed = block.is_followed[..., None]
         return Shots(
-            misfit=jnp.where(used, outputs - block.measured, 0.0),
-            misfit_slope=jnp.where(used[..., None], slope, 0.0),
+            misfit=jnp.where(block.valid, outputs - block.measured, 0.0),
+            misfit_slope=jnp.where(block.valid[..., None], slope, 0.0),
             gap=jnp.where(is_followed, end - next_starts, 0.0),
             end_slope=jnp.where(is_followed[..., None], end_slope, 0.0),
         )
@@ -303,7 +305,7 @@ class MultipleShooting:
         """
         n, p = self.num_states, len(point.z)
         (num_experiments, _), num_outputs = self.segments.shape, len(self.output_scales)
-        length = self.segments.valid.shape[-1]
+        length = self.segments.valid.shape[3]
         few = -(-2 * n // num_outputs) + 1
         used = jnp.arange(length) < jnp.where(is_first, few, length)
         weight = used[:, None] / sd[None]
@@ -508,7 +510,7 @@ class MultipleShooting:
                 than this part of its standard error.
             max_steps: of the second phase.
         """
-        count = jnp.sum(self.segments.valid) * len(sd)
+        count = jnp.sum(self.segments.valid)
 
         def improve(s: _Search) -> _Search:
             sweep = self.sweep(s.here)

@@ -117,7 +117,7 @@ class NLS(AbstractEstimator):
                 tolerance=self.tolerance,
                 max_steps=self.max_steps,
             )
-            misfit = sweep.misfit.reshape(len(segments.inputs[0]), -1, problem.num_outputs)
+            misfit = sweep.misfit.reshape(segments.shape[0], -1, problem.num_outputs)
             return _Found(point, converged, sweep.triangles, -misfit[:, :num_samples], sd)
 
         first = experiments.initial_state / problem.state_scales[None]
@@ -189,7 +189,7 @@ class _Problem(eqx.Module):
         """Standard deviation of each output's residual, corrected for the number of unknowns."""
         num_states = 0 if self.experiments.initial_state_known else self.state_scales.size
         spent = jnp.sum(self.free) + num_states * residual.shape[0]
-        count = jnp.sum(self.experiments.valid) - spent / self.num_outputs
+        count = jnp.sum(self.experiments.valid, axis=(0, 1)) - spent / self.num_outputs
         sd = jnp.sqrt(jnp.sum(residual**2, axis=(0, 1)) / jnp.maximum(count, 1.0))
         return jnp.maximum(sd, self.rounding)  # noise-free data keep a finite weight
 

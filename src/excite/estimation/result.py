@@ -94,10 +94,10 @@ class Identification:
         """Fit in percent by output, over all records together."""
         outputs = names_of(self.plant.outputs)
         measured = np.concatenate(
-            [f.record.outputs - f.record.outputs.mean(axis=0) for f in self.fitted]
+            [f.record.outputs - np.nanmean(f.record.outputs, axis=0) for f in self.fitted]
         )
         simulated = np.concatenate(
-            [f.simulated - f.record.outputs.mean(axis=0) for f in self.fitted]
+            [f.simulated - np.nanmean(f.record.outputs, axis=0) for f in self.fitted]
         )
         return {n: fit_percent(measured[:, i], simulated[:, i]) for i, n in enumerate(outputs)}
 

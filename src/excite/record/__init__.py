@@ -5,8 +5,11 @@ cells mean. Nothing here needs JAX, and to write and read excite's own CSV NumPy
 """
 
 from .formats import columns_in as columns_in
+from .prepare import is_even as is_even
 from .prepare import require_columns as require_columns
+from .prepare import require_even as require_even
 from .prepare import require_playable as require_playable
+from .prepare import unbroken as unbroken
 from .read import SIGNAL_ENDINGS as SIGNAL_ENDINGS
 from .read import read_record as read_record
 from .read import read_signal as read_signal

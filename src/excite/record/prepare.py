@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,8 @@ from ..description import Input, Output, PlantDescription, names_of
 from .record import Record
 
 _UNEVEN = 0.05  # of the sampling time: more than rounding in the file explains
+_MOST = 0.9  # of all steps are usual ones in an even record
+_MISSING, _GAP = 1.5, 10.0  # usual steps: a missing sample of an even record, a gap of another
 _TIMES_LIMIT = 2.0  # inputs beyond this many times the limits are in another unit
 TIMES_DT = 50.0  # likewise sampling times this many times the plant's
 _TIMES_SCALE = 10.0  # likewise outputs beyond this many times their typical size
@@ -54,21 +57,46 @@ def check_finite(values: np.ndarray, name: str, path: Path) -> None:
 
 
 def check_time(time: np.ndarray, path: Path) -> None:
-    """Raises ValueError for sampling instants that do not increase evenly."""
+    """Raises ValueError for sampling instants that do not increase."""
     if time.size < 2:
         raise ValueError(f"{path}: {time.size} samples; at least two are needed")
     check_finite(time, "time", path)
-    steps = np.diff(time)
-    usual = float(np.median(steps))
-    if usual <= 0:
-        raise ValueError(f"{path}: 'time' does not increase")
-    bad = np.flatnonzero(np.abs(steps - usual) > _UNEVEN * usual)
+    bad = np.flatnonzero(np.diff(time) <= 0)
     if bad.size:
-        k, gap = bad[0], steps[bad[0]]
-        what = "samples are missing" if gap > 1.5 * usual else "sampling is uneven"
+        k = bad[0]
+        what = "is there twice" if time[k + 1] == time[k] else "goes backwards"
         raise ValueError(
-            f"{path}: {what}: {gap:.6g} s between samples {k + 1} and {k + 2}, "
-            f"{usual:.6g} s elsewhere; one sampling time within {_UNEVEN:.0%} is needed"
+            f"{path}: 'time' {what}: sample {k + 1} is at {time[k]:.6g} s, sample {k + 2} at "
+            f"{time[k + 1]:.6g} s; {bad.size} of {time.size - 1} steps do not increase"
+        )
+
+
+def is_even(time: np.ndarray) -> bool:
+    """Whether sampling instants lie on a grid, but for the rounding of a file."""
+    grid = np.linspace(time[0], time[-1], time.size)
+    return bool(np.max(np.abs(time - grid)) <= _UNEVEN * (grid[1] - grid[0]))
+
+
+def unbroken(time: np.ndarray) -> list[slice]:
+    """Parts of a record without a gap in time, of two samples or more.
+
+    In an even record a gap is a missing sample, because the input in between is unknown; in an
+    uneven one it is a step of more than ten times the usual one.
+    """
+    steps = np.diff(time)
+    usual = np.median(steps)
+    most_are_usual = np.mean(np.abs(steps - usual) <= _UNEVEN * usual) >= _MOST
+    gaps = np.flatnonzero(steps > (_MISSING if most_are_usual else _GAP) * usual) + 1
+    ends = [0, *gaps.tolist(), time.size]
+    return [slice(a, b) for a, b in pairwise(ends) if b - a > 1]
+
+
+def require_even(record: Record, what: str) -> None:
+    """Raises ValueError where a record is sampled unevenly or has gaps."""
+    if len(unbroken(record.time)) > 1 or not is_even(record.time):
+        raise ValueError(
+            f"{record.source or 'the record'} is sampled unevenly or has gaps in time; {what} "
+            "one sampling time"
         )
 
 

@@ -75,7 +75,7 @@ class LiveEstimate:
         experiments = Experiments(
             inputs=jnp.asarray(self._inputs)[None],
             measured=jnp.asarray(self._measured)[None],
-            valid=jnp.asarray(seen)[None],
+            valid=jnp.broadcast_to(seen[None, :, None], (1, *self._measured.shape)),
             initial_state=self._plant.initial_state[None],
             initial_state_known=self._starts_at_rest,
         )
