@@ -124,6 +124,8 @@ class Estimate(eqx.Module):
         status: a `Status`.
         initial_state: known or estimated.
         residual: measured minus simulated outputs, zero where padded.
+        costs: weighted sum of squares at the end of each search, infinite where it did not
+            converge; None for estimators that do not search.
     """
 
     params: Params
@@ -132,6 +134,7 @@ class Estimate(eqx.Module):
     status: Int[Array, ""]
     initial_state: Float[Array, "experiment state"]
     residual: Float[Array, "experiment sample output"]
+    costs: Float[Array, " start"] | None = None
 
 
 class AbstractEstimator(eqx.Module):

@@ -55,6 +55,7 @@ _NOTHING_SEEN = (
     "input move the plant beyond the noise? or did the search begin too far from the truth "
     "(--start)?"
 )
+_STARTS, _SIZE_OF_MANY_STARTS = 8, 50_000  # measured values up to which so many are tried
 _BY_CHANCE = 1e-3  # a fit with a larger p-value explains nothing
 
 
@@ -462,9 +463,11 @@ def _estimate(
 ) -> Estimate:
     """An estimate; a search that does not converge is repeated with longer segments."""
     arguments = plant, experiments, start, jax.device_put(free)
-    estimate = jax.device_get(estimator(*arguments))
     if not isinstance(estimator, NLS):
-        return estimate
+        return jax.device_get(estimator(*arguments))
+    if estimator.num_starts == 1 and experiments.valid.size <= _SIZE_OF_MANY_STARTS:
+        estimator = dataclasses.replace(estimator, num_starts=_STARTS)
+    estimate = jax.device_get(estimator(*arguments))
     num_samples = experiments.valid.shape[1]
     length = estimator.length_of_segments(plant, num_samples)
     while int(estimate.status) == Status.ITERATIONS_EXHAUSTED and length < num_samples:

@@ -444,6 +444,22 @@ class MultipleShooting:
         found = jax.lax.while_loop(goes_on, match, begin)
         return _where(found.is_closed, found.here, found.best)
 
+    def chained(self, start: Point) -> Point:
+        """The start states of all segments from one simulation."""
+        params = self.plant.Params(*self.params_at(start.z))
+
+        def segment(state: Array, steps: tuple) -> tuple[Array, Array]:
+            def advance(x: Array, now: tuple) -> tuple[Array, None]:
+                input, dt, next_input = now
+                return step(self.plant, x, input, params, dt, next_input), None
+
+            end, _ = jax.lax.scan(advance, state * self.scales, steps)
+            return end / self.scales, state
+
+        steps = jax.tree.map(over_segments, self.segments.steps)
+        chain = jax.vmap(lambda first, steps: jax.lax.scan(segment, first, steps)[1])
+        return start._replace(starts=chain(start.starts[:, 0], steps))
+
     def weighted(self, sweep: Sweep, sd: Array) -> Float[Array, "experiment unknown unknown"]:
         """The triangle of all outputs over their standard deviations; unknowns, then value."""
         triangles = sweep.triangles / sd[None, :, None, None]

@@ -41,6 +41,8 @@ class NLS(AbstractEstimator):
             this part of its standard error.
         max_steps: of the search.
         segment_length: of multiple shooting [samples], default one for the record's length.
+        num_starts: of the search: the given one, the same without the first phase, and random
+            ones around it, side by side. The smallest sum of squares counts.
         noise: "declared": an output's weight follows from its declared noise (without one, from
             its scale), the size of the noise from the residual; "known": that follows from
             the declaration, too; "estimated": the weights follow from the residual, too.
@@ -50,6 +52,7 @@ class NLS(AbstractEstimator):
     tolerance: float = eqx.field(static=True, default=1e-4)
     max_steps: int = eqx.field(static=True, default=100)
     segment_length: int | None = eqx.field(static=True, default=None)
+    num_starts: int = eqx.field(static=True, default=1)
     noise: Noise = eqx.field(static=True, default="declared")
     known: tuple[str, ...] = eqx.field(static=True, default=())
     name: str = eqx.field(static=True, default="nls", kw_only=True)
@@ -118,12 +121,25 @@ class NLS(AbstractEstimator):
                 max_steps=self.max_steps,
             )
             misfit = sweep.misfit.reshape(segments.shape[0], -1, problem.num_outputs)
-            return _Found(point, converged, sweep.triangles, -misfit[:, :num_samples], sd)
+            residual = -misfit[:, :num_samples]
+            cost = jnp.sum((residual / sd[None, None]) ** 2)[None]
+            return _Found(point, converged, sweep.triangles, residual, sd, cost)
+
+        def matched(z: Array) -> Point:
+            return shooting.matched(Point(z, starts), sd)
 
         first = experiments.initial_state / problem.state_scales[None]
         starts = jnp.tile(first[:, None], (1, segments.shape[1], 1))
         sd = problem.assumed_sd
-        found = search(shooting.matched(Point(problem.start, starts), sd), sd)
+        if self.num_starts == 1:
+            found = search(matched(problem.start), sd)
+        else:
+            around = jnp.stack([problem.start, *problem.starts_around(self.num_starts - 2)])
+            one = shooting.chained(Point(problem.start, starts))
+            points = jax.tree.map(
+                lambda many, one: jnp.concatenate([many, one[None]]), jax.vmap(matched)(around), one
+            )
+            found = _best(jax.vmap(search, in_axes=(0, None))(points, sd))
         if self.noise == "estimated" and problem.num_outputs > 1:
             found = search(found.point, problem.noise_sd(found.residual))
         return found
@@ -143,6 +159,15 @@ class _Found(NamedTuple):
     triangles: Float[Array, "experiment output column column"]
     residual: Float[Array, "experiment sample output"]
     sd: Float[Array, " output"]
+    costs: Float[Array, " start"]
+
+
+def _best(found: _Found) -> _Found:
+    """The best of several searches; one that converged counts more than one that did not."""
+    costs = jnp.where(jnp.isfinite(found.costs[:, 0]), found.costs[:, 0], jnp.inf)
+    best = jnp.lexsort((costs, ~found.converged))[0]
+    chosen = jax.tree.map(lambda a: a[best], found)
+    return chosen._replace(sd=found.sd[0], costs=jnp.where(found.converged, costs, jnp.inf))
 
 
 class _Problem(eqx.Module):
@@ -184,6 +209,14 @@ class _Problem(eqx.Module):
     def params(self, z: Float[Array, " param"]) -> Float[Array, " param"]:
         """Parameters at search coordinates; held ones stay at the start."""
         return from_search(self.plant.definition, jnp.where(self.free, z, self.start))
+
+    def starts_around(self, count: int) -> Float[Array, "start param"]:
+        """Random search coordinates around the start, always the same: factors up to three."""
+        width = jnp.asarray(
+            [math.log(3) if p.positive else 2.0 for p in self.plant.definition.parameters]
+        )
+        unit = jax.random.uniform(jax.random.key(0), (count, len(width)), float, -1.0, 1.0)
+        return self.start[None] + width[None] * unit
 
     def noise_sd(self, residual: Array) -> Array:
         """Standard deviation of each output's residual, corrected for the number of unknowns."""
@@ -241,6 +274,7 @@ class _Problem(eqx.Module):
             status=_status(values, found.residual, relative, found.converged),
             initial_state=initial_state,
             residual=found.residual,
+            costs=found.costs,
         )
 
 
