@@ -850,6 +850,12 @@ BAD: dict[str, tuple[str, tuple[str, ...]]] = {
     "unknown command": ("identfy good.csv", ("identfy", "identify")),
     "unknown option": ("simulate aero2 --exitation chirp", ("--exitation", "--excitation")),
     "no file": ("identify --plant aero2", ("FILE",)),
+    "other hold of an input": (
+        "identify good.csv --plant aero2 --hold-input cubic", ("'voltage'", "linear", "cubic"),
+    ),
+    "hold of an input that is none": (
+        "identify good.csv --plant aero2 --hold-input volt=linear", ("'volt'", "it has voltage"),
+    ),
     "other initial state": (
         "identify good.csv --plant aero2 --initial-state maybe", ("maybe", "free", "known"),
     ),

@@ -343,14 +343,6 @@ def test_too_short_a_record_is_refused_with_what_is_needed(chirp, foreign):
         identify([foreign], PLANT, validate=[short])
 
 
-@pytest.mark.parametrize("role", ["fitted", "validation"])
-def test_records_of_different_sampling_times_are_refused(role, chirp, foreign):
-    slow = part(foreign, slice(None, None, 2))
-    records = [chirp, slow] if role == "fitted" else [chirp]
-    with pytest.raises(ValueError, match=r"part\.csv is sampled every 0\.2 s .* every 0\.1 s"):
-        identify(records, PLANT, validate=[slow] if role == "validation" else [])
-
-
 @pytest.mark.parametrize(
     ("start", "words"),
     [

@@ -91,6 +91,13 @@ from .options import (
     metavar="START:STOP:STEP",
     help="Rows to use, counted from 0 below the names: 100:1000:5.",
 )
+@click.option(
+    "--hold-input",
+    default="constant",
+    show_default=True,
+    metavar="constant|linear",
+    help="Inputs between samples; one of several by its name: voltage=linear.",
+)
 @click.option("--out", type=OUT_FILE, metavar="FOLDER", help="Run folder to write.")
 @click.option("--overwrite", is_flag=True, help="Replace the run folder if it exists.")
 @plot_option
@@ -110,6 +117,7 @@ def identify(
 
     if out is not None:
         require_free_run_folder(out, options["overwrite"])
+    hold_input = options["hold_input"]
     with progress_bar("identifying"):
         result = verb(
             files,
@@ -117,6 +125,7 @@ def identify(
             options["estimator"],
             **{name: merged(options[name]) for name in ("start", "hold")},
             initial_state=options["initial_state"],
+            hold_input=NAMES.convert(hold_input, None, None) if "=" in hold_input else hold_input,
             validate=options["validate"],
             columns=merged(options["column"]),
             scales=merged(options["scale"]),

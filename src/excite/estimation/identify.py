@@ -56,6 +56,7 @@ _NOTHING_SEEN = (
     "(--start)?"
 )
 _STARTS, _SIZE_OF_MANY_STARTS = 8, 50_000  # measured values up to which so many are tried
+_BETTER = 0.01  # part of the sum of squares that another hold of an input must gain to be told
 _BY_CHANCE = 1e-3  # a fit with a larger p-value explains nothing
 
 
@@ -162,7 +163,8 @@ def identify(
     covariance, verdict = _confidence(plant, experiments, estimator, fit, whiteness)
     wrong = _wrong_structure(structure, estimator) if fit.is_successful else ()
     others = tuple(s for record in [*records, *validation] for s in _other_plant(record, plant))
-    verdict = (*others, *wrong, *verdict)
+    other_hold = _other_hold(plant, records, experiments, estimator, fit, linear)
+    verdict = (*others, *wrong, *verdict, *other_hold)
     names, d = names_of(plant.definition.parameters), plant.description
     sd = np.where(fit.free, np.sqrt(np.maximum(np.diag(covariance), 0.0)), np.nan)
     return Identification(
@@ -292,7 +294,7 @@ def _require_complete(
             )
     if linear.any():
         raise ValueError(
-            f"{estimator.name} takes inputs as constant between samples; nls can take them as linear"
+            f"{estimator.name} takes inputs as constant between samples; nls also as linear"
         )
     first = records[0]
     for record in records[1:]:
@@ -339,9 +341,16 @@ def _are_even(records: Sequence[Record], dt: float) -> bool:
 
 
 def _experiments(
-    plant: AbstractPlant, records: Sequence[Record], known: bool, linear: np.ndarray
+    plant: AbstractPlant,
+    records: Sequence[Record],
+    known: bool,
+    linear: np.ndarray,
+    is_general: bool = False,
 ) -> Experiments:
-    """The parts of all records without gaps, as experiments."""
+    """The parts of all records without gaps, as experiments.
+
+    A general form, in which no input needs to be linear, shares one compilation.
+    """
     parts = [(record, part) for record in records for part in unbroken(record.time)]
     inputs = [record.inputs[part] for record, part in parts]
     outputs = [record.outputs[part] for record, part in parts]
@@ -354,14 +363,14 @@ def _experiments(
         outputs,
         known,
         dt=None if evenly else [np.diff(record.time[part]) for record, part in parts],
-        next_inputs=next_inputs if linear.any() else None,
+        next_inputs=next_inputs if is_general or linear.any() else None,
         seen=None if all(rows.all() for rows in seen) else seen,
     )
 
 
 def _by_record(
     records: Sequence[Record], values: Float[np.ndarray, "experiment sample output"]
-) -> list[Float[np.ndarray, "sample output"]]:
+) -> list[Float[np.ndarray, "_sample output"]]:
     """Values of the parts of records, joined; NaN where no output was measured."""
     experiments, joined = iter(values), []
     for record in records:
@@ -461,13 +470,19 @@ def _estimate(
     start: Params,
     free: np.ndarray,
 ) -> Estimate:
-    """An estimate; a search that does not converge is repeated with longer segments."""
+    """An estimate; the search is repeated where it may have missed the best one.
+
+    Where more than noise is left, it begins at several starts; where it does not converge, it
+    has longer segments.
+    """
     arguments = plant, experiments, start, jax.device_put(free)
-    if not isinstance(estimator, NLS):
-        return jax.device_get(estimator(*arguments))
-    if estimator.num_starts == 1 and experiments.valid.size <= _SIZE_OF_MANY_STARTS:
-        estimator = dataclasses.replace(estimator, num_starts=_STARTS)
     estimate = jax.device_get(estimator(*arguments))
+    if not isinstance(estimator, NLS):
+        return estimate
+    is_small = experiments.valid.size <= _SIZE_OF_MANY_STARTS
+    if estimator.num_starts == 1 and is_small and not _is_noise(plant, experiments, estimate):
+        estimator = dataclasses.replace(estimator, num_starts=_STARTS)
+        estimate = jax.device_get(estimator(*arguments))
     num_samples = experiments.valid.shape[1]
     length = estimator.length_of_segments(plant, num_samples)
     while int(estimate.status) == Status.ITERATIONS_EXHAUSTED and length < num_samples:
@@ -476,6 +491,18 @@ def _estimate(
         again = jax.device_get(longer(*arguments))
         estimate = again if int(again.status) == Status.SUCCESSFUL else estimate
     return estimate
+
+
+def _is_noise(plant: AbstractPlant, experiments: Experiments, estimate: Estimate) -> bool:
+    """Whether a search ended where only white noise is left; then it missed no better minimum."""
+    if int(estimate.status) != Status.SUCCESSFUL:
+        return False
+    residual, valid = np.asarray(estimate.residual), np.asarray(experiments.valid)
+    return all(
+        not _whiteness([r[v, i] for r, v in zip(residual, valid[..., i], strict=True)], o.scale)
+        < RARE
+        for i, o in enumerate(plant.definition.outputs)
+    )
 
 
 def _to_hold(plant: AbstractPlant, fit: _Fit, start: Params) -> tuple[int, float, str] | None:
@@ -500,7 +527,7 @@ def _residuals(
     experiments: Experiments,
     estimator: AbstractEstimator,
     fit: _Fit,
-) -> list[Float[np.ndarray, "sample output"]]:
+) -> list[Float[np.ndarray, "_sample output"]]:
     """Measured minus simulated outputs of each record, at its length."""
     estimate = fit.estimate
     knows_state = experiments.initial_state_known or isinstance(estimator, NLS)
@@ -566,7 +593,7 @@ def _whiteness(residuals: list[np.ndarray], scale: float) -> float:
 
 
 def _is_more_than_rounding(residual: np.ndarray, scale: float) -> bool:
-    return bool(np.abs(residual).max() > 1e-8 * scale)
+    return bool(np.any(np.abs(residual) > 1e-8 * scale))
 
 
 def _dependence(
@@ -594,6 +621,43 @@ def _wrong_structure(
         f"the residual of {' and '.join(wrong)} follows the input: the structure of this plant is "
         "wrong for these data, or time, input or sensor differ from its description; the "
         f"intervals do not include this error{or_biased}",
+    )
+
+
+def _other_hold(
+    plant: AbstractPlant,
+    records: Sequence[Record],
+    experiments: Experiments,
+    estimator: AbstractEstimator,
+    fit: _Fit,
+    linear: np.ndarray,
+) -> tuple[str, ...]:
+    """A sentence where an input that is held fits better as linear, or the other way round."""
+    if not isinstance(estimator, NLS) or not fit.is_successful:
+        return ()
+    if _is_noise(plant, experiments, fit.estimate):
+        return ()
+    sd = np.asarray(plant.sensor.sd)
+    scale = np.where(sd > 0, sd, [o.scale for o in plant.definition.outputs])
+    estimator = dataclasses.replace(estimator, num_starts=1)
+
+    def cost(estimate: Estimate) -> float:
+        return float(np.sum((np.asarray(estimate.residual) / scale) ** 2))
+
+    def cost_with(index: int) -> float:
+        other = linear ^ (np.arange(len(linear)) == index)
+        with_other = _experiments(plant, records, experiments.initial_state_known, other, True)
+        begin, free = jax.device_put((fit.estimate.params, fit.free))
+        return cost(jax.device_get(estimator(plant, with_other, begin, free)))
+
+    costs = [cost_with(index) for index in range(len(linear))]
+    own, best = cost(fit.estimate), int(np.argmin(costs))
+    if costs[best] > (1 - _BETTER) * own:
+        return ()
+    name, word = names_of(plant.definition.inputs)[best], "constant" if linear[best] else "linear"
+    return (
+        f"with {name} {word} between samples the sum of squared residuals would be "
+        f"{100 * (1 - costs[best] / own):.2g} % smaller (--hold-input {name}={word})",
     )
 
 

@@ -38,6 +38,7 @@ def require_columns(
 def require_playable(record: Record, description: PlantDescription) -> None:
     """Raises ValueError for another plant's inputs, or beyond limits: they would be clipped."""
     require_columns(record, description, inputs_only=True)
+    require_even(record, "an input to play needs")
     for part, values in zip(description.inputs, record.inputs.T, strict=True):
         if values.min() < part.lower - 1e-9 or values.max() > part.upper + 1e-9:
             raise ValueError(

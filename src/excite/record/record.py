@@ -97,7 +97,7 @@ class Record:
             ]
             for part, column in zip(parts, values.T, strict=True):
                 unit, factor = display_unit(part["unit"])
-                low, high = factor * column.min(), factor * column.max()
+                low, high = factor * np.nanmin(column), factor * np.nanmax(column)
                 lines.append(f"  {part['name']}: {low:.3g} to {high:.3g} {unit}".rstrip())
         if "warning" in about:
             lines.append(f"warning: {about['warning']}")
