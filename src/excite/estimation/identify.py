@@ -57,6 +57,8 @@ _NOTHING_SEEN = (
 )
 _STARTS, _SIZE_OF_MANY_STARTS = 8, 50_000  # measured values up to which so many are tried
 _BETTER = 0.01  # part of the sum of squares that another hold of an input must gain to be told
+_FREE = 100.0  # scales of a parameter of free sign that are small for its standard error
+_SAME = 1e-6  # relative difference of sums of squares at one minimum
 _BY_CHANCE = 1e-3  # a fit with a larger p-value explains nothing
 
 
@@ -164,7 +166,7 @@ def identify(
     wrong = _wrong_structure(structure, estimator) if fit.is_successful else ()
     others = tuple(s for record in [*records, *validation] for s in _other_plant(record, plant))
     other_hold = _other_hold(plant, records, experiments, estimator, fit, linear)
-    verdict = (*others, *wrong, *verdict, *other_hold)
+    verdict = (*others, *wrong, *verdict, *other_hold, *_agreement(fit))
     names, d = names_of(plant.definition.parameters), plant.description
     sd = np.where(fit.free, np.sqrt(np.maximum(np.diag(covariance), 0.0)), np.nan)
     return Identification(
@@ -512,7 +514,11 @@ def _to_hold(plant: AbstractPlant, fit: _Fit, start: Params) -> tuple[int, float
     if reached is not None and fit.free[reached[0]]:
         name, value = names[reached[0]], float(fit.estimate.params[reached[0]])
         return reached[0], value, f"{name} ended at its bound {reached[1]:g} and was held there"
-    unseen = worst_seen(names, np.asarray(fit.estimate.information), fit.free)
+    # A positive parameter is searched by its logarithm, which ends nowhere if the data do not tell
+    # it from zero; one of free sign is far from that as long as the equations can be solved.
+    unit = np.array([1.0 if p.positive else _FREE for p in plant.definition.parameters])
+    information = np.asarray(fit.estimate.information) * np.outer(unit, unit)
+    unseen = worst_seen(names, information, fit.free)
     if unseen is None:
         return None
     value = float(start[unseen[0]])
@@ -659,6 +665,15 @@ def _other_hold(
         f"with {name} {word} between samples the sum of squared residuals would be "
         f"{100 * (1 - costs[best] / own):.2g} % smaller (--hold-input {name}={word})",
     )
+
+
+def _agreement(fit: _Fit) -> tuple[str, ...]:
+    """A sentence on how many of several starts ended at the estimate."""
+    costs = np.asarray(fit.estimate.costs)
+    if not fit.is_successful or costs.size <= 1:
+        return ()
+    same = np.sum(costs <= (1 + _SAME) * np.min(costs))
+    return (f"{same} of {costs.size} starts of the search ended at this estimate",)
 
 
 def _require_explanation(

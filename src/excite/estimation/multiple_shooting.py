@@ -364,7 +364,7 @@ class MultipleShooting:
             return -jax.scipy.linalg.solve_triangular(R[:p, :p], R[:p, p])
 
         def longer(found: tuple[Array, Array]) -> tuple[Array, Array]:
-            damping = jnp.maximum(10 * found[0], 1e-9 * scale)
+            damping = jnp.maximum(10 * found[0], _EPS * scale)
             return damping, damped(damping)
 
         _, dz = jax.lax.while_loop(
@@ -476,7 +476,9 @@ class MultipleShooting:
         k, p = n if self.first_is_free else 0, width - n - 1
 
         def damped(rows: Array, count: int) -> Array:
-            extra = jnp.sqrt(damping) * jnp.eye(count, rows.shape[-1])
+            squares = jnp.sum(rows[:, :count] ** 2, axis=0)
+            least = _EPS**2 * jnp.sum(triangle[..., :-1] ** 2) + _TINY
+            extra = jnp.eye(count, rows.shape[-1]) * jnp.sqrt(damping * squares + least)[:, None]
             return jnp.linalg.qr(jnp.concatenate([rows, extra]), mode="r")
 
         R = jax.vmap(lambda own: damped(own, k))(triangle) if k else triangle
@@ -494,14 +496,13 @@ class MultipleShooting:
         self, moves: Array, triangle: Array, damping: Array
     ) -> tuple[Float[Array, ""], Point, Float[Array, "experiment unknown"]]:
         """A step with the damping raised until no search coordinate changes too much."""
-        scale = jnp.sum(triangle[..., :-1] ** 2)
 
         def is_too_long(found: tuple) -> Array:
             damping, change, _ = found
-            return (jnp.max(jnp.abs(change.z) / self.largest) > 1) & (damping < _MOST * scale)
+            return (jnp.max(jnp.abs(change.z) / self.largest) > 1) & (damping < _MOST)
 
         def shorter(found: tuple) -> tuple:
-            damping = jnp.maximum(10 * found[0], 1e-9 * scale)
+            damping = 10 * found[0]
             return damping, *self.newton_step(moves, triangle, damping)
 
         first = damping, *self.newton_step(moves, triangle, damping)
@@ -539,7 +540,7 @@ class MultipleShooting:
             growth = jnp.where(gained > _GOOD * hoped, _GROWTH, 1.0)
             radius = jnp.clip(s.radius * jnp.where(accepted, growth, _SHRINKING), 1e-9, 1e9)
             part = jnp.where(accepted, jnp.minimum(2 * s.part, 1.0), 0.5 * s.part)
-            damping = cost / radius + _EPS**2 * jnp.sum(triangle**2) + _TINY
+            damping = 1 / radius
             damping, change, outputs = self.limited_step(sweep.moves, triangle, damping)
             reached = jnp.sum((triangle[..., -1] + outputs) ** 2)
             least = jnp.maximum(tolerance**2 * cost / count, rounding**2)

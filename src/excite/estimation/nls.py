@@ -264,7 +264,10 @@ class _Problem(eqx.Module):
         H, V = jnp.sum(each, axis=0), jnp.einsum("o,opq->pq", ratio[0, :, 0, 0] ** 2, each)
         held = jnp.diag(jnp.where(self.free, 0.0, 1.0))
         active = jnp.outer(self.free, self.free)
-        inverse = jnp.where(active, jnp.linalg.inv(jnp.where(active, H, 0.0) + held), 0.0)
+        # Over the columns' lengths: one parameter that hardly acts leaves the others' digits.
+        length = jnp.sqrt(jnp.where(jnp.diagonal(H) > 0, jnp.diagonal(H), 1.0))
+        cosines = jnp.where(active, H / jnp.outer(length, length), 0.0) + held
+        inverse = jnp.where(active, jnp.linalg.inv(cosines) / jnp.outer(length, length), 0.0)
         relative = inverse @ V @ inverse
         information = jnp.einsum("eokp,eokq->pq", columns / ratio, columns / ratio)
         return Estimate(
