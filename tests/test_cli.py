@@ -725,8 +725,12 @@ BAD: dict[str, tuple[str, tuple[str, ...]]] = {
     "missing sample": (IDENTIFY.format("missing.csv"), ("missing.csv", "sample 5", "'pitch'")),
     "NaN": (IDENTIFY.format("nan.csv"), ("nan.csv", "sample 5", "'pitch'", "finite")),
     "text": (IDENTIFY.format("text.csv"), ("text.csv", "sample 5", "'on'", "number")),
-    "uneven sampling": (IDENTIFY.format("uneven.csv"), ("uneven.csv", "0.13 s", "0.1 s")),
-    "samples left out": (IDENTIFY.format("gap.csv"), ("gap.csv", "missing", "0.4 s")),
+    "uneven sampling for ARX": (
+        IDENTIFY.format("uneven.csv") + " --estimator arx-rls", ("uneven.csv", "nls does not"),
+    ),
+    "samples left out for ARX": (
+        IDENTIFY.format("gap.csv") + " --estimator arx-rls", ("gap.csv", "gaps in time"),
+    ),
     "wrong unit": (IDENTIFY.format("unit.csv"), ("unit.csv", "-24 to 24", "voltage=FACTOR")),
     "too short": (IDENTIFY.format("short.csv"), ("short.csv", "8 samples", "15 or more")),
     "nothing to see": (IDENTIFY.format("rest.csv"), ("no parameter is identifiable",)),
@@ -756,7 +760,10 @@ BAD: dict[str, tuple[str, tuple[str, ...]]] = {
     "sidecar by hand": (IDENTIFY.format("hand.csv"), ("hand.json", "plant")),
     "second file bad": (IDENTIFY.format("good.csv nan.csv"), ("nan.csv", "sample 5")),
     "validation bad": (IDENTIFY.format("good.csv --validate nan.csv"), ("nan.csv", "sample 5")),
-    "two sampling times": (IDENTIFY.format("good.csv slow.csv"), ("slow.csv", "0.2 s", "0.1 s")),
+    "two sampling times for ARX": (
+        IDENTIFY.format("good.csv slow.csv") + " --estimator arx-rls",
+        ("slow.csv", "0.2 s", "0.1 s"),
+    ),
     "unknown plant": ("identify good.csv --plant aero", ("unknown plant 'aero'", "'aero2'?")),
     "unknown plant to simulate": ("simulate dcmotor", ("'dcmotor'", "'dc_motor'?")),
     "unknown plant to show": ("plants cartpole", ("'cartpole'", "'cart_pole'?")),
@@ -851,7 +858,7 @@ BAD: dict[str, tuple[str, tuple[str, ...]]] = {
     "unknown option": ("simulate aero2 --exitation chirp", ("--exitation", "--excitation")),
     "no file": ("identify --plant aero2", ("FILE",)),
     "other hold of an input": (
-        "identify good.csv --plant aero2 --hold-input cubic", ("'voltage'", "linear", "cubic"),
+        "identify good.csv --plant aero2 --hold-input cubic", ("'voltage'", "constant or linear", "'cubic'"),
     ),
     "hold of an input that is none": (
         "identify good.csv --plant aero2 --hold-input volt=linear", ("'volt'", "it has voltage"),

@@ -311,11 +311,15 @@ BAD_FILES: dict[str, tuple[str, str | bytes | Callable[[Path], None], tuple[str,
         "r.csv", text_of(table()).replace("pitch", "voltage"),
         ("twice", "voltage (column 2) or voltage (column 3)", "--column voltage=NAME"),
     ),
-    "missing sample": ("r.csv", spoiled(pitch={4: ""}), ("sample 5", "'pitch'", "is missing")),
-    "blank sample": ("r.csv", spoiled(pitch={4: "  "}), ("sample 5", "'pitch'", "is missing")),
+    "missing input": ("r.csv", spoiled(voltage={4: ""}), ("sample 5", "'voltage'", "is missing")),
+    "blank input": ("r.csv", spoiled(voltage={4: "  "}), ("sample 5", "'voltage'", "is missing")),
     "NaN": (
-        "r.csv", spoiled(pitch={2: "nan", 9: "NaN"}),
-        ("sample 3", "'pitch'", "2 of 30", "finite"),
+        "r.csv", spoiled(voltage={2: "nan", 9: "NaN"}),
+        ("sample 3", "'voltage'", "2 of 30", "finite"),
+    ),
+    "nothing measured": (
+        "r.csv", spoiled(pitch=dict.fromkeys(range(30), "")),
+        ("'pitch' has no measurement in 30 samples",),
     ),
     "infinity": ("r.csv", spoiled(voltage={0: "-inf"}), ("sample 1", "'voltage'", "finite")),
     "NaN in time": ("r.csv", spoiled(time={7: "nan"}), ("sample 8", "'time'", "finite")),
@@ -359,7 +363,7 @@ BAD_FILES: dict[str, tuple[str, str | bytes | Callable[[Path], None], tuple[str,
     "MAT of unequal columns": (
         "r.mat", mat_of(pitch=np.zeros(7)), ("'pitch' has 7 samples", "'time' 30"),
     ),
-    "MAT with NaN": ("r.mat", mat_of(pitch=np.full(30, np.nan)), ("30 of 30", "finite")),
+    "MAT with NaN": ("r.mat", mat_of(pitch=np.full(30, np.nan)), ("no measurement",)),
     "wrong ending": ("r.toml", text_of(table()), (".csv, .txt", "or .parquet")),
     "no ending": ("record", text_of(table()), (".csv, .txt", "or .parquet")),
 }  # fmt: skip
@@ -475,9 +479,16 @@ def test_a_missing_sample_of_an_even_record_is_a_gap_and_a_slow_sensor_has_none(
     (tmp_path / "r.csv").write_text(gap(slice(10, 12)))
     record = read_record(tmp_path / "r.csv", AERO2)
     assert unbroken(record.time) == [slice(0, 10), slice(10, 28)]
-    waits = np.cumsum([0.0, 2.5, 2.5, 5.0, 10.0, 10.0, 10.0, 20.0, 20.0, 20.0, 20.0, 40.0, 200.0])
-    assert unbroken(waits) == [slice(0, 13)]
-    assert unbroken(np.concatenate([waits, waits + 1000.0])) == [slice(0, 13), slice(13, 26)]
+    waits = np.array([0.0, 2.5, 5, 10, 15, 20, 30, 40, 50, 60, 80, 100, 120, 160, 200, 240])
+    assert unbroken(waits) == [slice(0, 16)]
+    assert unbroken(np.concatenate([waits, waits + 1000.0])) == [slice(0, 16), slice(16, 32)]
+
+
+@pytest.mark.parametrize("missing", ["", "  ", "nan"])
+def test_an_output_that_was_not_measured_is_nan(missing, tmp_path):
+    (tmp_path / "r.csv").write_text(spoiled(pitch={4: missing, 9: missing}))
+    outputs = read_record(tmp_path / "r.csv", AERO2).outputs
+    assert np.flatnonzero(np.isnan(outputs)).tolist() == [4, 9]
 
 
 # Writing is atomic

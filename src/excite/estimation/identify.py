@@ -288,7 +288,7 @@ def _require_complete(
 ) -> None:
     """Raises ValueError where an estimator in discrete time cannot use the records."""
     for record in records:
-        require_even(record, f"{estimator.name} needs")
+        require_even(record, f"{estimator.name} needs one sampling time (nls does not)")
         if not np.isfinite(record.outputs).all():
             raise ValueError(
                 f"{record.source or 'the record'} has samples without a measurement; "

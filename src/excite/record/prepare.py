@@ -38,7 +38,7 @@ def require_columns(
 def require_playable(record: Record, description: PlantDescription) -> None:
     """Raises ValueError for another plant's inputs, or beyond limits: they would be clipped."""
     require_columns(record, description, inputs_only=True)
-    require_even(record, "an input to play needs")
+    require_even(record, "an input to play needs one sampling time")
     for part, values in zip(description.inputs, record.inputs.T, strict=True):
         if values.min() < part.lower - 1e-9 or values.max() > part.upper + 1e-9:
             raise ValueError(
@@ -96,8 +96,7 @@ def require_even(record: Record, what: str) -> None:
     """Raises ValueError where a record is sampled unevenly or has gaps."""
     if len(unbroken(record.time)) > 1 or not is_even(record.time):
         raise ValueError(
-            f"{record.source or 'the record'} is sampled unevenly or has gaps in time; {what} "
-            "one sampling time"
+            f"{record.source or 'the record'} is sampled unevenly or has gaps in time; {what}"
         )
 
 

@@ -67,10 +67,12 @@ def read_record(
         inputs_only: whether the file is a designed input without outputs; the record
             then has none either.
 
+    An output may be missing in some samples, where it is NaN.
+
     Raises:
         ValueError: one sentence for anything that cannot be used: an unreadable or
-            truncated file, a missing column or sample, a value that is not finite,
-            uneven sampling, values far outside what the plant can do.
+            truncated file, a missing column or input, an infinite value, times that do not
+            increase, values far outside what the plant can do.
     """
     path, chosen = path_from("record", path), _slice_of(rows)
     description = described_in(path) if description is None else description
@@ -309,11 +311,19 @@ def _check_unit_of_time(time: np.ndarray, options: _Options, where: Path) -> Non
 
 
 def _values(cells: np.ndarray, part: Input | Output, options: _Options, where: Path) -> np.ndarray:
-    """A column in the plant's unit; ValueError where its size shows that the unit is wrong."""
+    """A column in the plant's unit; ValueError where its size shows that the unit is wrong.
+
+    An output that was not measured in a sample is NaN.
+    """
+    if isinstance(part, Output) and cells.dtype.kind == "O":
+        cells = np.array([cell if _is_there(cell) else np.nan for cell in cells], object)
     values = _numbers(cells, part.name, where) * options.factor(part.name)
-    check_finite(values, part.name, where)
+    measured = ~np.isnan(values) if isinstance(part, Output) else np.ones(len(values), bool)
+    if not measured.any():
+        raise ValueError(f"{where}: {part.name!r} has no measurement in {len(values)} samples")
+    check_finite(np.where(measured, values, 0.0), part.name, where)
     if not options.confirms(part.name):
-        check_size(values, part, where)
+        check_size(values[measured], part, where)
     return values
 
 
