@@ -858,7 +858,8 @@ BAD: dict[str, tuple[str, tuple[str, ...]]] = {
     "unknown option": ("simulate aero2 --exitation chirp", ("--exitation", "--excitation")),
     "no file": ("identify --plant aero2", ("FILE",)),
     "other hold of an input": (
-        "identify good.csv --plant aero2 --hold-input cubic", ("'voltage'", "constant or linear", "'cubic'"),
+        "identify good.csv --plant aero2 --hold-input cubic",
+        ("'voltage'", "constant or linear", "'cubic'"),
     ),
     "hold of an input that is none": (
         "identify good.csv --plant aero2 --hold-input volt=linear", ("'volt'", "it has voltage"),

@@ -1,5 +1,7 @@
 """Records as they are sampled: uneven times, gaps, missing outputs, held or linear inputs."""
 
+from typing import Any
+
 import jax
 import numpy as np
 import pytest
@@ -106,7 +108,8 @@ def test_missing_outputs_are_left_out_of_the_likelihood(missing):
         simulated = response(plant, plant.Params(*(ratio * np.array(TRUE))), inputs)
         return (simulated - record.outputs)[~chosen]
 
-    best = scipy.optimize.least_squares(residual, np.ones(3), jax.jit(jax.jacfwd(residual)))
+    slope: Any = jax.jit(jax.jacfwd(residual))
+    best = scipy.optimize.least_squares(residual, np.ones(3), slope)
     np.testing.assert_allclose(list(found.params.values()), best.x * np.array(TRUE), rtol=1e-6)
     S, count = best.jac, np.sum(~chosen)
     variance = np.sum(best.fun**2) / (count - 3)
