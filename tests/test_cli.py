@@ -156,8 +156,8 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     good = (folder / "good.csv").read_text()
     texts = {
         "column.csv": good.replace("pitch", "theta", 1),
-        "missing.csv": spoiled(good, pitch=""),
-        "nan.csv": spoiled(good, pitch="nan"),
+        "missing.csv": spoiled(good, voltage=""),
+        "nan.csv": spoiled(good, voltage="nan"),
         "text.csv": spoiled(good, voltage="on"),
         "uneven.csv": spoiled(good, time="0.43"),
         "gap.csv": "\n".join(good.splitlines()[:50] + good.splitlines()[53:]) + "\n",
@@ -722,8 +722,8 @@ BAD: dict[str, tuple[str, tuple[str, ...]]] = {
     "unknown column": (
         IDENTIFY.format("column.csv"), ("column.csv", "'pitch'", "theta", "--column pitch=NAME"),
     ),
-    "missing sample": (IDENTIFY.format("missing.csv"), ("missing.csv", "sample 5", "'pitch'")),
-    "NaN": (IDENTIFY.format("nan.csv"), ("nan.csv", "sample 5", "'pitch'", "finite")),
+    "missing sample": (IDENTIFY.format("missing.csv"), ("missing.csv", "sample 5", "'voltage'")),
+    "NaN": (IDENTIFY.format("nan.csv"), ("nan.csv", "sample 5", "'voltage'", "finite")),
     "text": (IDENTIFY.format("text.csv"), ("text.csv", "sample 5", "'on'", "number")),
     "uneven sampling for ARX": (
         IDENTIFY.format("uneven.csv") + " --estimator arx-rls", ("uneven.csv", "nls does not"),
@@ -916,7 +916,7 @@ def test_as_a_program_a_mistake_is_one_line_and_code_2(here):
     answer = excite(*IDENTIFY.format("nan.csv").split(), folder=here)
     assert answer.code == 2
     assert answer.out == ""
-    assert answer.err.startswith("excite: nan.csv: sample 5 of 'pitch' is nan")
+    assert answer.err.startswith("excite: nan.csv: sample 5 of 'voltage' is nan")
     assert answer.err.count("\n") == 1
     assert contents(here) == before
 

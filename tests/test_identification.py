@@ -460,7 +460,7 @@ def test_coloured_noise_is_said_and_widens_the_intervals(foreign):
     noise = 2e-3 * autoregressive(np.random.default_rng(4), (1, NUM_STEPS + 1), 0.9).T
     result = identify([dataclasses.replace(foreign, outputs=foreign.outputs + noise)], PLANT)
     assert result.whiteness["pitch"] < 0.01
-    assert "the residual of pitch is not white: the intervals allow for" in result.verdict[-1]
+    assert "the residual of pitch is not white: the intervals allow for" in "".join(result.verdict)
     assert_within_sd(result, TRUTH)
     ratio = {n: result.std_error[n] / usual.std_error[n] for n in TRUTH}
     size = np.std(noise) / 2e-4
@@ -584,6 +584,6 @@ def test_emps_is_identified_from_starts_that_are_30_percent_off(signs, emps_reco
     assert result.fit()["position"] >= 97.0
     for name, value in PUBLISHED_FIT.items():
         assert result.params[name] == pytest.approx(value, rel=5e-3)
-    assert "not white" in result.verdict[-1]
+    assert any("not white" in sentence for sentence in result.verdict)
     low, high = result.ci95("M")
     assert low < 95.1089 < high  # the value published with the data

@@ -192,7 +192,7 @@ def test_numbers_of_other_programs_are_read_to_twelve_digits(tmp_path: Path):
     ("# c\ntime u y\n0 1.5 -0.25\n0.1 -2 1\n0.2 0.", ("line 5", "2 values", "truncated?")),
     ("time,u,y\n0,1.5,-0.25\n0.1,-2,", ("line 3", "line break", "truncated?")),
     ("time;u;y\n0;1.5;-0.25\n0.1;-2;1;7\n0.2;1;1\n", ("line 3", "4 values", "3")),
-    ("time;u;y\n0;1.5;-0.25\n\n0.1;-2\n0.2;1;1\n", ("sample 2 of 'y' is missing",)),
+    ("time;y;u\n0;1.5;-0.25\n\n0.1;-2\n0.2;1;1\n", ("sample 2 of 'u' is missing",)),
     ("Time [s]  Input [V]\n0 1\n0.1 2\n", ("2 values", "has 4", "blanks in quotes")),
     ("time,u,y\n[s],[V],[m]\n0,1,1\n0.1,2,1\n", ("sample 1 of 'time' is '[s]'", "--rows 1:")),
     ("time,u,y\n0,1,1\n0.1,on,1\n", ("sample 2 of 'u' is 'on', not a number",)),
@@ -266,7 +266,11 @@ def test_a_file_of_very_many_lines_is_not_read(tmp_path: Path, monkeypatch: pyte
 LONG = "7" * 5000
 BAD_TEXTS: dict[str, tuple[str | bytes, dict[str, object], str]] = {
     "time backwards": ("time,u,y\n0.1,1,1\n0,1,1\n", {}, "'time' "),
-    "one time twice": ("time,u,y\n0,1,1\n0.1,1,1\n0.1,1,1\n0.2,1,1\n", {}, "samples 2 and 3"),
+    "one time twice": (
+        "time,u,y\n0,1,1\n0.1,1,1\n0.1,1,1\n0.2,1,1\n",
+        {},
+        "sample 2 is at 0.1 s, sample 3 at 0.1 s",
+    ),
     "no progress": ("time,u,y\n0,1,1\n0,1,1\n", {}, "'time' "),
     "digits in a cell": (f"time,u,y\n0,{LONG},1\n0.1,1,1\n", {}, "sample 1 of 'u' is inf"),
     "digits in a time": (f"time;u;y\n0;1;1\n{LONG};1;1\n", {}, "sample 2 of 'time' is inf"),

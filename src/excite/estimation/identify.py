@@ -49,7 +49,7 @@ from .nls import NLS
 from .result import Fitted, Identification
 
 InitialState = Literal["auto", "free", "known"]
-Hold = Literal["constant", "linear"]
+_HOLDS = "constant", "linear"  # an input between samples
 _NOTHING_SEEN = (
     "no parameter is identifiable from the data; are columns, signs and units right, and does the "
     "input move the plant beyond the noise? or did the search begin too far from the truth "
@@ -74,7 +74,7 @@ def identify(
     start: Mapping[str, float] | Params | None = None,
     hold: Mapping[str, float] | None = None,
     initial_state: InitialState = "auto",
-    hold_input: Hold | Mapping[str, Hold] = "constant",
+    hold_input: str | Mapping[str, str] = "constant",
     validate: RecordLike | Sequence[RecordLike] = (),
     columns: Mapping[str, str] | None = None,
     scales: Mapping[str, float] | None = None,
@@ -166,7 +166,7 @@ def identify(
     wrong = _wrong_structure(structure, estimator) if fit.is_successful else ()
     others = tuple(s for record in [*records, *validation] for s in _other_plant(record, plant))
     other_hold = _other_hold(plant, records, experiments, estimator, fit, linear)
-    verdict = (*others, *wrong, *verdict, *other_hold, *_agreement(fit))
+    verdict = (*others, *wrong, *_agreement(fit), *verdict, *other_hold)
     names, d = names_of(plant.definition.parameters), plant.description
     sd = np.where(fit.free, np.sqrt(np.maximum(np.diag(covariance), 0.0)), np.nan)
     return Identification(
@@ -267,7 +267,7 @@ def _other_plant(record: Record, plant: AbstractPlant) -> tuple[str, ...]:
 
 
 def _linear_inputs(
-    plant: AbstractPlant, hold_input: Hold | Mapping[str, Hold]
+    plant: AbstractPlant, hold_input: str | Mapping[str, str]
 ) -> Bool[np.ndarray, " input"]:
     """Which inputs are linear between samples; ValueError for another word or name."""
     names = names_of(plant.definition.inputs)
@@ -278,7 +278,7 @@ def _linear_inputs(
                 f"plant {plant.definition.name!r} has no input {name!r} to hold; it has "
                 f"{', '.join(names)}"
             )
-        if word not in get_args(Hold):
+        if word not in _HOLDS:
             raise ValueError(f"hold_input of {name!r} must be constant or linear: got {word!r}")
     return np.array([by_name.get(name) == "linear" for name in names])
 

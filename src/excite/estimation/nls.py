@@ -30,6 +30,7 @@ from .contract import (
 )
 from .multiple_shooting import MultipleShooting, Point, Segments
 
+_FAR = 30.0  # logarithm of a positive parameter over its nominal value
 Noise = Literal["declared", "known", "estimated"]
 
 
@@ -207,8 +208,16 @@ class _Problem(eqx.Module):
         return 1e-9 * jnp.asarray([o.scale for o in self.plant.definition.outputs])
 
     def params(self, z: Float[Array, " param"]) -> Float[Array, " param"]:
-        """Parameters at search coordinates; held ones stay at the start."""
-        return from_search(self.plant.definition, jnp.where(self.free, z, self.start))
+        """Parameters at search coordinates; held ones stay at the start.
+
+        A positive one that the data do not tell from zero, or from infinity, ends far away.
+        """
+        d = self.plant.definition
+        usual = to_search(d, self.plant.nominal)
+        most = jnp.asarray([_FAR if p.positive else jnp.inf for p in d.parameters])
+        return from_search(
+            d, jnp.where(self.free, jnp.clip(z, usual - most, usual + most), self.start)
+        )
 
     def starts_around(self, count: int) -> Float[Array, "start param"]:
         """Random search coordinates around the start, always the same: factors up to three."""
