@@ -1,4 +1,4 @@
-"""Estimators: the contract (`contract`), `ARX`, `NLS` and `Decrement`."""
+"""Estimators: the contract (`contract`), `NLS`, `PEM`, `ARX` and `Decrement`."""
 
 from .arx import ARX as ARX
 from .contract import AbstractEstimator as AbstractEstimator
@@ -9,3 +9,4 @@ from .contract import bound_reached as bound_reached
 from .contract import stack_experiments as stack_experiments
 from .decrement import Decrement as Decrement
 from .nls import NLS as NLS
+from .pem import PEM as PEM

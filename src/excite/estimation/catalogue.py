@@ -12,11 +12,13 @@ from .arx import ARX
 from .contract import AbstractEstimator
 from .decrement import Decrement
 from .nls import NLS
+from .pem import PEM
 
 ESTIMATORS: Mapping[str, AbstractEstimator] = {
     "arx-rls": ARX(),
     "arx-rls-wide": ARX(start_covariance=1e8, name="arx-rls-wide"),
     "nls": NLS(),
+    "pem": PEM(),
     "decrement": Decrement(),
 }
 

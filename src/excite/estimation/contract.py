@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..description import PlantDescription
+from ..description import PlantDescription, names_of
 from ..information import relative_size
 from ..plant import AbstractPlant, Params
 from ..simulation import response
@@ -112,6 +112,22 @@ def stack_experiments(
     )
 
 
+class Prediction(eqx.Module):
+    """One-step prediction of the outputs of a plant that is disturbed.
+
+    Attributes:
+        outputs: predicted from all earlier samples.
+        sd: of measured minus predicted outputs.
+        process_noise: diffusion of each state [state unit / sqrt(s)].
+        noise_sd: of the sensors [output unit].
+    """
+
+    outputs: Float[Array, "experiment sample output"]
+    sd: Float[Array, "experiment sample output"]
+    process_noise: Float[Array, " state"]
+    noise_sd: Float[Array, " output"]
+
+
 class Estimate(eqx.Module):
     """What an estimator returns.
 
@@ -123,9 +139,11 @@ class Estimate(eqx.Module):
             its noise.
         status: a `Status`.
         initial_state: known or estimated.
-        residual: measured minus simulated outputs, zero where padded.
+        residual: measured minus simulated outputs, or minus predicted ones where there is a
+            prediction; zero where padded.
         costs: weighted sum of squares at the end of each search, infinite where it did not
             converge; None for estimators that do not search.
+        prediction: of estimators that take the plant as disturbed.
     """
 
     params: Params
@@ -135,6 +153,7 @@ class Estimate(eqx.Module):
     initial_state: Float[Array, "experiment state"]
     residual: Float[Array, "experiment sample output"]
     costs: Float[Array, " start"] | None = None
+    prediction: Prediction | None = None
 
 
 class AbstractEstimator(eqx.Module):
@@ -162,6 +181,27 @@ class AbstractEstimator(eqx.Module):
             start: where a search begins, default the nominal parameters.
             free: False for a parameter that is held at `start`; default all free.
         """
+
+
+class AbstractSearch(AbstractEstimator):
+    """Base of estimators that search from a start, with some parameters free and others held.
+
+    They take records as they are: uneven times, missing outputs, inputs that are linear
+    between samples. `known` names the parameters that are held where the search starts.
+    """
+
+    known: eqx.AbstractVar[tuple[str, ...]]
+
+    def held(self, plant: AbstractPlant) -> tuple[bool, ...]:
+        """Which parameters of a plant are held; ValueError for a name it does not have."""
+        names = names_of(plant.definition.parameters)
+        for name in self.known:
+            if name not in names:
+                raise ValueError(
+                    f"plant {plant.definition.name!r} has no parameter {name!r} to hold; it has "
+                    f"{', '.join(names)}"
+                )
+        return tuple(name in self.known for name in names)
 
 
 def simulate_experiments(

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..description import RARE, Named, PlantDescription, names_of, wrong_type
+from ..description import HALF_95, RARE, Named, PlantDescription, names_of, wrong_type
 from ..files import json_ready
 from ..information import identifiability, worst_seen
 from ..plant import AbstractPlant, Params, floats, params_from
@@ -31,10 +31,14 @@ from ..record import (
 from .catalogue import estimator_from
 from .contract import (
     AbstractEstimator,
+    AbstractSearch,
     Estimate,
     Experiments,
+    Prediction,
     Status,
     bound_reached,
+    residual_of,
+    simulate_experiments,
     stack_experiments,
 )
 from .diagnosis import (
@@ -46,7 +50,8 @@ from .diagnosis import (
     widened,
 )
 from .nls import NLS
-from .result import Fitted, Identification
+from .pem import PEM
+from .result import Fitted, Identification, Noise, Predicted
 
 InitialState = Literal["auto", "free", "known"]
 _HOLDS = "constant", "linear"  # an input between samples
@@ -144,14 +149,14 @@ def identify(
     )
     _check_lengths(plant, [*records, *validation], known)
     linear = _linear_inputs(plant, hold_input)
-    if not isinstance(estimator, NLS):
+    if not isinstance(estimator, AbstractSearch):
         _require_complete(estimator, [*records, *validation], linear)
     plant = _sampled_as([*records, *validation], plant)
     known = known and all(len(unbroken(record.time)) == 1 for record in records)
     experiments = _experiments(plant, records, known, linear)
     fit = _fit(plant, experiments, estimator, begin)
     residual = _residuals(plant, records, experiments, estimator, fit)
-    fitted = tuple(_fitted(plant.definition, *pair) for pair in zip(records, residual, strict=True))
+    fitted = _fitted_all(plant, records, experiments, fit.estimate, residual)
     if isinstance(estimator, NLS) and not fit.has_ended_in(Status.NOT_FINITE):
         _require_explanation(records, residual, int(fit.free.sum()))
     whiteness = {
@@ -183,9 +188,10 @@ def identify(
         verdict=verdict,
         fitted=fitted,
         validation=tuple(
-            _validated(plant, record, linear, fit.estimate.params) for record in validation
+            _validated(plant, record, linear, estimator, fit.estimate) for record in validation
         ),
         initial_state_known=known,
+        noise=_noise(plant.definition, fit.estimate),
     )
 
 
@@ -235,7 +241,7 @@ def _chosen(
     """The estimator, and the start of its search."""
     method = estimator_from(estimator)
     for word, values in (("start", start), ("hold", hold)):
-        if values and not isinstance(method, NLS):
+        if values and not isinstance(method, AbstractSearch):
             raise ValueError(
                 f"{method.name} estimates all parameters at once and takes no {word} (--{word})"
             )
@@ -391,7 +397,7 @@ def _finite(values: np.ndarray) -> np.ndarray:
 def _known(plant: AbstractPlant, estimator: AbstractEstimator) -> np.ndarray:
     """Which parameters the estimator holds because they are known; ValueError where all are."""
     names = names_of(plant.definition.parameters)
-    held = estimator.held(plant) if isinstance(estimator, NLS) else (False,) * len(names)
+    held = estimator.held(plant) if isinstance(estimator, AbstractSearch) else (False,) * len(names)
     if all(held):
         raise ValueError("all parameters are held; none is left to estimate")
     return np.array(held)
@@ -452,7 +458,7 @@ def _fit_seen(
         estimate = _estimate(plant, experiments, estimator, start, free)
         fit = _Fit(estimate, free, known, reasons)
         # ARX estimates all parameters or none.
-        if not isinstance(estimator, NLS) or fit.has_ended_in(Status.NOT_FINITE):
+        if not isinstance(estimator, AbstractSearch) or fit.has_ended_in(Status.NOT_FINITE):
             return fit
         held = _to_hold(plant, fit, start)
         if held is None:
@@ -534,9 +540,9 @@ def _residuals(
     estimator: AbstractEstimator,
     fit: _Fit,
 ) -> list[Float[np.ndarray, "_sample output"]]:
-    """Measured minus simulated outputs of each record, at its length."""
+    """The residual of each record, at its length."""
     estimate = fit.estimate
-    knows_state = experiments.initial_state_known or isinstance(estimator, NLS)
+    knows_state = experiments.initial_state_known or isinstance(estimator, AbstractSearch)
     if fit.is_successful and not knows_state:  # ARX does not estimate the state
         estimate = _with_initial_state(plant, experiments, estimate.params)
     return _by_record(records, np.asarray(estimate.residual))
@@ -584,13 +590,87 @@ def _confidence(
     return covariance, (*fit.reasons, seen, *remarks)
 
 
-def _fitted(description: PlantDescription, record: Record, residual: np.ndarray) -> Fitted:
+def _fitted_all(
+    plant: AbstractPlant,
+    records: Sequence[Record],
+    experiments: Experiments,
+    estimate: Estimate,
+    residual: list[np.ndarray],
+) -> tuple[Fitted, ...]:
+    """The records with what the plant makes of them."""
+    predicted = _predicted(plant, records, estimate.prediction)
+    if estimate.prediction is not None:
+        residual = _by_record(records, _simulation_error(plant, experiments, estimate.params))
+    parts = zip(records, residual, predicted, strict=True)
+    return tuple(_fitted(plant.definition, *part) for part in parts)
+
+
+def _fitted(
+    description: PlantDescription,
+    record: Record,
+    residual: np.ndarray,
+    predicted: Predicted | None = None,
+) -> Fitted:
+    """A record with its simulation, of which the residual is given."""
     simulated = record.outputs - residual
-    fits = {
-        name: fit_percent(record.outputs[:, i], simulated[:, i])
+    return Fitted(record, simulated, _fits(description, record, simulated), predicted)
+
+
+def _fits(
+    description: PlantDescription, record: Record, outputs: np.ndarray
+) -> dict[str, float]:
+    """Fit of each output in percent."""
+    return {
+        name: fit_percent(record.outputs[:, i], outputs[:, i])
         for i, name in enumerate(names_of(description.outputs))
     }
-    return Fitted(record, simulated, fits)
+
+
+def _simulation_error(
+    plant: AbstractPlant, experiments: Experiments, params: Params
+) -> Float[np.ndarray, "experiment sample output"]:
+    """Measured minus simulated outputs, from the initial states that fit best unless known."""
+    if not experiments.initial_state_known:
+        return np.asarray(_with_initial_state(plant, experiments, params).residual)
+    begin, given = jax.device_put((experiments.initial_state, params))
+    return np.asarray(
+        residual_of(experiments, simulate_experiments(plant, given, experiments, begin))
+    )
+
+
+def _predicted(
+    plant: AbstractPlant, records: Sequence[Record], prediction: Prediction | None
+) -> list[Predicted | None]:
+    """The one-step predictions of each record, of estimators that have one."""
+    if prediction is None:
+        return [None] * len(records)
+    outputs = _by_record(records, np.asarray(prediction.outputs))
+    sds = _by_record(records, np.asarray(prediction.sd))
+    return [
+        Predicted(
+            values,
+            sd,
+            _fits(plant.definition, record, values),
+            dict(zip(names_of(plant.definition.outputs), _inside(record, values, sd), strict=True)),
+        )
+        for record, values, sd in zip(records, outputs, sds, strict=True)
+    ]
+
+
+def _inside(record: Record, predicted: np.ndarray, sd: np.ndarray) -> list[float]:
+    """Share of the measured values of each output inside the 95 % band [%]."""
+    error = np.abs(record.outputs - predicted)
+    return [100 * float(np.mean(e[s] <= HALF_95 * w[s])) for e, w in zip(error.T, sd.T, strict=True) for s in [np.isfinite(e)]]
+
+
+def _noise(description: PlantDescription, estimate: Estimate) -> Noise | None:
+    """Estimated noise by name, of estimators that have one."""
+    p = estimate.prediction
+    if p is None:
+        return None
+    of_states = zip(names_of(description.states), map(float, p.process_noise), strict=True)
+    of_outputs = zip(names_of(description.outputs), map(float, p.noise_sd), strict=True)
+    return Noise(dict(of_states), dict(of_outputs))
 
 
 def _whiteness(residuals: list[np.ndarray], scale: float) -> float:
@@ -622,7 +702,7 @@ def _wrong_structure(
     wrong = [name for name, p in structure.items() if p < RARE]
     if not wrong:
         return ()
-    or_biased = "" if isinstance(estimator, NLS) else "; or the estimator is biased: try nls"
+    or_biased = "" if isinstance(estimator, AbstractSearch) else "; or the estimator is biased: try nls"
     return (
         f"the residual of {' and '.join(wrong)} follows the input: the structure of this plant is "
         "wrong for these data, or time, input or sensor differ from its description; the "
@@ -689,7 +769,16 @@ def _require_explanation(
         raise ValueError(_NOTHING_SEEN)
 
 
-def _validated(plant: AbstractPlant, record: Record, linear: np.ndarray, params: Params) -> Fitted:
-    """A record and its simulation; only its initial state is fitted."""
-    estimate = _with_initial_state(plant, _experiments(plant, [record], False, linear), params)
-    return _fitted(plant.definition, record, _by_record([record], np.asarray(estimate.residual))[0])
+def _validated(
+    plant: AbstractPlant,
+    record: Record,
+    linear: np.ndarray,
+    estimator: AbstractEstimator,
+    estimate: Estimate,
+) -> Fitted:
+    """A record with its simulation and prediction; only its initial state is fitted."""
+    experiments, prediction = _experiments(plant, [record], False, linear), None
+    if isinstance(estimator, PEM):
+        prediction = jax.device_get(estimator.predict(plant, experiments, jax.device_put(estimate)))
+    (residual,) = _by_record([record], _simulation_error(plant, experiments, estimate.params))
+    return _fitted(plant.definition, record, residual, *_predicted(plant, [record], prediction))

@@ -15,11 +15,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ..description import names_of
 from ..information import relative_size
 from ..plant import AbstractPlant, Params, require_double_precision
 from .contract import (
-    AbstractEstimator,
+    AbstractSearch,
     Estimate,
     Experiments,
     Status,
@@ -34,7 +33,7 @@ _FAR = 30.0  # logarithm of a positive parameter over its nominal value
 Noise = Literal["declared", "known", "estimated"]
 
 
-class NLS(AbstractEstimator):
+class NLS(AbstractSearch):
     """Output-error nonlinear least squares by multiple shooting.
 
     Attributes:
@@ -70,19 +69,8 @@ class NLS(AbstractEstimator):
         require_double_precision()
         others = ~jnp.asarray(self.held(plant))
         free = others if free is None else free & others
-        problem = _Problem(plant, experiments, plant.nominal if start is None else start, free)
+        problem = Problem(plant, experiments, plant.nominal if start is None else start, free)
         return problem.estimate(self._search(problem), self.noise == "known")
-
-    def held(self, plant: AbstractPlant) -> tuple[bool, ...]:
-        """Which parameters of a plant are held; ValueError for a name it does not have."""
-        names = names_of(plant.definition.parameters)
-        for name in self.known:
-            if name not in names:
-                raise ValueError(
-                    f"plant {plant.definition.name!r} has no parameter {name!r} to hold; it has "
-                    f"{', '.join(names)}"
-                )
-        return tuple(name in self.known for name in names)
 
     @eqx.filter_jit
     def sensitivity(
@@ -99,13 +87,13 @@ class NLS(AbstractEstimator):
         The unknowns are relative changes of the parameters, then the initial states if they
         were estimated.
         """
-        problem = _Problem(plant, experiments, estimate.params, free)
+        problem = Problem(plant, experiments, estimate.params, free)
         is_estimated = self.noise == "estimated"
         sd = problem.noise_sd(estimate.residual) if is_estimated else problem.assumed_sd
         S = problem.sensitivity(estimate.params, estimate.initial_state)
         return S / sd[None, None, :, None], estimate.residual / sd[None, None]
 
-    def _search(self, problem: _Problem) -> _Found:
+    def _search(self, problem: Problem) -> _Found:
         """The minimum."""
         experiments, plant = problem.experiments, problem.plant
         num_samples = experiments.valid.shape[1]
@@ -171,7 +159,7 @@ def _best(found: _Found) -> _Found:
     return chosen._replace(sd=found.sd[0], costs=jnp.where(found.converged, costs, jnp.inf))
 
 
-class _Problem(eqx.Module):
+class Problem(eqx.Module):
     """A plant, experiments, and which parameters are free."""
 
     plant: AbstractPlant
@@ -283,7 +271,7 @@ class _Problem(eqx.Module):
             params=params,
             covariance=relative * jnp.outer(size, size),
             information=jnp.where(active, information, 0.0),
-            status=_status(values, found.residual, relative, found.converged),
+            status=status_of_search(values, found.residual, relative, found.converged),
             initial_state=initial_state,
             residual=found.residual,
             costs=found.costs,
@@ -304,7 +292,10 @@ def _without(
     return (b - q @ (q.T @ b))[: len(a)].reshape(columns.shape)
 
 
-def _status(params: Array, residual: Array, covariance: Array, converged: Array) -> Array:
+def status_of_search(
+    params: Array, residual: Array, covariance: Array, converged: Array
+) -> Array:
+    """The status of an estimate that was searched for."""
     finite = jnp.all(jnp.isfinite(params)) & jnp.all(jnp.isfinite(residual))
     seen = jnp.all(jnp.isfinite(covariance)) & jnp.all(jnp.diagonal(covariance) >= 0)
     status = jnp.where(converged, Status.SUCCESSFUL, Status.ITERATIONS_EXHAUSTED)

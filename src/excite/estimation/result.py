@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -25,6 +25,36 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
+class Predicted:
+    """One-step prediction of a record by an estimator that takes the plant as disturbed.
+
+    Attributes:
+        outputs: predicted from all earlier samples; NaN where none was measured.
+        sd: of measured minus predicted outputs.
+        fit_percent: by output, as for the simulation.
+        inside_percent: by output, share of the measured values inside predicted ± 1.96 sd.
+    """
+
+    outputs: Float[np.ndarray, "sample output"]
+    sd: Float[np.ndarray, "sample output"]
+    fit_percent: Mapping[str, float]
+    inside_percent: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Estimated noise, by name.
+
+    Attributes:
+        process: diffusion of each state [state unit / sqrt(s)].
+        measurement: standard deviation of each output [output unit].
+    """
+
+    process: Mapping[str, float]
+    measurement: Mapping[str, float]
+
+
+@dataclass(frozen=True)
 class Fitted:
     """One record and its simulation.
 
@@ -32,11 +62,18 @@ class Fitted:
         record: the measurements.
         simulated: noise-free outputs of the estimated plant.
         fit_percent: by output, 100 (1 - |y - y_s| / |y - mean y|).
+        predicted: one step ahead, with `pem`; otherwise None.
     """
 
     record: Record
     simulated: Float[np.ndarray, "sample output"]
     fit_percent: Mapping[str, float]
+    predicted: Predicted | None = None
+
+    @property
+    def model(self) -> Float[np.ndarray, "sample output"]:
+        """Outputs that the residual is measured from: predicted ones where there are any."""
+        return self.simulated if self.predicted is None else self.predicted.outputs
 
 
 @dataclass(frozen=True, repr=False)
@@ -58,11 +95,13 @@ class Identification:
         held: parameters not estimated: not identifiable and held at their start value, or
             held at a bound that they reached.
         covariance, information: of the estimates; see `excite.estimation.Estimate`.
-        whiteness: by output, p-value of the residual being white (Ljung-Box).
+        whiteness: by output, p-value of the residual being white (Ljung-Box); with `pem` the
+            residual is the error of the one-step prediction.
         structure: by output, p-value of the residual not following past inputs.
         verdict: sentences on identifiability and on the validity of the intervals.
         fitted, validation: records and their simulation.
         initial_state_known: whether initial states were taken as known.
+        noise: estimated with `pem`; otherwise None.
     """
 
     plant: PlantDescription
@@ -79,6 +118,7 @@ class Identification:
     fitted: tuple[Fitted, ...]
     validation: tuple[Fitted, ...]
     initial_state_known: bool
+    noise: Noise | None = None
 
     @property
     def is_usable(self) -> bool:
@@ -91,15 +131,18 @@ class Identification:
         return self.params[name] - half, self.params[name] + half
 
     def fit(self) -> dict[str, float]:
-        """Fit in percent by output, over all records together."""
-        outputs = names_of(self.plant.outputs)
+        """Fit of the simulation in percent by output, over all records together."""
+        return self._fit_of([f.simulated for f in self.fitted])
+
+    def _fit_of(self, values: Sequence[np.ndarray]) -> dict[str, float]:
+        """Fit of some outputs of all records."""
+        means = [np.nanmean(f.record.outputs, axis=0) for f in self.fitted]
         measured = np.concatenate(
-            [f.record.outputs - np.nanmean(f.record.outputs, axis=0) for f in self.fitted]
+            [f.record.outputs - mean for f, mean in zip(self.fitted, means, strict=True)]
         )
-        simulated = np.concatenate(
-            [f.simulated - np.nanmean(f.record.outputs, axis=0) for f in self.fitted]
-        )
-        return {n: fit_percent(measured[:, i], simulated[:, i]) for i, n in enumerate(outputs)}
+        own = np.concatenate([v - mean for v, mean in zip(values, means, strict=True)])
+        names = names_of(self.plant.outputs)
+        return {n: fit_percent(measured[:, i], own[:, i]) for i, n in enumerate(names)}
 
     def __str__(self) -> str:
         return identification_text(self.summary())
@@ -115,7 +158,7 @@ class Identification:
         from ..report.figures import identification_figure
 
         first = self.fitted[0]
-        return identification_figure(self.plant, self.summary(), first.record, first.simulated)
+        return identification_figure(self.plant, self.summary(), first.record, first.model)
 
     def to_pandas(self) -> DataFrame:
         """One row per parameter: estimate, standard error, 95 % interval, unit.
@@ -158,7 +201,7 @@ class Identification:
             },
             "fit_percent": self.fit(),
             "validation": [
-                {"file": f.record.source, "fit_percent": dict(f.fit_percent)}
+                {"file": f.record.source, "fit_percent": dict(f.fit_percent), **_prediction(f)}
                 for f in self.validation
             ],
             "files": [f.record.source for f in self.fitted],
@@ -167,7 +210,29 @@ class Identification:
             "whiteness_p_value": dict(self.whiteness),
             "structure_p_value": dict(self.structure),
             "verdict": list(self.verdict),
+            **self._disturbance(),
         }
+
+    def _disturbance(self) -> dict[str, object]:
+        """The part of `to_dict` of an estimator that takes the plant as disturbed."""
+        if self.noise is None:
+            return {}
+        return {
+            "prediction_fit_percent": self._fit_of([f.model for f in self.fitted]),
+            "process_noise": dict(self.noise.process),
+            "measurement_noise": dict(self.noise.measurement),
+        }
+
+
+def _prediction(fitted: Fitted) -> dict[str, object]:
+    """JSON-ready data on the one-step prediction of a held-out record."""
+    p = fitted.predicted
+    if p is None:
+        return {}
+    return {
+        "prediction_fit_percent": dict(p.fit_percent),
+        "inside_band_percent": dict(p.inside_percent),
+    }
 
 
 def write_run(
@@ -187,12 +252,12 @@ def write_run(
         for i, f in enumerate(result.fitted, 1):
             ending = "" if len(result.fitted) == 1 else f"_{i}"
             write_record(folder / f"record{ending}.csv", f.record, d)
-            for name, values in (
-                ("simulated", f.simulated),
-                ("residual", f.record.outputs - f.simulated),
-            ):
-                columns = {"time": f.record.time, **dict(zip(outputs, values.T, strict=True))}
-                (folder / f"{name}{ending}.csv").write_text(csv_text(columns))
+            columns = {"simulated": f.simulated, "residual": f.record.outputs - f.model}
+            if f.predicted is not None:
+                columns |= {"predicted": f.predicted.outputs, "predicted_sd": f.predicted.sd}
+            for name, values in columns.items():
+                table = {"time": f.record.time, **dict(zip(outputs, values.T, strict=True))}
+                (folder / f"{name}{ending}.csv").write_text(csv_text(table))
         write_json(folder / "estimate.json", result.to_dict())
         write_json(
             folder / "information.json",

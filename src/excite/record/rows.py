@@ -272,10 +272,15 @@ class EstimatedParameter(Saved):
 
 
 class HeldOut(Saved):
-    """Fit of a record that was not used in the estimation, by output [%]."""
+    """Fit of a record that was not used in the estimation, by output [%].
+
+    With `pem` also that of its one-step prediction, and the share of values inside its 95 % band.
+    """
 
     file: str
     fit_percent: dict[str, Number]
+    prediction_fit_percent: dict[str, Number] = {}
+    inside_band_percent: dict[str, Number] = {}
 
 
 USABLE = ("successful", "partly identifiable")
@@ -283,7 +288,10 @@ USABLE = ("successful", "partly identifiable")
 
 
 class EstimateSummary(Saved):
-    """`estimate.json`: the result of an identification as plain data."""
+    """`estimate.json`: the result of an identification as plain data.
+
+    With `pem` there are the fit of the one-step prediction and the estimated noise.
+    """
 
     plant: str
     plant_hash: str
@@ -298,6 +306,9 @@ class EstimateSummary(Saved):
     whiteness_p_value: dict[str, Number]
     structure_p_value: dict[str, Number]
     verdict: tuple[str, ...]
+    prediction_fit_percent: dict[str, Number] = {}
+    process_noise: dict[str, Number] = {}
+    measurement_noise: dict[str, Number] = {}
 
     @classmethod
     def of(cls, data: Mapping[str, object]) -> EstimateSummary:

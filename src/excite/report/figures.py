@@ -35,7 +35,12 @@ def identification_figure(
     record: Record,
     simulated: Float[np.ndarray, "sample output"],
 ) -> matplotlib.figure.Figure:
-    """Measured against simulated outputs, residuals, and the parameters' intervals."""
+    """Measured against simulated outputs, residuals, and the parameters' intervals.
+
+    With `pem` the outputs of the plant are those of its one-step prediction.
+    """
+    fits = result.prediction_fit_percent or result.fit_percent
+    word = "predicted one step ahead" if result.prediction_fit_percent else "simulated"
     outputs = description.outputs
     figure, axes = new_figure(2 * len(outputs) + 1)
     for i, part in enumerate(outputs):
@@ -46,9 +51,9 @@ def identification_figure(
             record.time, record.outputs[:, i], simulated[:, i], residual
         )
         top.plot(time, factor * measured, color=GREY, lw=1.6, label="measured")
-        top.plot(time, factor * model, color=BLUE, lw=1, ls="--", label="simulated")
-        fit = result.fit_percent[part.name]
-        top.set(ylabel=axis_label(part), title=f"{part.name}: fit {number(fit, 4)} %")
+        top.plot(time, factor * model, color=BLUE, lw=1, ls="--", label=word)
+        fit = number(fits[part.name], 4)
+        top.set(ylabel=axis_label(part), title=f"{part.name}: fit {fit} %")
         below.plot(time, factor * residual, color=ORANGE, lw=0.8)
         below.set(ylabel=f"residual [{display_unit(part.unit)[0]}]")
     axes[-2, 0].set(xlabel="time [s]")

@@ -10,7 +10,7 @@ import textwrap
 from collections.abc import Mapping
 from typing import Any
 
-from ..record.rows import EstimateSummary
+from ..record.rows import EstimateSummary, HeldOut
 from .estimates import (
     largest_correlation,
     parameter_cells,
@@ -48,18 +48,40 @@ def _judgement(result: EstimateSummary) -> list[str]:
     if not result.is_usable:
         return list(result.verdict)
     lines = [
-        f"{name}: fit {number(percent, 4)} %, {residual_in_words(result, name)}"
-        for name, percent in result.fit_percent.items()
+        f"{name}: {_fits(result, name)}, {residual_in_words(result, name)}"
+        for name in result.fit_percent
     ]
     lines += [
-        f"{v.file}: held-out {name} fit {number(percent, 4)} %"
+        f"{v.file}: held-out {name} {_fits(v, name)}"
         for v in result.validation
-        for name, percent in v.fit_percent.items()
+        for name in v.fit_percent
     ]
+    if result.process_noise:
+        lines.append(
+            f"process noise [state unit / sqrt(s)]: {_named(result.process_noise)}; "
+            f"measurement noise: {_named(result.measurement_noise)}"
+        )
     lines += result.verdict
     if sum(not p.held for p in result.params.values()) > 1:
         lines.append(f"largest correlation: {largest_correlation(result)}")
     return lines
+
+
+def _fits(result: EstimateSummary | HeldOut, output: str) -> str:
+    """Fit of the simulation, and of the one-step prediction where there is one."""
+    simulated = f"{number(result.fit_percent[output], 4)} %"
+    if output not in result.prediction_fit_percent:
+        return f"fit {simulated}"
+    predicted = f"{number(result.prediction_fit_percent[output], 4)} %"
+    words = f"fit of the one-step prediction {predicted}, of the simulation {simulated}"
+    if isinstance(result, HeldOut):
+        inside = number(result.inside_band_percent[output], 3)
+        words += f", {inside} % of the samples inside the 95 % band of the prediction"
+    return words
+
+
+def _named(values: Mapping[str, float]) -> str:
+    return ", ".join(f"{name} {number(value)}" for name, value in values.items())
 
 
 def identification_text(result: EstimateSummary) -> str:

@@ -57,7 +57,8 @@ class Experiment(Run):
         marker: the content of `run.json`, and the folder.
         plant: as it was fitted.
         result: the content of `estimate.json`.
-        records, simulated: measurements, and the outputs of the estimated plant.
+        records, simulated: measurements, and the outputs of the estimated plant, with `pem`
+            those of its one-step prediction.
     """
 
     marker: Marker
@@ -111,7 +112,8 @@ def read_experiment(marker: Marker) -> Experiment:
     for i in range(1, count + 1):
         ending = "" if count == 1 else f"_{i}"
         records.append(record_in(folder / f"record{ending}.csv", plant))
-        names, path = names_of(plant.outputs), folder / f"simulated{ending}.csv"
+        word = "predicted" if result.prediction_fit_percent else "simulated"
+        names, path = names_of(plant.outputs), folder / f"{word}{ending}.csv"
         columns = read_columns(path, names, _ADVICE)
         with understood(path, _ADVICE):
             values = np.stack([columns[name] for name in names], axis=1)
@@ -141,6 +143,7 @@ def _truth(experiment: Experiment) -> str:
 def _figures(experiment: Experiment, name: str) -> str:
     """Signals and fit of the first records."""
     d, parts = experiment.plant, []
+    word = "predicted" if experiment.result.prediction_fit_percent else "simulated"
     pairs = list(zip(experiment.records, experiment.simulated, strict=True))
     for i, (record, simulated) in enumerate(pairs[:_MAX_RECORDS], 1):
         file = experiment.result.files[i - 1]
@@ -149,7 +152,7 @@ def _figures(experiment: Experiment, name: str) -> str:
             figure(
                 identification_figure(d, experiment.result, record, simulated),
                 f"{name}-fit{i}",
-                f"{file}: measured and simulated output, residual, and parameters.",
+                f"{file}: measured and {word} output, residual, and parameters.",
             ),
         ]
     if len(pairs) > _MAX_RECORDS:
@@ -165,16 +168,22 @@ def _residual_values(experiment: Experiment) -> list[np.ndarray]:
 def _residuals(experiment: Experiment) -> tuple[list[str], list[list[str]]]:
     """Fit and tests by output, and the fit of held-out records."""
     result, rows = experiment.result, []
+    fits = result.prediction_fit_percent or result.fit_percent
     residuals = np.concatenate(_residual_values(experiment))
     for i, part in enumerate(experiment.plant.outputs):
         unit, factor = display_unit(part.unit)
         size = f"{number(factor * float(np.sqrt(np.mean(residuals[:, i] ** 2))))} {unit}"
-        fit = f"{number(result.fit_percent[part.name], 4)} %"
+        fit = f"{number(fits[part.name], 4)} %"
         rows.append([part.name, fit, size, *residual_cells(result, part.name)])
+    simulated = "simulated, " if result.prediction_fit_percent else ""
+    others = [(result.fit_percent, "simulated")] if simulated else []
     for held_out in result.validation:
-        for output, percent in held_out.fit_percent.items():
-            label = f"{output}, held out: {held_out.file}"
-            rows.append([label, f"{number(percent, 4)} %", *"–––––"])
+        if held_out.prediction_fit_percent:
+            others.append((held_out.prediction_fit_percent, f"held out: {held_out.file}"))
+        others.append((held_out.fit_percent, f"{simulated}held out: {held_out.file}"))
+    for percents, about in others:
+        for output, percent in percents.items():
+            rows.append([f"{output}, {about}", f"{number(percent, 4)} %", *"–––––"])
     return ["output", "fit", "RMS residual", "white", "p", "follows the input", "p"], rows
 
 
