@@ -1,6 +1,5 @@
 """Prediction error: the filter against a Kalman filter in NumPy, the estimates by Monte Carlo."""
 
-from collections.abc import Callable
 from functools import cache
 from typing import Any
 
@@ -13,12 +12,15 @@ import scipy.linalg
 from experiments import record_of, spread_params
 
 from excite.description import Input, Output, Parameter, PlantDescription, State
-from excite.estimation import NLS, PEM, Estimate, Experiments, Status, stack_experiments
+from excite.estimation import NLS, PEM, Estimate, Experiments, Status
 from excite.estimation.identify import identify
 from excite.estimation.kalman import innovations
+from excite.estimation.result import Identification, write_run
 from excite.excitation import PRBS
 from excite.plant import AbstractPlant, Aero2, DCMotor
 from excite.record import Record
+from excite.report.html import report_html
+from excite.simulation import response, step
 
 
 class Tank(AbstractPlant):
@@ -56,7 +58,9 @@ class TwoTanks(AbstractPlant):
     )
 
     def derivative(self, state, input, params):
-        return jnp.stack([input[0] - params.a * state[0], params.a * state[0] - params.b * state[1]])
+        return jnp.stack(
+            [input[0] - params.a * state[0], params.a * state[0] - params.b * state[1]]
+        )
 
     def output(self, state, params):
         return jnp.stack([state[0] + state[1], state[1]])
@@ -118,3 +122,206 @@ def test_the_likelihood_is_that_of_a_kalman_filter(linear):
     )  # fmt: skip
     own = -float(found.cost) - 0.5 * np.log(2 * np.pi) * seen.sum()
     assert own == pytest.approx(expected, rel=1e-8)
+
+
+# Estimates
+
+TANK, MOTOR, AERO2 = Tank(), DCMotor(), Aero2()
+FINE = 20
+"""Steps of the simulated disturbance in one sampling time."""
+
+
+def levels(plant: AbstractPlant, length: int, hold: int = 10, seed: int = 0) -> np.ndarray:
+    """Inputs that jump between random levels."""
+    lower, upper = map(np.asarray, plant.input_limits)
+    amplitudes = [i.amplitude for i in plant.definition.inputs]
+    unit = np.random.default_rng(seed).uniform(-1, 1, (-(-length // hold), len(lower)))
+    return (lower + upper) / 2 + amplitudes * np.repeat(unit, hold, axis=0)[:length]
+
+
+@eqx.filter_jit
+def disturbed(
+    plant: AbstractPlant,
+    params: Any,
+    sigma: jax.Array,
+    inputs: jax.Array,
+    keys: jax.Array,
+) -> jax.Array:
+    """Measured outputs of many records with process noise, by small steps (Euler-Maruyama)."""
+    h = plant.dt / FINE
+
+    def one(key: jax.Array) -> jax.Array:
+        own, sensor = jax.random.split(key)
+        noise = jax.random.normal(own, (len(inputs), FINE, len(sigma)), float)
+
+        def advance(state: jax.Array, now: tuple) -> tuple[jax.Array, jax.Array]:
+            input, kicks = now
+
+            def small(x: jax.Array, kick: jax.Array) -> tuple[jax.Array, None]:
+                return step(plant, x, input, params, h) + sigma * jnp.sqrt(h) * kick, None
+
+            state, _ = jax.lax.scan(small, state, kicks)
+            return state, plant.output(state, params)
+
+        _, later = jax.lax.scan(advance, plant.initial_state, (inputs, noise))
+        outputs = jnp.concatenate([plant.output(plant.initial_state, params)[None], later])
+        return outputs + plant.sensor.noise_sd * jax.random.normal(sensor, outputs.shape, float)
+
+    return jax.vmap(one)(keys)
+
+
+def experiments_of(
+    plant: AbstractPlant, inputs: jax.Array, measured: jax.Array, known: bool
+) -> Experiments:
+    """One record as experiments, also with traced measurements."""
+    return Experiments(
+        inputs=inputs[None],
+        measured=measured[None],
+        valid=jnp.ones_like(measured[None], bool),
+        initial_state=plant.initial_state[None],
+        initial_state_known=known,
+    )
+
+
+def fitted_to_many(
+    plant: AbstractPlant, sigma: list[float], count: int, known: bool, length: int = 300
+) -> tuple[Any, Estimate]:
+    """True parameters, and the estimates from many records with other noise."""
+    true = spread_params(plant, 0.1)
+    inputs = jnp.asarray(levels(plant, length))
+    keys = jax.random.split(jax.random.key(1), count)
+    measured = disturbed(plant, true, jnp.asarray(sigma), inputs, keys)
+    pem = PEM(num_starts=1)
+
+    @eqx.filter_jit
+    def fit(plant: AbstractPlant, inputs: jax.Array, measured: jax.Array) -> Estimate:
+        return jax.vmap(lambda y: pem(plant, experiments_of(plant, inputs, y, known)))(measured)
+
+    return true, jax.device_get(fit(plant, inputs, measured))
+
+
+def coverage(true: Any, found: Estimate) -> np.ndarray:
+    """Percent of the 95 % intervals that contain the true value, by parameter."""
+    values = np.stack(found.params, axis=1)
+    sd = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
+    return 100 * np.mean(np.abs(values - np.array(true)) <= 1.96 * sd, axis=0)
+
+
+DISTURBED = {"tank": (TANK, [0.05], False), "dc_motor": (MOTOR, [20.0, 1.0], True)}
+
+
+@pytest.mark.science
+@pytest.mark.parametrize("name", DISTURBED)
+def test_the_intervals_of_disturbed_plants_hold_what_they_promise(name):
+    plant, sigma, known = DISTURBED[name]
+    true, found = fitted_to_many(plant, sigma, 300, known)
+    assert np.all(found.status == Status.SUCCESSFUL)
+    share = coverage(true, found)
+    assert np.all(np.abs(share - 95) < 3.5), share
+    noise = np.median(found.prediction.process_noise, axis=0)
+    np.testing.assert_allclose(noise, sigma, rtol=0.15)
+
+
+def test_without_disturbance_it_is_least_squares():
+    record = record_of(AERO2, PRBS(), params=spread_params(AERO2))
+    e = experiments_of(AERO2, record.inputs[:-1], record.outputs, True)
+    by_pem, by_nls = PEM(num_starts=1)(AERO2, e), NLS()(AERO2, e)
+    sd = np.sqrt(np.diagonal(by_nls.covariance))
+    away = np.abs(np.array(by_pem.params) - np.array(by_nls.params)) / sd
+    assert by_pem.status == Status.SUCCESSFUL
+    assert np.all(away < 0.1), away
+    np.testing.assert_allclose(np.sqrt(np.diagonal(by_pem.covariance)), sd, rtol=0.1)
+
+
+def test_data_without_any_noise_give_the_true_parameters():
+    true = spread_params(TANK)
+    u = jnp.asarray(levels(TANK, 200))
+    found = PEM(num_starts=1)(TANK, experiments_of(TANK, u, response(TANK, true, u), True))
+    assert found.status == Status.SUCCESSFUL
+    np.testing.assert_allclose(found.params, true, rtol=1e-6)
+
+
+# Identification
+
+TRUE = spread_params(TANK, 0.1)
+
+
+def tank_record(seed: int, length: int = 300, name: str = "r.csv") -> Record:
+    """A disturbed record from elsewhere: nothing tells how it began."""
+    inputs = levels(TANK, length, seed=seed)
+    keys = jax.random.key(seed)[None]
+    measured = disturbed(TANK, TRUE, jnp.array([0.05]), jnp.asarray(inputs), keys)[0]
+    return Record.of_episode(np.arange(length + 1.0), inputs, np.array(measured), {}, name)
+
+
+@cache
+def identified() -> Identification:
+    """A disturbed tank with a held-out record."""
+    return identify(tank_record(1), TANK, PEM(num_starts=1), validate=tank_record(2, name="v.csv"))
+
+
+def test_the_errors_of_the_prediction_are_white_and_those_of_the_simulation_larger():
+    result = identified()
+    assert result.status == "successful"
+    (fitted,) = result.fitted
+    assert fitted.predicted is not None
+    assert result.whiteness["level"] > 0.01
+    assert fitted.predicted.fit_percent["level"] > fitted.fit_percent["level"]
+    np.testing.assert_array_equal(fitted.model, fitted.predicted.outputs)
+    assert result.noise is not None
+    assert result.noise.process["level"] == pytest.approx(0.05, rel=0.3)
+    assert result.noise.measurement["level"] == pytest.approx(0.02, rel=0.5)
+    for name, true in zip(result.params, TRUE, strict=True):
+        assert abs(result.params[name] - float(true)) < 4 * result.std_error[name]
+
+
+def test_held_out_samples_lie_inside_the_band():
+    (validated,) = identified().validation
+    assert validated.predicted is not None
+    assert validated.predicted.inside_percent["level"] == pytest.approx(95, abs=4)
+    assert validated.predicted.fit_percent["level"] > validated.fit_percent["level"]
+
+
+def test_prediction_and_simulation_are_told_apart():
+    result = identified()
+    text, data = str(result), result.to_dict()
+    assert "level: fit of the one-step prediction" in text
+    assert "v.csv: held-out level fit of the one-step prediction" in text
+    assert "of the samples inside the 95 % band" in text
+    assert "process noise [state unit / sqrt(s)]: level 0.0" in text
+    (held_out,) = data["validation"]
+    assert held_out["inside_band_percent"]["level"] > 90
+    assert data["prediction_fit_percent"]["level"] > data["fit_percent"]["level"]
+    assert data["process_noise"].keys() == data["measurement_noise"].keys() == {"level"}
+
+
+def test_the_run_folder_has_the_prediction(tmp_path):
+    write_run(identified(), tmp_path / "run")
+    names = ("record", "simulated", "predicted", "predicted_sd", "residual")
+    tables = {n: np.loadtxt(tmp_path / f"run/{n}.csv", delimiter=",", skiprows=1) for n in names}
+    measured = identified().fitted[0].record.outputs[:, 0]
+    np.testing.assert_allclose(
+        tables["residual"][:, 1], measured - tables["predicted"][:, 1], atol=1e-6
+    )
+    assert "predicted one step ahead" in report_html([tmp_path / "run"])
+
+
+def test_uneven_records_with_missing_samples_and_a_known_parameter():
+    record, rng = tank_record(1), np.random.default_rng(0)
+    is_jump = np.arange(len(record.time)) % 10 == 0  # of the input
+    kept = is_jump | (rng.uniform(size=len(record.time)) < 0.8)
+    missing = rng.uniform(size=(kept.sum(), 1)) < 0.1
+    outputs = np.where(missing, np.nan, record.outputs[kept])
+    spoiled = Record(record.time[kept], record.inputs[kept], outputs, {}, "r.csv")
+    other = tank_record(2, 200)
+    result = identify(
+        [spoiled, other],
+        TANK,
+        PEM(num_starts=1),
+        hold={"loss": float(TRUE.loss)},
+        start={"area": 3.0},
+    )
+    assert result.status == "successful"
+    assert result.params["loss"] == float(TRUE.loss)
+    assert result.held == ("loss",)
+    assert abs(result.params["area"] - float(TRUE.area)) < 4 * result.std_error["area"]

@@ -616,9 +616,7 @@ def _fitted(
     return Fitted(record, simulated, _fits(description, record, simulated), predicted)
 
 
-def _fits(
-    description: PlantDescription, record: Record, outputs: np.ndarray
-) -> dict[str, float]:
+def _fits(description: PlantDescription, record: Record, outputs: np.ndarray) -> dict[str, float]:
     """Fit of each output in percent."""
     return {
         name: fit_percent(record.outputs[:, i], outputs[:, i])
@@ -660,7 +658,11 @@ def _predicted(
 def _inside(record: Record, predicted: np.ndarray, sd: np.ndarray) -> list[float]:
     """Share of the measured values of each output inside the 95 % band [%]."""
     error = np.abs(record.outputs - predicted)
-    return [100 * float(np.mean(e[s] <= HALF_95 * w[s])) for e, w in zip(error.T, sd.T, strict=True) for s in [np.isfinite(e)]]
+    return [
+        100 * float(np.mean(e[s] <= HALF_95 * w[s]))
+        for e, w in zip(error.T, sd.T, strict=True)
+        for s in [np.isfinite(e)]
+    ]
 
 
 def _noise(description: PlantDescription, estimate: Estimate) -> Noise | None:
@@ -702,7 +704,9 @@ def _wrong_structure(
     wrong = [name for name, p in structure.items() if p < RARE]
     if not wrong:
         return ()
-    or_biased = "" if isinstance(estimator, AbstractSearch) else "; or the estimator is biased: try nls"
+    or_biased = (
+        "" if isinstance(estimator, AbstractSearch) else "; or the estimator is biased: try nls"
+    )
     return (
         f"the residual of {' and '.join(wrong)} follows the input: the structure of this plant is "
         "wrong for these data, or time, input or sensor differ from its description; the "

@@ -292,9 +292,7 @@ def _without(
     return (b - q @ (q.T @ b))[: len(a)].reshape(columns.shape)
 
 
-def status_of_search(
-    params: Array, residual: Array, covariance: Array, converged: Array
-) -> Array:
+def status_of_search(params: Array, residual: Array, covariance: Array, converged: Array) -> Array:
     """The status of an estimate that was searched for."""
     finite = jnp.all(jnp.isfinite(params)) & jnp.all(jnp.isfinite(residual))
     seen = jnp.all(jnp.isfinite(covariance)) & jnp.all(jnp.diagonal(covariance) >= 0)

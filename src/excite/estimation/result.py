@@ -134,6 +134,10 @@ class Identification:
         """Fit of the simulation in percent by output, over all records together."""
         return self._fit_of([f.simulated for f in self.fitted])
 
+    def prediction_fit(self) -> dict[str, float] | None:
+        """The same of the one-step prediction, with `pem`."""
+        return None if self.noise is None else self._fit_of([f.model for f in self.fitted])
+
     def _fit_of(self, values: Sequence[np.ndarray]) -> dict[str, float]:
         """Fit of some outputs of all records."""
         means = [np.nanmean(f.record.outputs, axis=0) for f in self.fitted]
@@ -210,17 +214,9 @@ class Identification:
             "whiteness_p_value": dict(self.whiteness),
             "structure_p_value": dict(self.structure),
             "verdict": list(self.verdict),
-            **self._disturbance(),
-        }
-
-    def _disturbance(self) -> dict[str, object]:
-        """The part of `to_dict` of an estimator that takes the plant as disturbed."""
-        if self.noise is None:
-            return {}
-        return {
-            "prediction_fit_percent": self._fit_of([f.model for f in self.fitted]),
-            "process_noise": dict(self.noise.process),
-            "measurement_noise": dict(self.noise.measurement),
+            "prediction_fit_percent": self.prediction_fit(),
+            "process_noise": None if self.noise is None else dict(self.noise.process),
+            "measurement_noise": None if self.noise is None else dict(self.noise.measurement),
         }
 
 

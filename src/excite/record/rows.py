@@ -279,8 +279,8 @@ class HeldOut(Saved):
 
     file: str
     fit_percent: dict[str, Number]
-    prediction_fit_percent: dict[str, Number] = {}
-    inside_band_percent: dict[str, Number] = {}
+    prediction_fit_percent: dict[str, Number] | None = None
+    inside_band_percent: dict[str, Number] | None = None
 
 
 USABLE = ("successful", "partly identifiable")
@@ -306,9 +306,9 @@ class EstimateSummary(Saved):
     whiteness_p_value: dict[str, Number]
     structure_p_value: dict[str, Number]
     verdict: tuple[str, ...]
-    prediction_fit_percent: dict[str, Number] = {}
-    process_noise: dict[str, Number] = {}
-    measurement_noise: dict[str, Number] = {}
+    prediction_fit_percent: dict[str, Number] | None = None
+    process_noise: dict[str, Number] | None = None
+    measurement_noise: dict[str, Number] | None = None
 
     @classmethod
     def of(cls, data: Mapping[str, object]) -> EstimateSummary:

@@ -56,7 +56,7 @@ def _judgement(result: EstimateSummary) -> list[str]:
         for v in result.validation
         for name in v.fit_percent
     ]
-    if result.process_noise:
+    if result.process_noise is not None and result.measurement_noise is not None:
         lines.append(
             f"process noise [state unit / sqrt(s)]: {_named(result.process_noise)}; "
             f"measurement noise: {_named(result.measurement_noise)}"
@@ -70,11 +70,11 @@ def _judgement(result: EstimateSummary) -> list[str]:
 def _fits(result: EstimateSummary | HeldOut, output: str) -> str:
     """Fit of the simulation, and of the one-step prediction where there is one."""
     simulated = f"{number(result.fit_percent[output], 4)} %"
-    if output not in result.prediction_fit_percent:
+    if result.prediction_fit_percent is None:
         return f"fit {simulated}"
     predicted = f"{number(result.prediction_fit_percent[output], 4)} %"
     words = f"fit of the one-step prediction {predicted}, of the simulation {simulated}"
-    if isinstance(result, HeldOut):
+    if isinstance(result, HeldOut) and result.inside_band_percent is not None:
         inside = number(result.inside_band_percent[output], 3)
         words += f", {inside} % of the samples inside the 95 % band of the prediction"
     return words

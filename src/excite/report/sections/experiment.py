@@ -175,10 +175,10 @@ def _residuals(experiment: Experiment) -> tuple[list[str], list[list[str]]]:
         size = f"{number(factor * float(np.sqrt(np.mean(residuals[:, i] ** 2))))} {unit}"
         fit = f"{number(fits[part.name], 4)} %"
         rows.append([part.name, fit, size, *residual_cells(result, part.name)])
-    simulated = "simulated, " if result.prediction_fit_percent else ""
+    simulated = "simulated, " if result.prediction_fit_percent is not None else ""
     others = [(result.fit_percent, "simulated")] if simulated else []
     for held_out in result.validation:
-        if held_out.prediction_fit_percent:
+        if held_out.prediction_fit_percent is not None:
             others.append((held_out.prediction_fit_percent, f"held out: {held_out.file}"))
         others.append((held_out.fit_percent, f"{simulated}held out: {held_out.file}"))
     for percents, about in others:
