@@ -782,7 +782,8 @@ def _validated(
 ) -> Fitted:
     """A record with its simulation and prediction; only its initial state is fitted."""
     experiments, prediction = _experiments(plant, [record], False, linear), None
-    if isinstance(estimator, PEM):
-        prediction = jax.device_get(estimator.predict(plant, experiments, jax.device_put(estimate)))
+    if isinstance(estimator, PEM) and estimate.prediction is not None:
+        found = jax.device_put((estimate.params, estimate.prediction))
+        prediction = jax.device_get(estimator.predict(plant, experiments, *found))
     (residual,) = _by_record([record], _simulation_error(plant, experiments, estimate.params))
     return _fitted(plant.definition, record, residual, *_predicted(plant, [record], prediction))

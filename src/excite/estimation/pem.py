@@ -86,14 +86,18 @@ class PEM(AbstractSearch):
 
     @eqx.filter_jit
     def predict(
-        self, plant: AbstractPlant, experiments: Experiments, estimate: Estimate
+        self, plant: AbstractPlant, experiments: Experiments, params: Params, found: Prediction
     ) -> Prediction:
-        """One-step prediction of other experiments, for which only initial states are fitted."""
+        """One-step prediction of other experiments, for which only initial states are fitted.
+
+        Args:
+            found: its noise was estimated with `params`.
+        """
         held = jnp.zeros(len(plant.nominal), bool)
-        first = NLS()(plant, experiments, estimate.params, held)
-        likelihood = _Likelihood(plant, experiments, estimate.params, held, noise_is_free=False)
-        noise = jnp.append(estimate.prediction.process_noise, estimate.prediction.noise_sd)
-        begin = likelihood.at(estimate.params, noise, first.initial_state)
+        first = NLS()(plant, experiments, params, held)
+        likelihood = _Likelihood(plant, experiments, params, held, noise_is_free=False)
+        noise = jnp.append(found.process_noise, found.noise_sd)
+        begin = likelihood.at(params, noise, first.initial_state)
         found = likelihood.maximum(begin, self.tolerance, self.max_steps)
         return likelihood.prediction(found.here)
 
@@ -224,45 +228,57 @@ class _Likelihood:
 
     def _eliminated(self, triangles: Array, damping: Array) -> tuple[Array, Array]:
         """Triangles of each experiment, and of the common unknowns without the start states."""
-        k = self._num_starts
+        k, c = self._num_starts, len(self.active)
+        R = jax.vmap(lambda own: _damped(own, k, damping))(triangles) if k else triangles
+        return R, _damped(R[:, k:, k:].reshape(-1, c + 1), c, damping)
 
-        def damped(rows: Array, count: int) -> Array:
-            squares = jnp.sum(rows[:, :count] ** 2, axis=0)
-            extra = jnp.sqrt(damping * squares + jnp.where(squares > 0, 0.0, 1.0))
-            extra = jnp.eye(count, rows.shape[-1]) * extra[:, None]
-            return jnp.linalg.qr(jnp.concatenate([rows, extra]), mode="r")
-
-        R = jax.vmap(lambda own: damped(own, k))(triangles) if k else triangles
-        return R, damped(R[:, k:, k:].reshape(-1, R.shape[-1] - k), R.shape[-1] - k - 1)
-
-    def _step(self, point: _Point, triangles: Array, damping: Array) -> tuple[_Point, Array]:
-        """A damped step, and the square of its size over the standard errors."""
-        k, n = self._num_starts, len(self.noise_scales)
+    def _step(self, point: _Point, triangles: Array, damping: Array, part: Array) -> _Point:
+        """Part of a damped step."""
+        k, c = self._num_starts, len(self.active)
         R, rows = self._eliminated(triangles, damping)
-        c = rows.shape[1] - 1
-        change = -jax.scipy.linalg.solve_triangular(rows[:c, :c], rows[:c, c])
-        change = jnp.where(self.active, jnp.clip(change, -self.largest, self.largest), 0.0)
-        noise = jnp.clip(point.common[:n] + change[:n], _LEAST, _MOST)
-        change = change.at[:n].set(noise - point.common[:n])
-        starts, both = jnp.zeros_like(point.starts), jnp.append(change, 1.0)
+
+        def solved(rows: Array) -> tuple[Array, Array]:
+            change = -jax.scipy.linalg.solve_triangular(rows[:c, :c], rows[:c, c])
+            lower = jnp.where(self.is_noise, _LEAST - point.common, -jnp.inf)
+            upper = jnp.where(self.is_noise, _MOST - point.common, jnp.inf)
+            lower, upper = jnp.maximum(lower, -self.largest), jnp.minimum(upper, self.largest)
+            limited = jnp.clip(change, lower, upper)
+            return jnp.where(self.active, limited, 0.0), limited != change
+
+        # What is limited is taken as known, and the others are solved for once more.
+        change, is_limited = solved(rows)
+        known = jnp.where(is_limited, change, 0.0)
+        others = rows.at[:, :c].multiply(~is_limited).at[:, c].add(rows[:, :c] @ known)
+        change = part * (known + solved(_damped(others, c, jnp.asarray(0.0)))[0])
+        starts, both = jnp.zeros_like(point.starts), jnp.append(change, part)
         if k:
             right = jnp.einsum("ekq,q->ek", R[:, :k, k:], both)
             starts = -jax.vmap(jax.scipy.linalg.solve_triangular)(R[:, :k, :k], right)
-        size = jnp.einsum("erk,ek->er", triangles[..., :k], starts[:, :k])
-        size += jnp.einsum("erq,q->er", triangles[..., k:-1], change)
-        return _Point(change, starts), jnp.sum(size**2)
+        return _Point(change, starts)
+
+    def _along(self, triangles: Array, change: _Point) -> tuple[Array, Array]:
+        """Slope of the cost along a change, and its square over the standard errors."""
+        k = self._num_starts
+        rows = jnp.einsum("erk,ek->er", triangles[..., :k], change.starts[:, :k])
+        rows += jnp.einsum("erq,q->er", triangles[..., k:-1], change.common)
+        return jnp.sum(rows * triangles[..., -1]), jnp.sum(rows**2)
 
     def maximum(self, begin: _Point, tolerance: float, max_steps: int) -> _Search:
         """The likeliest point."""
 
         def improve(s: _Search) -> _Search:
             triangles, cost = self._reduced(s.here)
+            # The information is an expected curvature; the real one may be twice as large.
+            moved = jax.tree.map(jnp.subtract, s.here, s.best)
+            slope, expected = self._along(s.triangles, moved)
+            curvature = self._along(triangles, moved)[0] - slope
+            part = jnp.where(curvature > 0, jnp.clip(expected / curvature, 0.3, 1.0), 1.0)
             accepted = cost <= s.cost + 1e-10 * jnp.abs(cost)
             found = _where(accepted, (s.here, triangles, cost), (s.best, s.triangles, s.cost))
             best, triangles, cost = found
             damping = jnp.where(accepted, jnp.maximum(s.damping / 3, 1e-12), 5 * s.damping)
-            change, size = self._step(best, triangles, damping)
-            here = jax.tree.map(jnp.add, best, change)
+            change = self._step(best, triangles, damping, part)
+            here, size = jax.tree.map(jnp.add, best, change), self._along(triangles, change)[1]
             # Where an output saturates the likelihood has edges, and even small steps gain nothing.
             settled = (size <= tolerance**2) & (~accepted | (damping <= 1))
             return _Search(here, best, triangles, cost, damping, s.steps + 1, settled)
@@ -320,6 +336,14 @@ class _Likelihood:
             residual=residual,
             prediction=prediction,
         )
+
+
+def _damped(rows: Array, count: int, damping: Array) -> Array:
+    """Rows with the first columns damped as by Marquardt, as a triangle."""
+    squares = jnp.sum(rows[:, :count] ** 2, axis=0)
+    extra = jnp.sqrt(damping * squares + jnp.where(squares > 0, 0.0, 1.0))
+    extra = jnp.eye(count, rows.shape[-1]) * extra[:, None]
+    return jnp.linalg.qr(jnp.concatenate([rows, extra]), mode="r")
 
 
 def _where(condition: Array, new: Tree, old: Tree) -> Tree:
