@@ -248,7 +248,7 @@ class _Likelihood:
         # What is limited is taken as known, and the others are solved for once more.
         change, is_limited = solved(rows)
         known = jnp.where(is_limited, change, 0.0)
-        others = rows.at[:, :c].multiply(~is_limited).at[:, c].add(rows[:, :c] @ known)
+        others = rows.at[:, :c].multiply(~is_limited[None]).at[:, c].add(rows[:, :c] @ known)
         change = part * (known + solved(_damped(others, c, jnp.asarray(0.0)))[0])
         starts, both = jnp.zeros_like(point.starts), jnp.append(change, part)
         if k:
