@@ -167,7 +167,8 @@ def disturbed(
 
         _, later = jax.lax.scan(advance, plant.initial_state, (inputs, noise))
         outputs = jnp.concatenate([plant.output(plant.initial_state, params)[None], later])
-        return outputs + plant.sensor.noise_sd * jax.random.normal(sensor, outputs.shape, float)
+        noise_sd = plant.sensor.noise_sd[None]
+        return outputs + noise_sd * jax.random.normal(sensor, outputs.shape, float)
 
     return jax.vmap(one)(keys)
 
