@@ -93,7 +93,7 @@ def identify(
         0.0125
 
     Args:
-        records: a record or the path of an experiment file, or several, with one sampling time.
+        records: a record or the path of an experiment file, or several.
         plant: a name, `path/to/file.py:ClassName`, a plant or its class; its constants and
             sensor are taken as known, its dt is replaced by that of the records. Default the
             plant that the first record's sidecar names.
@@ -113,9 +113,8 @@ def identify(
         rows: rows of the files to use, counted from 0: slice(100, 1000, 5) or "100:1000:5".
 
     Raises:
-        ValueError: for records too short, of different sampling times, or in which no
-            parameter can be identified, for a file that cannot be used, and for a name or a
-            value that is not allowed.
+        ValueError: for records too short, or in which no parameter can be identified, for a
+            file that cannot be used, and for a name or a value that is not allowed.
         TypeError: for an argument of another type.
     """
     given = _listed(records, "records")

@@ -239,7 +239,9 @@ def _given(option: str, values: Mapping[str, object]) -> list[str]:
 
 def _first(data: Experiments, count: int) -> Experiments:
     """The experiment after some samples, padded so that nothing is compiled again."""
-    return dataclasses.replace(data, valid=jnp.arange(data.valid.shape[1])[None] < count)
+    return dataclasses.replace(
+        data, valid=data.valid & (jnp.arange(data.valid.shape[1])[None, :, None] < count)
+    )
 
 
 def _outcome(
