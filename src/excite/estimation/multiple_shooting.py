@@ -55,9 +55,10 @@ _LIMIT = 1e3
 """Largest growth of the sum of squares in one of them."""
 _ACCEPTED, _GOOD = 0.01, 0.75  # parts of the predicted reduction that a step must reach
 _GROWTH, _SHRINKING = 10.0, 0.1  # of the radius after a good and after a refused step
+_CAREFUL = 2.0  # growth after a step was refused
 _LARGEST = {True: 1.0, False: 10.0}
 """Change in one step of the logarithm of a positive parameter, of a free one over its scale."""
-_MOST = 1e3  # largest damping over the size of the rows
+_MOST = 1e30  # largest damping over the squared length of a column
 _CLOSED = 1e-6  # a gap that is closed to first order leaves its square
 _BLOCK = 2**14
 """Samples that are simulated side by side; longer records are simulated in blocks."""
@@ -198,6 +199,7 @@ class _Search(NamedTuple):
     cost: Float[Array, ""]
     predicted: Float[Array, ""]
     radius: Float[Array, ""]
+    growth: Float[Array, ""]
     part: Float[Array, ""]
     steps: Int[Array, ""]
     converged: Bool[Array, ""]
@@ -469,20 +471,25 @@ class MultipleShooting:
         return jnp.linalg.qr(stacked, mode="r")
 
     def newton_step(
-        self, moves: Array, triangle: Array, damping: Array
+        self, moves: Array, triangle: Array, damping: Array, more: Float[Array, " param"]
     ) -> tuple[Point, Float[Array, "experiment unknown"]]:
-        """Damped Gauss-Newton step: the change of the point, and of the weighted outputs."""
+        """Damped Gauss-Newton step: the change of the point, and of the weighted outputs.
+
+        `more` is a factor of each parameter's damping.
+        """
         n, width = self.num_states, moves.shape[-1]
         k, p = n if self.first_is_free else 0, width - n - 1
 
-        def damped(rows: Array, count: int) -> Array:
+        def damped(rows: Array, factors: Array) -> Array:
+            count = len(factors)
             squares = jnp.sum(rows[:, :count] ** 2, axis=0)
             least = _EPS**2 * jnp.sum(triangle[..., :-1] ** 2) + _TINY
-            extra = jnp.eye(count, rows.shape[-1]) * jnp.sqrt(damping * squares + least)[:, None]
+            size = jnp.sqrt(damping * factors * squares + least)
+            extra = jnp.eye(count, rows.shape[-1]) * size[:, None]
             return jnp.linalg.qr(jnp.concatenate([rows, extra]), mode="r")
 
-        R = jax.vmap(lambda own: damped(own, k))(triangle) if k else triangle
-        common = damped(R[:, k:, k:].reshape(-1, p + 1), p)
+        R = jax.vmap(lambda own: damped(own, jnp.ones(k)))(triangle) if k else triangle
+        common = damped(R[:, k:, k:].reshape(-1, p + 1), more)
         dz = -jax.scipy.linalg.solve_triangular(common[:p, :p], common[:p, p])
         change = jnp.zeros((len(R), width)).at[:, n:].set(jnp.append(dz, 1.0)[None])
         if k:
@@ -494,19 +501,20 @@ class MultipleShooting:
 
     def limited_step(
         self, moves: Array, triangle: Array, damping: Array
-    ) -> tuple[Float[Array, ""], Point, Float[Array, "experiment unknown"]]:
-        """A step with the damping raised until no search coordinate changes too much."""
+    ) -> tuple[Point, Float[Array, "experiment unknown"]]:
+        """A step in which no search coordinate changes too much; one that would is damped more."""
 
         def is_too_long(found: tuple) -> Array:
-            damping, change, _ = found
-            return (jnp.max(jnp.abs(change.z) / self.largest) > 1) & (damping < _MOST)
+            more, change, _ = found
+            return (jnp.abs(change.z) > self.largest) & (damping * more < _MOST)
 
         def shorter(found: tuple) -> tuple:
-            damping = 10 * found[0]
-            return damping, *self.newton_step(moves, triangle, damping)
+            more = jnp.where(is_too_long(found), 10 * found[0], found[0])
+            return more, *self.newton_step(moves, triangle, damping, more)
 
-        first = damping, *self.newton_step(moves, triangle, damping)
-        return jax.lax.while_loop(is_too_long, shorter, first)
+        ones = jnp.ones(len(self.largest))
+        first = ones, *self.newton_step(moves, triangle, damping, ones)
+        return jax.lax.while_loop(lambda found: jnp.any(is_too_long(found)), shorter, first)[1:]
 
     def solve(
         self,
@@ -534,21 +542,24 @@ class MultipleShooting:
             cost = jnp.sum((sweep.triangles[..., -1] / sd[None, :, None]) ** 2)
             hoped, gained = s.cost - s.predicted, s.cost - cost
             is_bold = (s.steps < _BOLD) & (cost < _LIMIT * s.cost)
-            accepted = (gained >= _ACCEPTED * hoped) | is_bold | (s.steps == 0)
+            is_equal = jnp.abs(gained) <= 100 * _EPS * cost
+            accepted = (gained >= _ACCEPTED * hoped) | is_equal | is_bold | (s.steps == 0)
             best, sweep, cost = _where(accepted, (s.here, sweep, cost), (s.best, s.sweep, s.cost))
             triangle = self.weighted(sweep, sd)
-            growth = jnp.where(gained > _GOOD * hoped, _GROWTH, 1.0)
-            radius = jnp.clip(s.radius * jnp.where(accepted, growth, _SHRINKING), 1e-9, 1e9)
+            grown = jnp.where(gained > _GOOD * hoped, s.growth, 1.0)
+            radius = jnp.clip(s.radius * jnp.where(accepted, grown, _SHRINKING), 1e-9, 1e18)
+            growth = jnp.where(accepted, s.growth, _CAREFUL)
             part = jnp.where(accepted, jnp.minimum(2 * s.part, 1.0), 0.5 * s.part)
-            damping = 1 / radius
-            damping, change, outputs = self.limited_step(sweep.moves, triangle, damping)
+            change, outputs = self.limited_step(sweep.moves, triangle, 1 / radius)
             reached = jnp.sum((triangle[..., -1] + outputs) ** 2)
             least = jnp.maximum(tolerance**2 * cost / count, rounding**2)
             is_closed = jnp.max(jnp.abs(sweep.moves[..., -1])) < _CLOSED
             settled = accepted & is_closed & (jnp.sum(outputs**2) <= least)
             here = jax.tree.map(lambda at, by: at + part * by, best, change)
             predicted = cost + part * (reached - cost)
-            return _Search(here, best, sweep, cost, predicted, radius, part, s.steps + 1, settled)
+            return _Search(
+                here, best, sweep, cost, predicted, radius, growth, part, s.steps + 1, settled
+            )
 
         def goes_on(s: _Search) -> Array:
             is_sound = (s.steps == 0) | (jnp.isfinite(s.cost) & (s.part > 1e-6))
@@ -562,6 +573,7 @@ class MultipleShooting:
             cost=jnp.asarray(jnp.inf),
             predicted=jnp.asarray(0.0),
             radius=jnp.asarray(1e3),
+            growth=jnp.asarray(_GROWTH),
             part=jnp.asarray(1.0),
             steps=jnp.asarray(0),
             converged=jnp.asarray(False),

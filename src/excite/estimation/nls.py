@@ -214,10 +214,10 @@ class _Problem(eqx.Module):
         """
         d = self.plant.definition
         usual = to_search(d, self.plant.nominal)
-        most = jnp.asarray([_FAR if p.positive else jnp.inf for p in d.parameters])
-        return from_search(
-            d, jnp.where(self.free, jnp.clip(z, usual - most, usual + most), self.start)
-        )
+        positive = jnp.asarray([p.positive for p in d.parameters])
+        beyond = jax.lax.stop_gradient(z - jnp.clip(z, usual - _FAR, usual + _FAR))
+        z = z - jnp.where(positive, beyond, 0.0)  # its derivative goes on
+        return from_search(d, jnp.where(self.free, z, self.start))
 
     def starts_around(self, count: int) -> Float[Array, "start param"]:
         """Random search coordinates around the start, always the same: factors up to three."""
