@@ -82,7 +82,8 @@ def stack_experiments(
     """Experiments of any lengths side by side; each has one more output than inputs.
 
     Args:
-        dt, next_inputs: see `Experiments`.
+        dt: see `Experiments`.
+        next_inputs: see `Experiments`.
         seen: False where an output was not measured; its value is ignored.
     """
     xp = jnp if any(isinstance(rows, jax.core.Tracer) for rows in (*inputs, *measured)) else np
