@@ -75,6 +75,53 @@ def step(
     return jax.lax.scan(substep, state, jnp.arange(n), unroll=min(n, 4))[0]
 
 
+def delayed(
+    inputs: Float[Array, "time input"],
+    delay: Float[Array, " input"],
+    dt: Float[Array, " time"],
+    next_inputs: Float[Array, "time input"] | None = None,
+) -> tuple[Float[Array, "time input"], Float[Array, "time input"]]:
+    """Inputs after a delay, at the beginning and the end of each step, and linear in between.
+
+    In each step they have the mean and the first moment of the delayed input: a double
+    integrator is at its exact state at every sample. They are continuous in the delay.
+
+    Args:
+        delay: of each input [s]; zero or more.
+        dt, next_inputs: see `response`.
+    """
+    times = jnp.concatenate([jnp.zeros(1), jnp.cumsum(dt)])
+
+    def after(u: Array, u_next: Array, delay: Array) -> tuple[Array, Array]:
+        centre = jnp.mean(u)  # its integrals stay small, and keep their digits
+        u, u_next = u - centre, u_next - centre
+        slope = (u_next - u) / jnp.where(dt > 0, dt, 1.0)
+        first = _summed(dt * (u + u_next) / 2)
+        second = _summed(dt * first[:-1] + dt**2 * (u / 3 + u_next / 6))
+
+        def integrals(t: Array) -> tuple[Array, Array]:
+            """The input integrated once and twice; it is constant before the first sample."""
+            k = jnp.clip(jnp.searchsorted(times, t) - 1, 0, len(u) - 1)
+            past = t - times[k]
+            a, b, c, s = second[k], first[k], u[k], jnp.where(past > 0, slope[k], 0.0)
+            return b + past * (c + past * s / 2), a + past * (b + past * (c / 2 + past * s / 6))
+
+        once, twice = integrals(times - delay)
+        steps = jnp.where(dt > 0, dt, 1.0)
+        mean = jnp.diff(once) / steps
+        moment = (once[:-1] + once[1:]) / 2 - jnp.diff(twice) / steps
+        return centre + mean - 6 * moment / steps, centre + mean + 6 * moment / steps
+
+    return jax.vmap(after, in_axes=(1, 1, 0), out_axes=1)(
+        inputs, inputs if next_inputs is None else next_inputs, delay
+    )
+
+
+def _summed(values: Array) -> Array:
+    """Cumulative sums, beginning with zero."""
+    return jnp.concatenate([jnp.zeros(1), jnp.cumsum(values)])
+
+
 @eqx.filter_jit
 def response(
     plant: AbstractPlant,
@@ -91,6 +138,9 @@ def response(
         next_inputs: see `step`.
     """
     start = plant.initial_state if initial_state is None else initial_state
+    if (delay := plant.delay(params)) is not None:
+        dt = jnp.full(len(inputs), plant.dt) if dt is None else dt
+        inputs, next_inputs = delayed(inputs, delay, dt, next_inputs)
 
     def advance(state: Array, now: tuple) -> tuple[Array, Array]:
         input, dt, next_input = now
@@ -113,6 +163,17 @@ def measure(
     return noisy + jax.lax.stop_gradient(rounded - noisy)
 
 
+def _delayed_step(
+    past: Float[Array, "time input"], delay: Float[Array, " input"], k: Array
+) -> tuple[Array, Array]:
+    """`delayed` for step k of held inputs; the delay is in steps."""
+    whole = jnp.floor(delay).astype(int)
+    part, inputs = delay - whole, jnp.arange(past.shape[1])
+    new, old = (past[jnp.maximum(k - whole - more, 0), inputs] for more in (0, 1))
+    mean, half = new + part * (old - new), 3 * part * (1 - part) * (new - old)
+    return mean - half, mean + half
+
+
 @eqx.filter_jit
 def run_episode(
     plant: AbstractPlant,
@@ -130,16 +191,28 @@ def run_episode(
     noise_keys = jax.random.split(sensor_key, num_steps + 1)
     lower, upper = plant.input_limits
 
-    def advance(carry: tuple, noise_key: PRNGKeyArray) -> tuple[tuple, tuple]:
-        state, memory = carry
+    delay = plant.delay(params)
+
+    def moved(state: Array, past: Array, input: Array, k: Array) -> tuple[Array, Array]:
+        if delay is None:
+            return step(plant, state, input, params), past
+        past = past.at[k].set(input)
+        first, last = _delayed_step(past, delay / plant.dt, k)
+        return step(plant, state, first, params, next_input=last), past
+
+    def advance(carry: tuple, now: tuple) -> tuple[tuple, tuple]:
+        (state, past, memory), (noise_key, k) = carry, now
         output = plant.output(state, params)
         measured = measure(plant, output, noise_key)
         memory, input = excitation(memory, measured)
         input = jnp.clip(input, lower, upper)
-        return (step(plant, state, input, params), memory), (input, measured, output)
+        state, past = moved(state, past, input, k)
+        return (state, past, memory), (input, measured, output)
 
-    start = plant.initial_state, excitation.init(plant, num_steps, excitation_key)
-    (state, _), (inputs, measured, outputs) = jax.lax.scan(advance, start, noise_keys[:-1])
+    past = jnp.zeros((0 if delay is None else num_steps, len(lower)))
+    start = plant.initial_state, past, excitation.init(plant, num_steps, excitation_key)
+    steps = noise_keys[:-1], jnp.arange(num_steps)
+    (state, *_), (inputs, measured, outputs) = jax.lax.scan(advance, start, steps)
     last = plant.output(state, params)
     return Trajectory(
         time=jnp.arange(num_steps + 1) * plant.dt,

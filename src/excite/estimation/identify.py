@@ -205,7 +205,7 @@ def _plant_of(record: RecordLike) -> str:
     is_read = isinstance(record, Record)
     where = (record.source if is_read else str(record)) or "the record"
     name = (record.description if is_read else described_in(Path(record))).name
-    if name not in PLANTS:
+    if name.partition("+")[0] not in PLANTS:
         raise ValueError(
             f"{where} is of plant {name!r}, which does not come with the package: give the plant "
             "as path/to/file.py:ClassName, as an object or as a class"

@@ -26,6 +26,7 @@ techniques for O.D.E.", Progress in Scientific Computing 2, 1983).
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple, TypeVar
 
@@ -35,8 +36,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..plant import AbstractPlant
-from ..simulation import step
+from ..plant import AbstractPlant, Params
+from ..simulation import delayed, step
 from .contract import Experiments
 
 Tree = TypeVar("Tree")
@@ -65,13 +66,25 @@ _BLOCK = 2**14
 _EPS, _TINY = np.finfo(float).eps, np.finfo(float).tiny
 
 
+class Steps(NamedTuple):
+    """What acts from each sample to the next; see `Experiments`.
+
+    `change`: of inputs and next inputs with the delay of each input.
+    """
+
+    inputs: Array
+    dt: Array | None
+    next_inputs: Array | None
+    change: tuple[Array, Array] | None = None
+
+
 class Segments(eqx.Module):
     """Experiments cut into blocks of segments of one length.
 
     `valid` is False for unused samples, `is_followed` for a segment after which none are used.
     """
 
-    steps: tuple[Array, Array | None, Array | None]  # inputs, dt, next inputs
+    steps: Steps
     measured: Float[Array, "block experiment segment time output"]
     valid: Bool[Array, "block experiment segment time output"]
     is_followed: Bool[Array, "block experiment segment"]
@@ -92,7 +105,7 @@ class Segments(eqx.Module):
 
         valid = cut(experiments.valid)
         return cls(
-            jax.tree.map(cut, (experiments.inputs, experiments.dt, experiments.next_inputs)),
+            jax.tree.map(cut, Steps(experiments.inputs, experiments.dt, experiments.next_inputs)),
             cut(experiments.measured),
             valid,
             in_blocks(_next(over_segments(valid.any(axis=(3, 4)))), num_blocks),
@@ -227,22 +240,54 @@ class MultipleShooting:
         self.num_states = len(plant.definition.states)
         self.largest = jnp.asarray([_LARGEST[p.positive] for p in plant.definition.parameters])
 
+    def delayed(self, z: Array) -> Segments:
+        """The segments with the inputs of a plant that delays them."""
+        delay = self.plant.delay(self.plant.Params(*self.params_at(z)))
+        if delay is None:
+            return self.segments
+        (num_blocks, *_, length), s = self.segments.valid.shape[:4], self.segments.steps
+        dt = jnp.full(s.inputs.shape[:-1], self.plant.dt) if s.dt is None else s.dt
+        held = s.inputs if s.next_inputs is None else s.next_inputs
+
+        def joined(rows: Array) -> Array:
+            rows = over_segments(rows)
+            return rows.reshape(len(rows), -1, *rows.shape[3:])
+
+        def cut(rows: Array) -> Array:
+            return in_blocks(rows.reshape(len(rows), -1, length, *rows.shape[2:]), num_blocks)
+
+        def acting(delay: Array) -> tuple[Array, Array]:
+            arguments = joined(s.inputs), joined(dt), joined(held)
+            return jax.vmap(lambda u, dt, v: delayed(u, delay, dt, v))(*arguments)
+
+        now, change = jax.jvp(acting, (delay,), (jnp.ones_like(delay),))
+        first, last, *change = map(cut, (*now, *change))
+        steps = Steps(first, s.dt, last, tuple(change))
+        return dataclasses.replace(self.segments, steps=steps)
+
+    def advance(self, x: Array, now: Steps, params: Params, delay: Array | None = None) -> Array:
+        """State one sample later; `delay` is that of the inputs, for the derivatives."""
+        input, dt, next_input, change = now
+        if change is not None and delay is not None:
+            more = self.plant.delay(params) - delay
+            input, next_input = input + more * change[0], next_input + more * change[1]
+        return step(self.plant, x, input, params, dt, next_input)
+
     def shoot(self, z: Array, starts: Array, next_starts: Array, block: Segments) -> Shots:
         """Simulates the segments of one block."""
         n = self.num_states
+        delay = self.plant.delay(self.plant.Params(*self.params_at(z)))
 
-        def outputs_and_end(point: Array, steps: tuple) -> tuple[tuple, tuple]:
+        def outputs_and_end(point: Array, steps: Steps) -> tuple[tuple, tuple]:
             params = self.plant.Params(*self.params_at(point[n:]))
 
-            def advance(x: Array, now: tuple) -> tuple[Array, Array]:
-                input, dt, next_input = now
-                after = step(self.plant, x, input, params, dt, next_input)
-                return after, self.plant.output(x, params)
+            def advance(x: Array, now: Steps) -> tuple[Array, Array]:
+                return self.advance(x, now, params, delay), self.plant.output(x, params)
 
             end, outputs = jax.lax.scan(advance, point[:n] * self.scales, steps)
             return (found := (outputs, end / self.scales)), found
 
-        def differentiated(start: Array, steps: tuple) -> tuple:
+        def differentiated(start: Array, steps: Steps) -> tuple:
             point = jnp.concatenate([start, z])
             return jax.jacfwd(outputs_and_end, has_aux=True)(point, steps)
 
@@ -259,10 +304,11 @@ class MultipleShooting:
             end_slope=jnp.where(is_followed[..., None], end_slope, 0.0),
         )
 
-    def _blocks(self, starts: Array) -> tuple[Array, Array, Segments]:
+    def _blocks(self, point: Point) -> tuple[Array, Array, Segments]:
         """Start states, those of the next segments, and segments, by block."""
-        num_blocks = len(self.segments.valid)
-        return in_blocks(starts, num_blocks), in_blocks(_next(starts), num_blocks), self.segments
+        num_blocks, starts = len(self.segments.valid), point.starts
+        here, following = (in_blocks(x, num_blocks) for x in (starts, _next(starts)))
+        return here, following, self.delayed(point.z)
 
     def sweep(self, point: Point) -> Sweep:
         """Simulates all segments, and closes their gaps to first order."""
@@ -293,7 +339,7 @@ class MultipleShooting:
             jnp.zeros((num_experiments, num_outputs, width, width)),
         )
         (_, triangles), (moves, misfit) = jax.lax.scan(
-            simulate_block, begin, self._blocks(point.starts)
+            simulate_block, begin, self._blocks(point)
         )
         return Sweep(over_segments(moves), triangles, over_segments(misfit))
 
@@ -346,7 +392,7 @@ class MultipleShooting:
         nothing = jnp.asarray(0.0)
         begin = jnp.zeros((num_experiments, n + p + 1, n + p + 1)), nothing, nothing, 0
         (triangle, misfits, gaps, _), rows = jax.lax.scan(
-            simulate_block, begin, self._blocks(point.starts)
+            simulate_block, begin, self._blocks(point)
         )
         common = jnp.linalg.qr(triangle[:, n:, n:].reshape(-1, p + 1), mode="r")
         return Linear(over_segments(rows), common, misfits, gaps)
@@ -450,15 +496,14 @@ class MultipleShooting:
         """The start states of all segments from one simulation."""
         params = self.plant.Params(*self.params_at(start.z))
 
-        def segment(state: Array, steps: tuple) -> tuple[Array, Array]:
-            def advance(x: Array, now: tuple) -> tuple[Array, None]:
-                input, dt, next_input = now
-                return step(self.plant, x, input, params, dt, next_input), None
+        def segment(state: Array, steps: Steps) -> tuple[Array, Array]:
+            def advance(x: Array, now: Steps) -> tuple[Array, None]:
+                return self.advance(x, now, params), None
 
             end, _ = jax.lax.scan(advance, state * self.scales, steps)
             return end / self.scales, state
 
-        steps = jax.tree.map(over_segments, self.segments.steps)
+        steps = jax.tree.map(over_segments, self.delayed(start.z).steps)
         chain = jax.vmap(lambda first, steps: jax.lax.scan(segment, first, steps)[1])
         return start._replace(starts=chain(start.starts[:, 0], steps))
 
