@@ -85,6 +85,17 @@ def _lagged(
     return np.concatenate(columns, axis=1) if columns else np.zeros((len(values), 0))
 
 
+def innovations(residuals: Sequence[Float[np.ndarray, " _sample"]]) -> list[np.ndarray]:
+    """What residuals do not follow from their own past: the errors of an autoregression.
+
+    One autoregression, of order 10 at most, is fitted to all of them.
+    """
+    order = min(10, sum(r.size for r in residuals) // 20)
+    past = [_lagged(r[:, None], order) for r in residuals]
+    memory = np.linalg.lstsq(np.concatenate(past), np.concatenate(residuals), rcond=None)[0]
+    return [r - own @ memory for r, own in zip(residuals, past, strict=True)]
+
+
 def chance_of_fit(
     measured: Float[np.ndarray, " sample"], residual: Float[np.ndarray, " sample"], unknowns: int
 ) -> float:

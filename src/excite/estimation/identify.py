@@ -46,6 +46,7 @@ from .diagnosis import (
     widened,
 )
 from .nls import NLS
+from .remedies import Suspect, outliers, suspects
 from .result import Fitted, Identification
 
 InitialState = Literal["auto", "free", "known"]
@@ -56,7 +57,6 @@ _NOTHING_SEEN = (
     "(--start)?"
 )
 _STARTS, _SIZE_OF_MANY_STARTS = 8, 50_000  # measured values up to which so many are tried
-_BETTER = 0.01  # part of the sum of squares that another hold of an input must gain to be told
 _FREE = 100.0  # scales of a parameter of free sign that are small for its standard error
 _SAME = 1e-6  # relative difference of sums of squares at one minimum
 _BY_CHANCE = 1e-3  # a fit with a larger p-value explains nothing
@@ -164,8 +164,8 @@ def identify(
     covariance, verdict = _confidence(plant, experiments, estimator, fit, whiteness)
     wrong = _wrong_structure(structure, estimator) if fit.is_successful else ()
     others = tuple(s for record in [*records, *validation] for s in _other_plant(record, plant))
-    other_hold = _other_hold(plant, records, experiments, estimator, fit, linear)
-    verdict = (*others, *wrong, *_agreement(fit), *verdict, *other_hold)
+    found = _suspects(plant, records, experiments, estimator, fit, linear)
+    verdict = (*others, *wrong, *_remedies(found), *_agreement(fit), *verdict)
     names, d = names_of(plant.definition.parameters), plant.description
     sd = np.where(fit.free, np.sqrt(np.maximum(np.diag(covariance), 0.0)), np.nan)
     return Identification(
@@ -180,6 +180,7 @@ def identify(
         whiteness=whiteness,
         structure=structure,
         verdict=verdict,
+        suspects=found,
         fitted=fitted,
         validation=tuple(
             _validated(plant, record, linear, fit.estimate.params) for record in validation
@@ -629,41 +630,38 @@ def _wrong_structure(
     )
 
 
-def _other_hold(
+def _suspects(
     plant: AbstractPlant,
     records: Sequence[Record],
     experiments: Experiments,
     estimator: AbstractEstimator,
     fit: _Fit,
     linear: np.ndarray,
-) -> tuple[str, ...]:
-    """A sentence where an input that is held fits better as linear, or the other way round."""
+) -> tuple[Suspect, ...]:
+    """What the plant may leave out, where more than noise is left; not for long records."""
     if not isinstance(estimator, NLS) or not fit.is_successful:
         return ()
-    if _is_noise(plant, experiments, fit.estimate):
+    if experiments.valid.size > _SIZE_OF_MANY_STARTS:
         return ()
-    sd = np.asarray(plant.sensor.sd)
-    scale = np.where(sd > 0, sd, [o.scale for o in plant.definition.outputs])
-    estimator = dataclasses.replace(estimator, num_starts=1)
-
-    def cost(estimate: Estimate) -> float:
-        return float(np.sum((np.asarray(estimate.residual) / scale) ** 2))
-
-    def cost_with(index: int) -> float:
-        other = linear ^ (np.arange(len(linear)) == index)
-        with_other = _experiments(plant, records, experiments.initial_state_known, other, True)
-        begin, free = jax.device_put((fit.estimate.params, fit.free))
-        return cost(jax.device_get(estimator(plant, with_other, begin, free)))
-
-    costs = [cost_with(index) for index in range(len(linear))]
-    own, best = cost(fit.estimate), int(np.argmin(costs))
-    if costs[best] > (1 - _BETTER) * own:
+    residual, valid = np.asarray(fit.estimate.residual), np.asarray(experiments.valid)
+    if _is_noise(plant, experiments, fit.estimate) and outliers(residual, valid) is None:
         return ()
-    name, word = names_of(plant.definition.inputs)[best], "constant" if linear[best] else "linear"
-    return (
-        f"with {name} {word} between samples the sum of squared residuals would be "
-        f"{100 * (1 - costs[best] / own):.2g} % smaller (--hold-input {name}={word})",
-    )
+
+    def stacked(plant: AbstractPlant, linear: np.ndarray) -> Experiments:
+        return _experiments(plant, records, experiments.initial_state_known, linear, True)
+
+    plain = plant.definition.name.partition("+")[0] in PLANTS
+    word = plant.definition.name if plain else f"FILE.py:{type(plant).__name__}"
+    return suspects(plant, stacked, linear, estimator, fit.estimate.params, fit.free, word)
+
+
+def _remedies(found: Sequence[Suspect]) -> tuple[str, ...]:
+    """Sentences on the suspects, the likeliest first."""
+    if not found:
+        return ()
+    others = [f"{s.name} ({100 * s.reduction:.2g} %)" for s in found[1:4] if s.reduction > 0]
+    less = (f"less likely: {', '.join(others)}",) if others else ()
+    return (f"likely cause: {found[0].sentence}", *less)
 
 
 def _agreement(fit: _Fit) -> tuple[str, ...]:

@@ -338,9 +338,7 @@ class MultipleShooting:
             jnp.tile(first[None], (num_experiments, 1, 1)),
             jnp.zeros((num_experiments, num_outputs, width, width)),
         )
-        (_, triangles), (moves, misfit) = jax.lax.scan(
-            simulate_block, begin, self._blocks(point)
-        )
+        (_, triangles), (moves, misfit) = jax.lax.scan(simulate_block, begin, self._blocks(point))
         return Sweep(over_segments(moves), triangles, over_segments(misfit))
 
     def linearised(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,6 +18,7 @@ from ..record.rows import USABLE, EstimateSummary
 from ..record.table import data_frame
 from ..report.results import identification_html, identification_text, wrapped
 from .diagnosis import correlation, fit_percent
+from .remedies import Suspect
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -61,6 +62,7 @@ class Identification:
         whiteness: by output, p-value of the residual being white (Ljung-Box).
         structure: by output, p-value of the residual not following past inputs.
         verdict: sentences on identifiability and on the validity of the intervals.
+        suspects: what the plant may leave out, the likeliest first; see `Suspect`.
         fitted, validation: records and their simulation.
         initial_state_known: whether initial states were taken as known.
     """
@@ -76,6 +78,7 @@ class Identification:
     whiteness: Mapping[str, float]
     structure: Mapping[str, float]
     verdict: tuple[str, ...]
+    suspects: tuple[Suspect, ...]
     fitted: tuple[Fitted, ...]
     validation: tuple[Fitted, ...]
     initial_state_known: bool
@@ -167,6 +170,7 @@ class Identification:
             "whiteness_p_value": dict(self.whiteness),
             "structure_p_value": dict(self.structure),
             "verdict": list(self.verdict),
+            "suspects": [asdict(suspect) for suspect in self.suspects],
         }
 
 

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..description import Output, Parameter, PlantDescription, State, names_of, unknown
+from ..description import Parameter, PlantDescription, State, names_of, unknown
 from .contract import AbstractPlant, Params
 
 _INPUT, _VELOCITY, _OUTPUT = (
@@ -63,8 +63,14 @@ def _extensions(d: PlantDescription) -> tuple[_Extension, ...]:
 
 
 def extensions_of(plant: AbstractPlant) -> tuple[str, ...]:
-    """Names of the extensions that a plant can have."""
-    return tuple(e.name for e in _extensions(plant.definition))
+    """Names of the extensions that a plant can have, and does not have yet."""
+    kind, own = _plain_kind(plant), names_of(plant.definition.parameters)
+    return tuple(e.name for e in _extensions(kind.definition) if e.name not in own)
+
+
+def _plain_kind(plant: AbstractPlant) -> type[AbstractPlant]:
+    """The class of a plant without its extensions."""
+    return plant.plain if isinstance(plant, Extended) else type(plant)
 
 
 def extended(plant: AbstractPlant, extensions: Sequence[str]) -> AbstractPlant:
@@ -76,16 +82,14 @@ def extended(plant: AbstractPlant, extensions: Sequence[str]) -> AbstractPlant:
     Raises:
         ValueError: for an unknown name, or one that the plant has.
     """
-    kind, has = type(plant), ()
-    if isinstance(plant, Extended):
-        kind, has = plant.plain, names_of(plant.extensions)
-    possible, chosen = _extensions(kind.definition), set(has)
+    kind = _plain_kind(plant)
+    possible, chosen = _extensions(kind.definition), {*names_of(plant.definition.parameters)}
     for word in extensions:
         found = [e.name for e in possible if word in (e.kind, e.name)]
         if len(found) != 1:
             allowed = found or [e.name for e in possible]
             raise unknown(f"extension of plant {kind.definition.name!r}", word, allowed)
-        if found[0] in chosen | set(names_of(kind.definition.parameters)):
+        if found[0] in chosen:
             raise ValueError(f"plant {plant.definition.name!r} has {found[0]!r} already")
         chosen |= {found[0]}
     whole = _class_of(kind, tuple(e for e in possible if e.name in chosen))
@@ -178,7 +182,7 @@ def _class_of(kind: type[AbstractPlant], extensions: tuple[_Extension, ...]) -> 
     d, plant = kind.definition, kind()
     definition = dataclasses.replace(
         d,
-        name="+".join([d.name, *names_of(extensions)]),
+        name="+".join([d.name, *(e.name for e in extensions)]),
         states=(*d.states, *(s for e in extensions for s in _states(d, e))),
         parameters=(*d.parameters, *(_parameter(plant, e) for e in extensions)),
     )

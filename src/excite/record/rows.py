@@ -282,6 +282,19 @@ USABLE = ("successful", "partly identifiable")
 """Statuses of an identification that has estimates."""
 
 
+class FoundSuspect(Saved):
+    """What a plant may leave out; see `excite.estimation.remedies.Suspect`."""
+
+    name: str
+    value: float | None
+    std_error: Number
+    unit: str
+    reduction: Number
+    log_likelihood: Number
+    p_value: float
+    remedy: str
+
+
 class EstimateSummary(Saved):
     """`estimate.json`: the result of an identification as plain data."""
 
@@ -298,6 +311,7 @@ class EstimateSummary(Saved):
     whiteness_p_value: dict[str, Number]
     structure_p_value: dict[str, Number]
     verdict: tuple[str, ...]
+    suspects: tuple[FoundSuspect, ...] = ()
 
     @classmethod
     def of(cls, data: Mapping[str, object]) -> EstimateSummary:
