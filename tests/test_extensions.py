@@ -1,5 +1,7 @@
 """Plants with extensions: input delay, lag, offset, friction, and so on."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,19 +22,20 @@ def solved(inputs: np.ndarray, dt: np.ndarray, delay: float, linear: bool = Fals
     """Pitch of the ideal plant after the delayed input by SciPy, from switch to switch."""
     times = np.concatenate([[0.0], np.cumsum(dt)])
     edges = np.unique(np.concatenate([times, times + delay]))
-    edges = edges[edges <= times[-1] + 1e-12]
+    edges = edges[(edges > -1e-12) & (edges <= times[-1] + 1e-12)]
 
     def voltage(t: float) -> float:
         if linear:
             return float(np.interp(t - delay, times[:-1], inputs))
-        return inputs[max(int(np.searchsorted(times, t - delay, side="right")) - 1, 0)]
+        k = int(np.searchsorted(times, t - delay, side="right")) - 1
+        return inputs[min(max(k, 0), len(inputs) - 1)]
 
     def rate(t: float, x: np.ndarray, held: float | None) -> np.ndarray:
         u = voltage(t) if held is None else held
         return np.asarray(PLANT_RATE(x, np.array([u])))
 
     state, pitch = np.zeros(2), {0.0: 0.0}
-    for start, end in zip(edges[:-1], edges[1:], strict=True):
+    for start, end in itertools.pairwise(edges):
         held = None if linear else voltage((start + end) / 2)
         found = scipy.integrate.solve_ivp(
             rate, (start, end), state, "DOP853", args=(held,), rtol=1e-10, atol=1e-12
@@ -45,7 +48,7 @@ def solved(inputs: np.ndarray, dt: np.ndarray, delay: float, linear: bool = Fals
 PLANT_RATE = jax.jit(lambda x, u: PLANT.derivative(x, u, PLANT.nominal))
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.03, 0.1, 0.237])
+@pytest.mark.parametrize("delay", [-0.07, 0.0, 0.03, 0.1, 0.237])
 @pytest.mark.parametrize("uneven", [False, True], ids=["even", "uneven"])
 def test_a_delayed_input_acts_at_its_time(delay, uneven):
     rng = np.random.default_rng(1)
@@ -80,6 +83,11 @@ def test_a_delay_keeps_the_mean_and_the_first_moment_of_every_step(linear):
         straight = first[k, 0] + fine * (last[k, 0] - first[k, 0])
         assert np.mean(straight) == pytest.approx(np.mean(values), abs=2e-4)
         assert np.mean(fine * straight) == pytest.approx(np.mean(fine * values), abs=2e-4)
+
+
+def test_an_input_that_would_act_before_it_is_chosen_is_refused():
+    with pytest.raises(ValueError, match="input 'voltage' has a delay of -0.05 s; it must be zero"):
+        simulate("aero2+delay", params={"delay_voltage": -0.05})
 
 
 def test_no_delay_changes_nothing():

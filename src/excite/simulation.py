@@ -87,23 +87,26 @@ def delayed(
     integrator is at its exact state at every sample. They are continuous in the delay.
 
     Args:
-        delay: of each input [s]; zero or more.
-        dt, next_inputs: see `response`.
+        delay: of each input [s]; negative for one that acts earlier.
+        dt: time from each sample to the next [s].
+        next_inputs: see `response`.
     """
     times = jnp.concatenate([jnp.zeros(1), jnp.cumsum(dt)])
 
     def after(u: Array, u_next: Array, delay: Array) -> tuple[Array, Array]:
         centre = jnp.mean(u)  # its integrals stay small, and keep their digits
         u, u_next = u - centre, u_next - centre
-        slope = (u_next - u) / jnp.where(dt > 0, dt, 1.0)
+        slope = jnp.append((u_next - u) / jnp.where(dt > 0, dt, 1.0), 0.0)
         first = _summed(dt * (u + u_next) / 2)
         second = _summed(dt * first[:-1] + dt**2 * (u / 3 + u_next / 6))
 
+        acting = jnp.append(u, u_next[-1])
+
         def integrals(t: Array) -> tuple[Array, Array]:
-            """The input integrated once and twice; it is constant before the first sample."""
-            k = jnp.clip(jnp.searchsorted(times, t) - 1, 0, len(u) - 1)
+            """The input integrated once and twice; it is constant before and after the record."""
+            k = jnp.clip(jnp.searchsorted(times, t) - 1, 0, len(u))
             past = t - times[k]
-            a, b, c, s = second[k], first[k], u[k], jnp.where(past > 0, slope[k], 0.0)
+            a, b, c, s = second[k], first[k], acting[k], jnp.where(past > 0, slope[k], 0.0)
             return b + past * (c + past * s / 2), a + past * (b + past * (c / 2 + past * s / 6))
 
         once, twice = integrals(times - delay)
@@ -275,9 +278,9 @@ class Experiment:
         found, origin = excitation_and_origin(excitation, options or {}, chosen)
         source = excitation.source if isinstance(excitation, Record) else ""
         num_steps = experiment_length(found, source or name, steps, isinstance(excitation, Record))
-        return cls(
-            chosen, params_from(chosen, params), found, name, origin, num_steps, _checked(seed)
-        )
+        values = params_from(chosen, params)
+        _require_causal(chosen, values)
+        return cls(chosen, values, found, name, origin, num_steps, _checked(seed))
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -342,6 +345,19 @@ def experiment_length(
     if (steps or usual) > longest:
         raise ValueError(f"{name} was made for {longest} steps: got {steps}")
     return steps or usual
+
+
+def _require_causal(plant: AbstractPlant, params: Params) -> None:
+    """Raises ValueError where an input would act before it is chosen."""
+    delay = plant.delay(params)
+    for name, value in zip(
+        names_of(plant.definition.inputs), () if delay is None else delay, strict=False
+    ):
+        if value < 0:
+            raise ValueError(
+                f"input {name!r} has a delay of {float(value):g} s; it must be zero or more in a "
+                "simulation (only a recorded input can be late)"
+            )
 
 
 def _checked(seed: object) -> int | PRNGKeyArray:

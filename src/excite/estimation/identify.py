@@ -19,6 +19,7 @@ from ..files import json_ready
 from ..information import identifiability, worst_seen
 from ..plant import AbstractPlant, Params, floats, params_from
 from ..plant.catalogue import PLANTS, PlantLike, plant_from
+from ..plant.extension import plain_kind
 from ..record import (
     Record,
     described_in,
@@ -650,8 +651,10 @@ def _suspects(
     def stacked(plant: AbstractPlant, linear: np.ndarray) -> Experiments:
         return _experiments(plant, records, experiments.initial_state_known, linear, True)
 
-    plain = plant.definition.name.partition("+")[0] in PLANTS
-    word = plant.definition.name if plain else f"FILE.py:{type(plant).__name__}"
+    name, plus, extensions = plant.definition.name.partition("+")
+    word = (
+        f"{name if name in PLANTS else 'FILE.py:' + plain_kind(plant).__name__}{plus}{extensions}"
+    )
     return suspects(plant, stacked, linear, estimator, fit.estimate.params, fit.free, word)
 
 

@@ -84,7 +84,8 @@ def suspects(
     Args:
         stacked: the experiments of a plant, with some inputs linear between samples.
         linear: which inputs are.
-        params, free: estimate without suspects, and its free parameters.
+        params: estimate without suspects.
+        free: which parameters were estimated.
         plant_word: the plant on the command line.
     """
     names = [name for name in extensions_of(plant) if not name.startswith("bias_")]

@@ -165,8 +165,8 @@ class AbstractPlant(_Module):
     def delay(self, params: Params) -> Float[Array, " input"] | None:
         """Time after which each input acts [s]; None: all inputs act at once.
 
-        It may be any number from zero and depend on the parameters. Before its first sample an
-        input has its first value.
+        It may be any number and depend on the parameters; a negative one says that the input is
+        recorded late. Before its first sample an input has its first value.
         """
         return None
 

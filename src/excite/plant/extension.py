@@ -1,6 +1,7 @@
 """Extensions: effects that the equations of a plant leave out, each with one parameter.
 
-    delay_voltage, lag_voltage      the input acts later, or through a first-order lag [s]
+    delay_voltage, lag_voltage      the input acts later (negative: it is recorded late), or
+                                    through a first-order lag [s]
     offset_voltage                  is added to the input
     saturation_voltage              largest magnitude of the input
     dead_zone_voltage               magnitude up to which the input does nothing
@@ -64,11 +65,11 @@ def _extensions(d: PlantDescription) -> tuple[_Extension, ...]:
 
 def extensions_of(plant: AbstractPlant) -> tuple[str, ...]:
     """Names of the extensions that a plant can have, and does not have yet."""
-    kind, own = _plain_kind(plant), names_of(plant.definition.parameters)
+    kind, own = plain_kind(plant), names_of(plant.definition.parameters)
     return tuple(e.name for e in _extensions(kind.definition) if e.name not in own)
 
 
-def _plain_kind(plant: AbstractPlant) -> type[AbstractPlant]:
+def plain_kind(plant: AbstractPlant) -> type[AbstractPlant]:
     """The class of a plant without its extensions."""
     return plant.plain if isinstance(plant, Extended) else type(plant)
 
@@ -82,7 +83,7 @@ def extended(plant: AbstractPlant, extensions: Sequence[str]) -> AbstractPlant:
     Raises:
         ValueError: for an unknown name, or one that the plant has.
     """
-    kind = _plain_kind(plant)
+    kind = plain_kind(plant)
     possible, chosen = _extensions(kind.definition), {*names_of(plant.definition.parameters)}
     for word in extensions:
         found = [e.name for e in possible if word in (e.kind, e.name)]
@@ -209,7 +210,9 @@ def _parameter(plant: AbstractPlant, e: _Extension) -> Parameter:
             e.name, unit, nominal, scale=scale, lower=lower, positive=False, target=False
         )
 
-    if e.kind in ("delay", "lag"):
+    if e.kind == "delay":
+        return size("s", d.dt / 2, d.dt, None)
+    if e.kind == "lag":
         return size("s", d.dt / 2, d.dt)
     if e.kind in _INPUT:
         u = d.inputs[e.index]
