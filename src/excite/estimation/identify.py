@@ -40,6 +40,7 @@ from .contract import (
 from .diagnosis import (
     chance_of_fit,
     fit_percent,
+    half_95,
     input_dependence,
     ljung_box,
     robust_covariance,
@@ -56,6 +57,7 @@ _NOTHING_SEEN = (
     "(--start)?"
 )
 _STARTS, _SIZE_OF_MANY_STARTS = 8, 50_000  # measured values up to which so many are tried
+_TELLING = 50  # measured values from which the residual tells whether the search missed something
 _BETTER = 0.01  # part of the sum of squares that another hold of an input must gain to be told
 _FREE = 100.0  # scales of a parameter of free sign that are small for its standard error
 _SAME = 1e-6  # relative difference of sums of squares at one minimum
@@ -142,12 +144,14 @@ def identify(
     known = initial_state == "known" or (
         initial_state == "auto" and all(_starts_at(record, plant) for record in records)
     )
-    _check_lengths(plant, [*records, *validation], known)
+    _require_enough(plant, records, int(np.sum(~_known(plant, estimator))), known)
+    for record in validation:
+        _require_enough(plant, [record], 0, False)
     linear = _linear_inputs(plant, hold_input)
     if not isinstance(estimator, NLS):
         _require_complete(estimator, [*records, *validation], linear)
     plant = _sampled_as([*records, *validation], plant)
-    known = known and all(len(unbroken(record.time)) == 1 for record in records)
+    known = known and all(len(_parts(record)) == 1 for record in records)
     experiments = _experiments(plant, records, known, linear)
     fit = _fit(plant, experiments, estimator, begin)
     residual = _residuals(plant, records, experiments, estimator, fit)
@@ -162,19 +166,23 @@ def identify(
         name: _dependence(residual, records, i, plant.definition.outputs[i].scale)
         for i, name in enumerate(whiteness)
     }
-    covariance, verdict = _confidence(plant, experiments, estimator, fit, whiteness)
+    covariance, degrees, verdict = _confidence(plant, experiments, estimator, fit, whiteness)
     wrong = _wrong_structure(structure, estimator) if fit.is_successful else ()
     others = tuple(s for record in [*records, *validation] for s in _other_plant(record, plant))
     other_hold = _other_hold(plant, records, experiments, estimator, fit, linear)
     verdict = (*others, *wrong, *_agreement(fit), *verdict, *other_hold)
     names, d = names_of(plant.definition.parameters), plant.description
+    values = np.array([float(value) for value in fit.estimate.params])
     sd = np.where(fit.free, np.sqrt(np.maximum(np.diag(covariance), 0.0)), np.nan)
+    half = np.where(fit.free, half_95(covariance, degrees), np.nan)
+    ends = zip((values - half).tolist(), (values + half).tolist(), strict=True)
     return Identification(
         plant=d,
         estimator=estimator.name,
         status=fit.status,
-        params=Named(zip(names, map(float, fit.estimate.params), strict=True)),
-        std_error=Named(zip(names, map(float, sd), strict=True)),
+        params=Named(zip(names, values.tolist(), strict=True)),
+        std_error=Named(zip(names, sd.tolist(), strict=True)),
+        intervals=Named(zip(names, ends, strict=True)),
         held=tuple(n for n, is_free in zip(names, fit.free, strict=True) if not is_free),
         covariance=covariance,
         information=np.asarray(fit.estimate.information),
@@ -280,7 +288,7 @@ def _linear_inputs(
             )
         if word not in _HOLDS:
             raise ValueError(f"hold_input of {name!r} must be constant or linear: got {word!r}")
-    return np.array([by_name.get(name) == "linear" for name in names])
+    return np.array([by_name.get(name) == "linear" for name in names], bool)
 
 
 def _require_complete(
@@ -307,16 +315,26 @@ def _require_complete(
             )
 
 
-def _check_lengths(plant: AbstractPlant, records: Sequence[Record], known: bool) -> None:
-    d = plant.definition
-    unknowns = len(d.parameters) + (0 if known else len(d.states))
-    needed = max(10, -(-3 * unknowns // len(d.outputs)))
-    for record in records:
-        if len(record.time) < needed:
-            raise ValueError(
-                f"{record.source}: {len(record.time)} samples are too short a record; "
-                f"{needed} or more are needed for {unknowns} unknowns"
-            )
+def _require_enough(
+    plant: AbstractPlant, records: Sequence[Record], num_params: int, knows_state: bool
+) -> None:
+    """Raises ValueError where there are not more measured values than unknowns."""
+    where = " and ".join(record.source or "the record" for record in records)
+    if any(len(record.time) < 2 for record in records):
+        raise ValueError(f"{where}: a record needs at least two samples")
+    values = sum(int(np.isfinite(record.outputs).sum()) for record in records)
+    parts = sum(len(_parts(record)) for record in records)
+    states = 0 if knows_state and parts == len(records) else parts * len(plant.definition.states)
+    if values <= num_params + states:
+        raise ValueError(
+            f"{where}: {values} measured values for {num_params + states} unknowns ({num_params} "
+            f"parameters, {states} initial states); more values than unknowns are needed"
+        )
+
+
+def _parts(record: Record) -> list[slice]:
+    """Parts without a gap in time; without inputs nothing is unknown in a gap."""
+    return unbroken(record.time) if record.inputs.shape[1] else [slice(0, len(record.time))]
 
 
 def _sampled_as(records: Sequence[Record], plant: AbstractPlant) -> AbstractPlant:
@@ -330,14 +348,14 @@ def _sampled_as(records: Sequence[Record], plant: AbstractPlant) -> AbstractPlan
     sampled = plant.changed(dt=usual)
     if _are_even(records, usual):
         return sampled
-    steps = [np.diff(r.time[part]).max() for r in records for part in unbroken(r.time)]
+    steps = [np.diff(r.time[part]).max() for r in records for part in _parts(r)]
     longest = plant.changed(dt=max(steps))
     return eqx.tree_at(lambda p: p.dt, longest, sampled.dt)
 
 
 def _are_even(records: Sequence[Record], dt: float) -> bool:
     """Whether all parts of the records are sampled with this time."""
-    parts = [record.time[part] for record in records for part in unbroken(record.time)]
+    parts = [record.time[part] for record in records for part in _parts(record)]
     own = [(time[-1] - time[0]) / (time.size - 1) for time in parts]
     return all(map(is_even, parts)) and bool(np.allclose(own, dt, rtol=1e-3, atol=0))
 
@@ -353,7 +371,7 @@ def _experiments(
 
     A general form, in which no input needs to be linear, shares one compilation.
     """
-    parts = [(record, part) for record in records for part in unbroken(record.time)]
+    parts = [(record, part) for record in records for part in _parts(record)]
     inputs = [record.inputs[part] for record, part in parts]
     outputs = [record.outputs[part] for record, part in parts]
     evenly = _are_even(records, float(plant.dt))
@@ -377,7 +395,7 @@ def _by_record(
     experiments, joined = iter(values), []
     for record in records:
         own = np.full(record.outputs.shape, np.nan)
-        for part in unbroken(record.time):
+        for part in _parts(record):
             rows = part.stop - part.start
             own[part] = next(experiments)[:rows]
         joined.append(np.where(np.isfinite(record.outputs), own, np.nan))
@@ -474,15 +492,16 @@ def _estimate(
 ) -> Estimate:
     """An estimate; the search is repeated where it may have missed the best one.
 
-    Where more than noise is left, it begins at several starts; where it does not converge, it
-    has longer segments.
+    Where more than noise is left, or a short record cannot tell, it begins at several starts;
+    where it does not converge, it has longer segments.
     """
     arguments = plant, experiments, start, jax.device_put(free)
     estimate = jax.device_get(estimator(*arguments))
     if not isinstance(estimator, NLS):
         return estimate
-    is_small = experiments.valid.size <= _SIZE_OF_MANY_STARTS
-    if estimator.num_starts == 1 and is_small and not _is_noise(plant, experiments, estimate):
+    size = experiments.valid.size
+    is_in_doubt = size < _TELLING or not _is_noise(plant, experiments, estimate)
+    if estimator.num_starts == 1 and size <= _SIZE_OF_MANY_STARTS and is_in_doubt:
         estimator = dataclasses.replace(estimator, num_starts=_STARTS)
         estimate = jax.device_get(estimator(*arguments))
     num_samples = experiments.valid.shape[1]
@@ -554,13 +573,13 @@ def _confidence(
     estimator: AbstractEstimator,
     fit: _Fit,
     whiteness: Mapping[str, float],
-) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Covariance of the estimates, and the sentences of the verdict."""
-    covariance = np.asarray(fit.estimate.covariance)
+) -> tuple[np.ndarray, np.ndarray | None, tuple[str, ...]]:
+    """Covariance of the estimates, its degrees of freedom, and the sentences of the verdict."""
+    covariance, degrees = np.asarray(fit.estimate.covariance), fit.estimate.degrees
     if not fit.is_successful:
         sentence = Status(int(fit.estimate.status)).sentence
         needed = f"; {estimator.name} needs {estimator.needs}" if estimator.needs else ""
-        return covariance, (*fit.reasons, sentence + needed)
+        return covariance, degrees, (*fit.reasons, sentence + needed)
     names = names_of(plant.definition.parameters)
     parameters = zip(plant.definition.parameters, fit.estimate.params, strict=True)
     size = np.array([float(value) if p.positive else p.scale for p, value in parameters])
@@ -569,8 +588,12 @@ def _confidence(
     if coloured and isinstance(estimator, NLS):
         estimate, free = jax.device_put((fit.estimate, fit.free))
         S, residual = estimator.sensitivity(plant, experiments, estimate, free)
-        robust = robust_covariance(np.asarray(S), np.asarray(residual))
+        robust, its_degrees = robust_covariance(
+            np.asarray(S), np.asarray(residual), np.asarray(experiments.valid)
+        )
         robust = np.outer(size, size) * robust[: len(names), : len(names)]
+        is_wider = np.diag(robust) > np.diag(covariance)
+        degrees = np.where(is_wider, its_degrees[: len(names)], degrees)
         covariance = widened(covariance, robust)
         remarks = (
             "the intervals allow for coloured noise, not for an error in the plant's equations",
@@ -581,7 +604,7 @@ def _confidence(
         f"the residual of {' and '.join(coloured)} is not white: {remark}" for remark in remarks
     )
     seen = identifiability(names, covariance / np.outer(size, size), fit.free)
-    return covariance, (*fit.reasons, seen, *remarks)
+    return covariance, degrees, (*fit.reasons, seen, *remarks)
 
 
 def _fitted(description: PlantDescription, record: Record, residual: np.ndarray) -> Fitted:
@@ -641,7 +664,7 @@ def _other_hold(
     """A sentence where an input that is held fits better as linear, or the other way round."""
     if not isinstance(estimator, NLS) or not fit.is_successful:
         return ()
-    if _is_noise(plant, experiments, fit.estimate):
+    if not linear.size or _is_noise(plant, experiments, fit.estimate):
         return ()
     sd = np.asarray(plant.sensor.sd)
     scale = np.where(sd > 0, sd, [o.scale for o in plant.definition.outputs])

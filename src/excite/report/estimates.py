@@ -51,7 +51,7 @@ def residual_in_words(result: EstimateSummary, output: str) -> str:
     if follows != "–":
         word = "follows" if follows == "yes" else "does not follow"
         parts.append(f"{word} the input (p = {p_follows})")
-    return ", ".join(parts) or "residual too small to be tested"
+    return ", ".join(parts) or "residual too small or too short to be tested"
 
 
 def largest_correlation(result: EstimateSummary) -> str:
