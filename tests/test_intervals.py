@@ -7,13 +7,25 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
+from commands import excite
+from experiments import autoregressive, record_of
 from test_identification import Tank, tank_record
 
+from excite.description import Constant, Input, Output, Parameter, PlantDescription, State
 from excite.estimation import ARX, NLS
-from excite.estimation.contract import Estimate, stack_experiments
-from excite.estimation.diagnosis import half_95, input_dependence, ljung_box, student_95
+from excite.estimation.contract import Estimate, Experiments, stack_experiments
+from excite.estimation.diagnosis import (
+    effect_of_constants,
+    half_95,
+    input_dependence,
+    ljung_box,
+    robust_covariance,
+    student_95,
+    with_independent,
+)
 from excite.estimation.identify import identify
-from excite.plant import Aero2
+from excite.excitation import PRBS, Chirp
+from excite.plant import AbstractPlant, Aero2, DCMotor
 from excite.record import Record
 from excite.simulation import response, simulate
 
@@ -129,3 +141,164 @@ def test_intervals_of_eight_samples_hold_in_95_percent(is_known):
     residual = found.residual[:, 0, :, 0]
     assert not any(ljung_box(r) < 0.01 for r in residual)
     assert not any(input_dependence([r], [FLOW]) < 0.01 for r in residual)
+
+
+# Coloured noise
+
+SLOW = Tank().changed(dt=0.05)
+
+
+@pytest.mark.science
+@pytest.mark.parametrize("rho", [0.5, 0.9])
+@pytest.mark.parametrize("plant", [Aero2(), DCMotor(), SLOW], ids=["aero2", "dc_motor", "slow"])
+def test_intervals_hold_in_noise_that_remembers(plant, rho):
+    """Over 1000 records; the estimate is linear in such noise, so its sensitivities are enough."""
+    excitation = PRBS(clock=20) if plant is SLOW else Chirp()
+    record = record_of(plant, excitation, num_steps=500)
+    experiments = stack_experiments(plant, [record.inputs[:-1]], [record.outputs], True)
+    estimate = NLS()(plant, experiments)
+    S = np.asarray(NLS().sensitivity(plant, experiments, estimate)[0])
+    columns, valid = S.reshape(-1, S.shape[-1]), np.ones(S.shape[:3], bool)
+    inverse, inside = np.linalg.pinv(columns), []
+    shape = 1000, S.shape[2], S.shape[1]
+    for noise in autoregressive(np.random.default_rng(1), shape, rho).swapaxes(1, 2):
+        error = inverse @ noise.ravel()
+        residual = (noise.ravel() - columns @ error).reshape(valid.shape)
+        assert min(ljung_box(r) for r in residual[0].T) < 0.01
+        covariance, degrees = robust_covariance(S, residual, valid)
+        inside.append(np.abs(error) < half_95(covariance, degrees))
+    share = np.mean(inside, axis=0)
+    assert np.all((share > 0.93) & (share < 0.97)), share
+
+
+@pytest.mark.science
+@pytest.mark.parametrize("rho", [0.5, 0.9])
+def test_intervals_of_refitted_records_hold_in_noise_that_remembers(rho):
+    """As above, with the whole estimator on 300 records."""
+    plant = SLOW
+    record = record_of(plant, PRBS(clock=20), num_steps=500)
+    clean = np.asarray(response(plant, plant.nominal, record.inputs[:-1]))
+    noise = 0.01 * autoregressive(np.random.default_rng(2), (300, 501), rho)[..., None]
+    free = jnp.ones(2, bool)
+
+    def fit(outputs: jax.Array) -> tuple[Estimate, tuple[jax.Array, jax.Array]]:
+        experiments = stack_experiments(plant, [record.inputs[:-1]], [outputs], True)
+        estimate = NLS()(plant, experiments)
+        return estimate, NLS().sensitivity(plant, experiments, estimate, free)
+
+    found, (S, residual) = jax.device_get(jax.jit(jax.vmap(fit))(clean + noise))
+    valid = np.ones(residual[0].shape, bool)
+    half = np.array(
+        [half_95(*robust_covariance(s, r, valid)) for s, r in zip(S, residual, strict=True)]
+    )
+    values, truth = np.stack(found.params, axis=1), np.array(plant.nominal)
+    share = np.mean(np.abs(values - truth[None]) < half * values, axis=0)
+    assert np.all((share > 0.91) & (share < 0.985)), share
+
+
+def test_noise_that_remembers_has_fewer_degrees_of_freedom():
+    record = record_of(SLOW, PRBS(clock=20), num_steps=500)
+    usual = identify(record, SLOW)
+    noise = 0.01 * autoregressive(np.random.default_rng(3), (1, 501), 0.9).T
+    result = identify(dataclasses.replace(record, outputs=record.outputs + noise), SLOW)
+    for name in ("area", "leak"):
+        factors = [(r.ci95(name)[1] - r.params[name]) / r.std_error[name] for r in (usual, result)]
+        assert factors[0] == pytest.approx(student_95(501 - 2), rel=1e-9)
+        assert 2.0 < factors[1] < 2.6
+
+
+# Uncertain constants
+
+
+class Heater(AbstractPlant):
+    """A mass that is heated; data tell only its heat capacity times its mass."""
+
+    definition = PlantDescription(
+        name="heater",
+        states=(State("temperature", "K", scale=10.0),),
+        inputs=(Input("power", "W", 0.0, 100.0),),
+        outputs=(Output("temperature_k", "K", 20.0, noise_sd=0.05),),
+        parameters=(Parameter("c", "J/(kg K)", 400.0), Parameter("loss", "W/K", 2.0)),
+        constants=(Constant("mass", "kg", 0.5), Constant("gain", "", 1.0)),
+        dt=5.0,
+    )
+
+    def derivative(self, state, input, params):
+        k = self.constants
+        return (k.gain * input - params.loss * state) / (params.c * k.mass)
+
+    def output(self, state, params):
+        return state
+
+
+def test_the_effect_of_a_constant_is_that_of_another_fit():
+    record = record_of(Heater(), num_steps=60)
+    result = identify(record, Heater(), uncertain={"mass": "5%", "gain": 0.02})
+    usual = identify(record, Heater())
+    other = {k: identify(record, Heater(**{k: v})) for k, v in (("mass", 0.501), ("gain", 1.002))}
+    for name in ("c", "loss"):
+        per_sd = (
+            (other["mass"].params[name] - usual.params[name]) / 0.001 * 0.025,
+            (other["gain"].params[name] - usual.params[name]) / 0.002 * 0.02,
+        )
+        expected = np.sqrt(usual.std_error[name] ** 2 + np.sum(np.square(per_sd)))
+        assert result.std_error[name] == pytest.approx(expected, rel=0.01)
+        assert result.params[name] == usual.params[name]
+    assert result.std_error["c"] > 10 * usual.std_error["c"]
+    told = "the intervals include the standard deviation of mass (0.025 kg), gain (0.02)"
+    assert told in result.verdict
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"mas": 0.1}, "unknown heater constant 'mas'; did you mean 'mass'"),
+        ({"mass": -0.1}, "standard deviation of 'mass' must be above 0: got -0.1"),
+        ({"mass": float("nan")}, "must be above 0: got nan"),
+        ({"mass": "0%"}, "must be above 0: got 0%"),
+        ({"mass": "much"}, "uncertain 'mass' must be a number or 5%: got 'much'"),
+    ],
+)
+def test_an_uncertainty_that_makes_no_sense_is_refused(given, words):
+    with pytest.raises(ValueError, match=words):
+        identify(record_of(Heater(), num_steps=60), Heater(), uncertain=given)
+
+
+def test_uncertain_constants_need_nls():
+    with pytest.raises(ValueError, match="uncertain constants need the estimator nls"):
+        identify(simulate("aero2", steps=60), estimator="arx-rls", uncertain={"m": "5%"})
+
+
+def test_the_command_line_takes_uncertain_constants(tmp_path):
+    simulate("aero2", steps=60).save(tmp_path / "r.csv")
+    done = excite("identify", "r.csv", "--uncertain", "m=5%,g=0.01", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "include the standard deviation of m (0.0535 kg), g (0.01 m/s²)" in done.stdout
+    refused = excite("identify", "r.csv", "--uncertain", "m=x", cwd=tmp_path)
+    assert refused.returncode == 2
+
+
+@pytest.mark.science
+def test_intervals_hold_where_a_constant_is_uncertain():
+    plant, sd = Heater(), np.array([0.025, 0.02])
+    record = record_of(plant, num_steps=60)
+    inputs, rng = record.inputs[:-1], np.random.default_rng(4)
+    constants = np.array([0.5, 1.0]) + sd * rng.normal(size=(1000, 2))
+    noise = 0.05 * rng.normal(size=(1000, 61, 1))
+
+    def fit(true: jax.Array, noise: jax.Array) -> tuple[Estimate, jax.Array, jax.Array]:
+        real = plant.changed(mass=true[0], gain=true[1])
+        outputs = response(real, plant.nominal, inputs) + noise
+        experiments: Experiments = stack_experiments(plant, [inputs], [outputs], True)
+        estimate = NLS()(plant, experiments)
+        S, _ = NLS().sensitivity(plant, experiments, estimate, jnp.ones(2, bool))
+        return estimate, S, NLS().constant_sensitivity(plant, experiments, estimate)
+
+    found, S, to_constants = jax.device_get(jax.jit(jax.vmap(fit))(constants, noise))
+    values, inside = np.stack(found.params, axis=1), []
+    for i, value in enumerate(values):
+        effect = value[:, None] * effect_of_constants(S[i], to_constants[i]) * sd
+        total = with_independent(found.covariance[i], found.degrees[i], effect @ effect.T)
+        inside.append(np.abs(value - np.array(plant.nominal)) < half_95(*total))
+    share = np.mean(inside, axis=0)
+    assert np.all((share > 0.93) & (share < 0.97)), share

@@ -55,6 +55,12 @@ from .options import (
     help="Known values, not to be estimated: tau=0.162.",
 )
 @click.option(
+    "--uncertain",
+    type=NAMES,
+    multiple=True,
+    help="Standard deviation of known constants, which widens the intervals: m=5%,g=0.02.",
+)
+@click.option(
     "--validate",
     type=OUT_FILE,
     multiple=True,
@@ -123,7 +129,7 @@ def identify(
             files,
             options["plant"],
             options["estimator"],
-            **{name: merged(options[name]) for name in ("start", "hold")},
+            **{name: merged(options[name]) for name in ("start", "hold", "uncertain")},
             initial_state=options["initial_state"],
             hold_input=NAMES.convert(hold_input, None, None) if "=" in hold_input else hold_input,
             validate=options["validate"],

@@ -319,19 +319,47 @@ def robust_covariance(
     1946). Sensitivity and residual are over the standard deviation of the weights.
     Undetermined directions get zero.
     """
-    H = np.einsum("etou,etov->uv", sensitivity, sensitivity)
-    size = np.sqrt(np.diag(H))
-    size[size == 0] = 1.0
-    inverse = np.linalg.pinv(H / np.outer(size, size), hermitian=True) / np.outer(size, size)
-    covariance, variance, spread = np.zeros_like(H), np.zeros(len(H)), np.zeros(len(H))
+    inverse = _inverse_information(sensitivity)
+    count = len(inverse)
+    covariance, variance, spread = np.zeros((count, count)), np.zeros(count), np.zeros(count)
     for o, noise in enumerate(coloured_noise(sensitivity, residual, valid)):
         weights = sensitivity[:, :, o] @ inverse
         covariance += np.einsum("etu,etv->uv", weights, noise.times(weights))
         own, its_spread = noise.variances(weights)
         variance, spread = variance + own, spread + its_spread
-    degrees = np.full(len(H), np.inf)
+    degrees = np.full(count, np.inf)
     np.divide(2 * variance**2, spread, out=degrees, where=spread > 0)
     return covariance, degrees
+
+
+def _inverse_information(
+    sensitivity: Float[np.ndarray, "experiment sample output unknown"],
+) -> Float[np.ndarray, "unknown unknown"]:
+    """(S' S)^-1; zero in undetermined directions."""
+    H = np.einsum("etou,etov->uv", sensitivity, sensitivity)
+    size = np.sqrt(np.diag(H))
+    size[size == 0] = 1.0
+    return np.linalg.pinv(H / np.outer(size, size), hermitian=True) / np.outer(size, size)
+
+
+def effect_of_constants(
+    sensitivity: Float[np.ndarray, "experiment sample output unknown"],
+    to_constants: Float[np.ndarray, "experiment sample output constant"],
+) -> Float[np.ndarray, "unknown constant"]:
+    """Derivative of a least-squares estimate with respect to constants that it takes as known."""
+    rows = np.einsum("etou,etoc->uc", sensitivity, to_constants)
+    return -_inverse_information(sensitivity) @ rows
+
+
+def with_independent(
+    covariance: Float[np.ndarray, "param param"],
+    degrees: Float[np.ndarray, " param"],
+    other: Float[np.ndarray, "param param"],
+) -> tuple[Float[np.ndarray, "param param"], Float[np.ndarray, " param"]]:
+    """An estimated covariance and its degrees of freedom, with a known one added."""
+    total, own = np.diag(covariance) + np.diag(other), np.diag(covariance)
+    growth = np.where(own > 0, total / np.where(own > 0, own, 1.0), 1.0)
+    return covariance + other, degrees * growth**2
 
 
 def widened(

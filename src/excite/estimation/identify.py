@@ -14,7 +14,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..description import RARE, Named, PlantDescription, names_of, wrong_type
+from ..description import RARE, Named, PlantDescription, names_of, unknown, wrong_type
 from ..files import json_ready
 from ..information import identifiability, worst_seen
 from ..plant import AbstractPlant, Params, floats, params_from
@@ -39,12 +39,14 @@ from .contract import (
 )
 from .diagnosis import (
     chance_of_fit,
+    effect_of_constants,
     fit_percent,
     half_95,
     input_dependence,
     ljung_box,
     robust_covariance,
     widened,
+    with_independent,
 )
 from .nls import NLS
 from .result import Fitted, Identification
@@ -75,6 +77,7 @@ def identify(
     *,
     start: Mapping[str, float] | Params | None = None,
     hold: Mapping[str, float] | None = None,
+    uncertain: Mapping[str, float | str] | None = None,
     initial_state: InitialState = "auto",
     hold_input: str | Mapping[str, str] = "constant",
     validate: RecordLike | Sequence[RecordLike] = (),
@@ -102,6 +105,8 @@ def identify(
         estimator: a name (`ex.estimators()` lists them), an estimator or its class.
         start: where the search begins, by name; default the nominal parameters.
         hold: values of parameters that are known and not estimated, by name.
+        uncertain: standard deviation of known constants, by name: {"m": 0.02} in the constant's
+            unit, {"m": "5%"} of its value. It widens the intervals.
         initial_state: "known" (the plant's), "free" (estimated too), or "auto": known
             where every sidecar says so.
         hold_input: "constant": an input keeps its value until the next sample; "linear": it runs
@@ -125,6 +130,7 @@ def identify(
         raise ValueError("no record is given")
     plant = plant_from(_plant_of(given[0]) if plant is None else plant)
     estimator, begin = _chosen(estimator, plant, start, hold)
+    uncertain_sd = _uncertain(plant, estimator, uncertain)
     if initial_state not in get_args(InitialState):
         raise ValueError(f"initial state {initial_state!r} is not one of: known, free, auto")
     read = partial(
@@ -166,7 +172,9 @@ def identify(
         name: _dependence(residual, records, i, plant.definition.outputs[i].scale)
         for i, name in enumerate(whiteness)
     }
-    covariance, degrees, verdict = _confidence(plant, experiments, estimator, fit, whiteness)
+    covariance, degrees, verdict = _confidence(
+        plant, experiments, estimator, fit, whiteness, uncertain_sd
+    )
     wrong = _wrong_structure(structure, estimator) if fit.is_successful else ()
     others = tuple(s for record in [*records, *validation] for s in _other_plant(record, plant))
     other_hold = _other_hold(plant, records, experiments, estimator, fit, linear)
@@ -254,6 +262,30 @@ def _chosen(
     names = tuple(hold if isinstance(hold, Mapping) else begin._fields)
     begin = begin._replace(**{name: getattr(held, name) for name in names})
     return dataclasses.replace(method, known=names), begin
+
+
+def _uncertain(
+    plant: AbstractPlant, estimator: AbstractEstimator, given: Mapping[str, float | str] | None
+) -> Float[np.ndarray, " constant"]:
+    """Standard deviation of each known constant, zero where none is given."""
+    if not isinstance(given, Mapping | None):
+        raise wrong_type("uncertain", given, "a dict by constant")
+    if given and not isinstance(estimator, NLS):
+        raise ValueError(f"uncertain constants need the estimator nls: got {estimator.name}")
+    values = {name: float(value) for name, value in plant.constants._asdict().items()}
+    sd = dict.fromkeys(values, 0.0)
+    for name, spread in (given or {}).items():
+        if name not in values:
+            raise unknown(f"{plant.definition.name} constant", name, values)
+        try:
+            is_part = isinstance(spread, str) and spread.endswith("%")
+            number = float(spread[:-1]) / 100 * abs(values[name]) if is_part else float(spread)
+        except (TypeError, ValueError):
+            raise ValueError(f"uncertain {name!r} must be a number or 5%: got {spread!r}") from None
+        if not (np.isfinite(number) and number > 0):
+            raise ValueError(f"standard deviation of {name!r} must be above 0: got {spread}")
+        sd[name] = number
+    return np.array(list(sd.values()), float)
 
 
 def _starts_at(record: Record, plant: AbstractPlant) -> bool:
@@ -573,6 +605,7 @@ def _confidence(
     estimator: AbstractEstimator,
     fit: _Fit,
     whiteness: Mapping[str, float],
+    uncertain: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray | None, tuple[str, ...]]:
     """Covariance of the estimates, its degrees of freedom, and the sentences of the verdict."""
     covariance, degrees = np.asarray(fit.estimate.covariance), fit.estimate.degrees
@@ -585,12 +618,11 @@ def _confidence(
     size = np.array([float(value) if p.positive else p.scale for p, value in parameters])
     remarks = ()
     coloured = [name for name, p in whiteness.items() if p < RARE]
-    if coloured and isinstance(estimator, NLS):
+    if (coloured or uncertain.any()) and isinstance(estimator, NLS):
         estimate, free = jax.device_put((fit.estimate, fit.free))
-        S, residual = estimator.sensitivity(plant, experiments, estimate, free)
-        robust, its_degrees = robust_covariance(
-            np.asarray(S), np.asarray(residual), np.asarray(experiments.valid)
-        )
+        S, residual = map(np.asarray, estimator.sensitivity(plant, experiments, estimate, free))
+    if coloured and isinstance(estimator, NLS):
+        robust, its_degrees = robust_covariance(S, residual, np.asarray(experiments.valid))
         robust = np.outer(size, size) * robust[: len(names), : len(names)]
         is_wider = np.diag(robust) > np.diag(covariance)
         degrees = np.where(is_wider, its_degrees[: len(names)], degrees)
@@ -603,6 +635,17 @@ def _confidence(
     remarks = tuple(
         f"the residual of {' and '.join(coloured)} is not white: {remark}" for remark in remarks
     )
+    if uncertain.any() and isinstance(estimator, NLS):
+        to_constants = np.asarray(estimator.constant_sensitivity(plant, experiments, estimate))
+        effect = effect_of_constants(S, to_constants)[: len(names)] * uncertain
+        effect *= size[:, None]
+        covariance, degrees = with_independent(covariance, degrees, effect @ effect.T)
+        told = [
+            f"{c.name} ({sd:.3g} {c.unit})".replace(" )", ")")
+            for c, sd in zip(plant.definition.constants, uncertain, strict=True)
+            if sd
+        ]
+        remarks = (*remarks, f"the intervals include the standard deviation of {', '.join(told)}")
     seen = identifiability(names, covariance / np.outer(size, size), fit.free)
     return covariance, degrees, (*fit.reasons, seen, *remarks)
 

@@ -105,6 +105,25 @@ class NLS(AbstractEstimator):
         S = problem.sensitivity(estimate.params, estimate.initial_state)
         return S / sd[None, None, :, None], estimate.residual / sd[None, None]
 
+    @eqx.filter_jit
+    def constant_sensitivity(
+        self, plant: AbstractPlant, experiments: Experiments, estimate: Estimate
+    ) -> Float[Array, "experiment sample output constant"]:
+        """Derivative of the outputs with respect to the known constants, weighted like these."""
+        problem = _Problem(plant, experiments, estimate.params, None)
+        is_estimated = self.noise == "estimated"
+        sd = problem.noise_sd(estimate.residual) if is_estimated else problem.assumed_sd
+        names = plant.constants._fields
+
+        def outputs(values: Array) -> Array:
+            changed = plant.changed(**dict(zip(names, values, strict=True)))
+            simulated = simulate_experiments(
+                changed, estimate.params, experiments, estimate.initial_state
+            )
+            return -residual_of(experiments, simulated)
+
+        return jax.jacfwd(outputs)(jnp.stack(plant.constants)) / sd[None, None, :, None]
+
     def _search(self, problem: _Problem) -> _Found:
         """The minimum."""
         experiments, plant = problem.experiments, problem.plant
