@@ -43,6 +43,13 @@ from .options import (
     "sidecar says that the record starts there.",
 )
 @click.option(
+    "--intervals",
+    type=click.Choice(["linear", "profile"]),
+    default="linear",
+    show_default=True,
+    help="From standard errors, or from the profile likelihood (slower; sides may be open).",
+)
+@click.option(
     "--start",
     type=NUMBERS,
     multiple=True,
@@ -131,6 +138,7 @@ def identify(
             options["estimator"],
             **{name: merged(options[name]) for name in ("start", "hold", "uncertain")},
             initial_state=options["initial_state"],
+            intervals=options["intervals"],
             hold_input=NAMES.convert(hold_input, None, None) if "=" in hold_input else hold_input,
             validate=options["validate"],
             columns=merged(options["column"]),

@@ -319,7 +319,7 @@ def robust_covariance(
     1946). Sensitivity and residual are over the standard deviation of the weights.
     Undetermined directions get zero.
     """
-    inverse = _inverse_information(sensitivity)
+    inverse = inverse_information(sensitivity)
     count = len(inverse)
     covariance, variance, spread = np.zeros((count, count)), np.zeros(count), np.zeros(count)
     for o, noise in enumerate(coloured_noise(sensitivity, residual, valid)):
@@ -332,7 +332,7 @@ def robust_covariance(
     return covariance, degrees
 
 
-def _inverse_information(
+def inverse_information(
     sensitivity: Float[np.ndarray, "experiment sample output unknown"],
 ) -> Float[np.ndarray, "unknown unknown"]:
     """(S' S)^-1; zero in undetermined directions."""
@@ -348,7 +348,7 @@ def effect_of_constants(
 ) -> Float[np.ndarray, "unknown constant"]:
     """Derivative of a least-squares estimate with respect to constants that it takes as known."""
     rows = np.einsum("etou,etoc->uc", sensitivity, to_constants)
-    return -_inverse_information(sensitivity) @ rows
+    return -inverse_information(sensitivity) @ rows
 
 
 def with_independent(

@@ -49,9 +49,11 @@ from .diagnosis import (
     with_independent,
 )
 from .nls import NLS
+from .profile import profile_intervals
 from .result import Fitted, Identification
 
 InitialState = Literal["auto", "free", "known"]
+Intervals = Literal["linear", "profile"]
 _HOLDS = "constant", "linear"  # an input between samples
 _NOTHING_SEEN = (
     "no parameter is identifiable from the data; are columns, signs and units right, and does the "
@@ -79,6 +81,7 @@ def identify(
     hold: Mapping[str, float] | None = None,
     uncertain: Mapping[str, float | str] | None = None,
     initial_state: InitialState = "auto",
+    intervals: Intervals = "linear",
     hold_input: str | Mapping[str, str] = "constant",
     validate: RecordLike | Sequence[RecordLike] = (),
     columns: Mapping[str, str] | None = None,
@@ -109,6 +112,8 @@ def identify(
             unit, {"m": "5%"} of its value. It widens the intervals.
         initial_state: "known" (the plant's), "free" (estimated too), or "auto": known
             where every sidecar says so.
+        intervals: "linear": from standard errors; "profile": from the profile likelihood, which
+            follows a curved likelihood and may stay open to one side, and takes longer.
         hold_input: "constant": an input keeps its value until the next sample; "linear": it runs
             straight to the next value; or one of them by the input's name.
         validate: records for which only the initial state is fitted.
@@ -130,6 +135,10 @@ def identify(
         raise ValueError("no record is given")
     plant = plant_from(_plant_of(given[0]) if plant is None else plant)
     estimator, begin = _chosen(estimator, plant, start, hold)
+    if intervals not in get_args(Intervals):
+        raise ValueError(f"intervals {intervals!r} are not one of: linear, profile")
+    if intervals == "profile" and not isinstance(estimator, NLS):
+        raise ValueError(f"profile intervals need the estimator nls: got {estimator.name}")
     uncertain_sd = _uncertain(plant, estimator, uncertain)
     if initial_state not in get_args(InitialState):
         raise ValueError(f"initial state {initial_state!r} is not one of: known, free, auto")
@@ -183,14 +192,18 @@ def identify(
     values = np.array([float(value) for value in fit.estimate.params])
     sd = np.where(fit.free, np.sqrt(np.maximum(np.diag(covariance), 0.0)), np.nan)
     half = np.where(fit.free, half_95(covariance, degrees), np.nan)
-    ends = zip((values - half).tolist(), (values + half).tolist(), strict=True)
+    ends = np.stack([values - half, values + half], axis=1)
+    if intervals == "profile" and isinstance(estimator, NLS) and fit.is_successful:
+        estimate = jax.device_put(fit.estimate)
+        ends = profile_intervals(plant, experiments, estimator, estimate, fit.free, half)
+        verdict = (*verdict, *_open_sides(plant.definition, ends))
     return Identification(
         plant=d,
         estimator=estimator.name,
         status=fit.status,
         params=Named(zip(names, values.tolist(), strict=True)),
         std_error=Named(zip(names, sd.tolist(), strict=True)),
-        intervals=Named(zip(names, ends, strict=True)),
+        intervals=Named(zip(names, map(tuple, ends.tolist()), strict=True)),
         held=tuple(n for n, is_free in zip(names, fit.free, strict=True) if not is_free),
         covariance=covariance,
         information=np.asarray(fit.estimate.information),
@@ -286,6 +299,21 @@ def _uncertain(
             raise ValueError(f"standard deviation of {name!r} must be above 0: got {spread}")
         sd[name] = number
     return np.array(list(sd.values()), float)
+
+
+def _open_sides(
+    description: PlantDescription, ends: Float[np.ndarray, "param end"]
+) -> tuple[str, ...]:
+    """A sentence for each interval that the data do not close."""
+    told = []
+    for part, (low, high) in zip(description.parameters, ends, strict=True):
+        is_open = np.isinf(low) or (part.positive and low == 0), np.isinf(high)
+        if any(is_open):
+            side = "to either side" if all(is_open) else "above" if is_open[1] else "below"
+            told.append(
+                f"{part.name} is practically not identifiable: its 95 % interval is open {side}"
+            )
+    return tuple(told)
 
 
 def _starts_at(record: Record, plant: AbstractPlant) -> bool:

@@ -105,14 +105,20 @@ class NLS(AbstractEstimator):
         S = problem.sensitivity(estimate.params, estimate.initial_state)
         return S / sd[None, None, :, None], estimate.residual / sd[None, None]
 
+    def weights(
+        self, plant: AbstractPlant, experiments: Experiments, estimate: Estimate
+    ) -> Float[Array, " output"]:
+        """The standard deviations over which the residual of an estimate counts."""
+        problem = _Problem(plant, experiments, estimate.params, None)
+        is_estimated = self.noise == "estimated"
+        return problem.noise_sd(estimate.residual) if is_estimated else problem.assumed_sd
+
     @eqx.filter_jit
     def constant_sensitivity(
         self, plant: AbstractPlant, experiments: Experiments, estimate: Estimate
     ) -> Float[Array, "experiment sample output constant"]:
         """Derivative of the outputs with respect to the known constants, weighted like these."""
-        problem = _Problem(plant, experiments, estimate.params, None)
-        is_estimated = self.noise == "estimated"
-        sd = problem.noise_sd(estimate.residual) if is_estimated else problem.assumed_sd
+        sd = self.weights(plant, experiments, estimate)
         names = plant.constants._fields
 
         def outputs(values: Array) -> Array:

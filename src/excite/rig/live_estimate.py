@@ -65,7 +65,8 @@ class LiveEstimate:
 
     def _keep(self, estimate: Estimate) -> None:
         if int(estimate.status) == Status.SUCCESSFUL:
-            half = half_95(np.asarray(estimate.covariance), estimate.degrees)
+            estimate = jax.device_get(estimate)
+            half = half_95(estimate.covariance, estimate.degrees)
             names = names_of(self._plant.definition.parameters)
             values = zip(map(float, estimate.params), map(float, half), strict=True)
             self._latest = {n: Interval(*v) for n, v in zip(names, values, strict=True)}

@@ -15,6 +15,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import cast
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -193,9 +194,9 @@ def _estimates(own: Experiment, run: Trajectory, information: Array) -> Iterator
     free = jnp.ones(len(own.params), bool)
     counts = np.linspace(min(_FIRST, own.num_steps + 1), own.num_steps + 1, NUM_ESTIMATES)
     for count in np.unique(counts.astype(int)):
-        estimate = NLS()(plant, _first(data, int(count)), plant.nominal, free)
+        estimate = jax.device_get(NLS()(plant, _first(data, int(count)), plant.nominal, free))
         is_good = int(estimate.status) == Status.SUCCESSFUL
-        half = half_95(np.asarray(estimate.covariance), estimate.degrees)
+        half = half_95(estimate.covariance, estimate.degrees)
         bound = HALF_95 * np.asarray(cramer_rao_bound(information[count - 2]) * size)
         parts = plant.definition.parameters
         yield {
