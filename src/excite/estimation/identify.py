@@ -289,7 +289,7 @@ def _uncertain(
     sd = dict.fromkeys(values, 0.0)
     for name, spread in (given or {}).items():
         if name not in values:
-            raise unknown(f"{plant.definition.name} constant", name, values)
+            raise unknown(f"{plant.definition.name} constant", name, values or ["none"])
         try:
             is_part = isinstance(spread, str) and spread.endswith("%")
             number = float(spread[:-1]) / 100 * abs(values[name]) if is_part else float(spread)

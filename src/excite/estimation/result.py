@@ -88,10 +88,10 @@ class Identification:
         return self.status in USABLE
 
     def ci95(self, name: str) -> tuple[float, float]:
-        """95 % interval of a parameter: estimate ± t standard errors.
+        """95 % interval of a parameter: estimate ± t standard errors, or by profile likelihood.
 
         t is 1.96 where the noise is known; where its size is estimated from the residual, it is
-        that of Student's distribution.
+        that of Student's distribution. An end where a profile stays open is infinite.
         """
         return self.intervals[name]
 

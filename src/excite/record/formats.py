@@ -56,7 +56,7 @@ def _by_observable(path: Path, table: dict[str, np.ndarray]) -> dict[str, np.nda
         )
     try:
         time, values = (table[name].astype(float) for name in ("time", "measurement"))
-    except ValueError as error:
+    except (TypeError, ValueError) as error:
         raise ValueError(f"{path}: 'time' or 'measurement' is not a number ({error})") from None
     instants, names = np.unique(time), table["observableId"].astype(str)
     columns = {"time": instants}
