@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from . import __version__
 from .description import names_of, wrong_type
-from .excitation import AbstractExcitation, PolicyExcitation, Replay
+from .excitation import AbstractExcitation, NoInput, PolicyExcitation, Replay
 from .excitation.catalogue import ExcitationLike, excitation_and_origin, name_of
 from .files import json_ready
 from .plant import AbstractPlant, Params, params_from
@@ -254,7 +254,7 @@ class Experiment:
     def of(
         cls,
         plant: PlantLike,
-        excitation: ExcitationLike = "chirp",
+        excitation: ExcitationLike | None = None,
         *,
         options: Mapping[str, object] | None = None,
         steps: int | None = None,
@@ -274,6 +274,12 @@ class Experiment:
             chosen = chosen.changed(dt=excitation.dt)
         if not isinstance(options, Mapping | None):
             raise wrong_type("options", options, "a dict by name")
+        if excitation is None:
+            excitation = "chirp" if chosen.definition.inputs else NoInput()
+        elif not chosen.definition.inputs and not isinstance(excitation, Record):
+            raise ValueError(
+                f"plant {chosen.definition.name!r} has no inputs: leave the excitation out"
+            )
         name = excitation if isinstance(excitation, str) else name_of(excitation)
         found, origin = excitation_and_origin(excitation, options or {}, chosen)
         source = excitation.source if isinstance(excitation, Record) else ""
@@ -373,7 +379,7 @@ def _checked(seed: object) -> int | PRNGKeyArray:
 
 def simulate(
     plant: PlantLike,
-    excitation: ExcitationLike = "chirp",
+    excitation: ExcitationLike | None = None,
     *,
     options: Mapping[str, object] | None = None,
     steps: int | None = None,
@@ -394,7 +400,8 @@ def simulate(
             its class.
         excitation: a name (`ex.excitations()` lists them), an excitation or its class, a
             policy, the file of a policy or of a signal, a record to replay, or an array of
-            inputs by sample and input [input units].
+            inputs by sample and input [input units]. Default a chirp; a plant without inputs
+            takes none.
         options: of the excitation, by name.
         steps: length [samples]; default 500, or that of a policy, a record or a signal.
         params: true parameters that differ from the nominal ones, by name or as the

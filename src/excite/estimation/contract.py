@@ -127,6 +127,8 @@ class Estimate(eqx.Module):
         residual: measured minus simulated outputs, zero where padded.
         costs: weighted sum of squares at the end of each search, infinite where it did not
             converge; None for estimators that do not search.
+        degrees: degrees of freedom of Student's t for each parameter's interval, infinite where
+            the noise is known; None counts as infinite.
     """
 
     params: Params
@@ -136,6 +138,7 @@ class Estimate(eqx.Module):
     initial_state: Float[Array, "experiment state"]
     residual: Float[Array, "experiment sample output"]
     costs: Float[Array, " start"] | None = None
+    degrees: Float[Array, " param"] | None = None
 
 
 class AbstractEstimator(eqx.Module):

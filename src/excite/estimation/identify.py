@@ -14,7 +14,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..description import RARE, Named, PlantDescription, names_of, wrong_type
+from ..description import RARE, Named, PlantDescription, names_of, unknown, wrong_type
 from ..files import json_ready
 from ..information import identifiability, worst_seen
 from ..plant import AbstractPlant, Params, floats, params_from
@@ -40,17 +40,22 @@ from .contract import (
 )
 from .diagnosis import (
     chance_of_fit,
+    effect_of_constants,
     fit_percent,
+    half_95,
     input_dependence,
     ljung_box,
     robust_covariance,
     widened,
+    with_independent,
 )
 from .nls import NLS
+from .profile import profile_intervals
 from .remedies import Suspect, outliers, suspects
 from .result import Fitted, Identification
 
 InitialState = Literal["auto", "free", "known"]
+Intervals = Literal["linear", "profile"]
 _HOLDS = "constant", "linear"  # an input between samples
 _NOTHING_SEEN = (
     "no parameter is identifiable from the data; are columns, signs and units right, and does the "
@@ -58,6 +63,7 @@ _NOTHING_SEEN = (
     "(--start)?"
 )
 _STARTS, _SIZE_OF_MANY_STARTS = 8, 50_000  # measured values up to which so many are tried
+_TELLING = 50  # measured values from which the residual tells whether the search missed something
 _FREE = 100.0  # scales of a parameter of free sign that are small for its standard error
 _SAME = 1e-6  # relative difference of sums of squares at one minimum
 _BY_CHANCE = 1e-3  # a fit with a larger p-value explains nothing
@@ -74,7 +80,9 @@ def identify(
     *,
     start: Mapping[str, float] | Params | None = None,
     hold: Mapping[str, float] | None = None,
+    uncertain: Mapping[str, float | str] | None = None,
     initial_state: InitialState = "auto",
+    intervals: Intervals = "linear",
     hold_input: str | Mapping[str, str] = "constant",
     validate: RecordLike | Sequence[RecordLike] = (),
     columns: Mapping[str, str] | None = None,
@@ -101,8 +109,12 @@ def identify(
         estimator: a name (`ex.estimators()` lists them), an estimator or its class.
         start: where the search begins, by name; default the nominal parameters.
         hold: values of parameters that are known and not estimated, by name.
+        uncertain: standard deviation of known constants, by name: {"m": 0.02} in the constant's
+            unit, {"m": "5%"} of its value. It widens the intervals.
         initial_state: "known" (the plant's), "free" (estimated too), or "auto": known
             where every sidecar says so.
+        intervals: "linear": from standard errors; "profile": from the profile likelihood, which
+            follows a curved likelihood and may stay open to one side, and takes longer.
         hold_input: "constant": an input keeps its value until the next sample; "linear": it runs
             straight to the next value; or one of them by the input's name.
         validate: records for which only the initial state is fitted.
@@ -123,6 +135,11 @@ def identify(
         raise ValueError("no record is given")
     plant = plant_from(_plant_of(given[0]) if plant is None else plant)
     estimator, begin = _chosen(estimator, plant, start, hold)
+    if intervals not in get_args(Intervals):
+        raise ValueError(f"intervals {intervals!r} are not one of: linear, profile")
+    if intervals == "profile" and not isinstance(estimator, NLS):
+        raise ValueError(f"profile intervals need the estimator nls: got {estimator.name}")
+    uncertain_sd = _uncertain(plant, estimator, uncertain)
     if initial_state not in get_args(InitialState):
         raise ValueError(f"initial state {initial_state!r} is not one of: known, free, auto")
     read = partial(
@@ -142,12 +159,14 @@ def identify(
     known = initial_state == "known" or (
         initial_state == "auto" and all(_starts_at(record, plant) for record in records)
     )
-    _check_lengths(plant, [*records, *validation], known)
+    _require_enough(plant, records, int(np.sum(~_known(plant, estimator))), known)
+    for record in validation:
+        _require_enough(plant, [record], 0, False)
     linear = _linear_inputs(plant, hold_input)
     if not isinstance(estimator, NLS):
         _require_complete(estimator, [*records, *validation], linear)
     plant = _sampled_as([*records, *validation], plant)
-    known = known and all(len(unbroken(record.time)) == 1 for record in records)
+    known = known and all(len(_parts(record)) == 1 for record in records)
     experiments = _experiments(plant, records, known, linear)
     fit = _fit(plant, experiments, estimator, begin)
     residual = _residuals(plant, records, experiments, estimator, fit)
@@ -162,19 +181,29 @@ def identify(
         name: _dependence(residual, records, i, plant.definition.outputs[i].scale)
         for i, name in enumerate(whiteness)
     }
-    covariance, verdict = _confidence(plant, experiments, estimator, fit, whiteness)
+    covariance, degrees, verdict = _confidence(
+        plant, experiments, estimator, fit, whiteness, uncertain_sd
+    )
     wrong = _wrong_structure(structure, estimator) if fit.is_successful else ()
     others = tuple(s for record in [*records, *validation] for s in _other_plant(record, plant))
     found = _suspects(plant, records, experiments, estimator, fit, linear)
     verdict = (*others, *wrong, *_remedies(found), *_agreement(fit), *verdict)
     names, d = names_of(plant.definition.parameters), plant.description
+    values = np.array([float(value) for value in fit.estimate.params])
     sd = np.where(fit.free, np.sqrt(np.maximum(np.diag(covariance), 0.0)), np.nan)
+    half = np.where(fit.free, half_95(covariance, degrees), np.nan)
+    ends = np.stack([values - half, values + half], axis=1)
+    if intervals == "profile" and isinstance(estimator, NLS) and fit.is_successful:
+        estimate = jax.device_put(fit.estimate)
+        ends = profile_intervals(plant, experiments, estimator, estimate, fit.free, half)
+        verdict = (*verdict, *_open_sides(plant.definition, ends))
     return Identification(
         plant=d,
         estimator=estimator.name,
         status=fit.status,
-        params=Named(zip(names, map(float, fit.estimate.params), strict=True)),
-        std_error=Named(zip(names, map(float, sd), strict=True)),
+        params=Named(zip(names, values.tolist(), strict=True)),
+        std_error=Named(zip(names, sd.tolist(), strict=True)),
+        intervals=Named(zip(names, map(tuple, ends.tolist()), strict=True)),
         held=tuple(n for n, is_free in zip(names, fit.free, strict=True) if not is_free),
         covariance=covariance,
         information=np.asarray(fit.estimate.information),
@@ -249,6 +278,45 @@ def _chosen(
     return dataclasses.replace(method, known=names), begin
 
 
+def _uncertain(
+    plant: AbstractPlant, estimator: AbstractEstimator, given: Mapping[str, float | str] | None
+) -> Float[np.ndarray, " constant"]:
+    """Standard deviation of each known constant, zero where none is given."""
+    if not isinstance(given, Mapping | None):
+        raise wrong_type("uncertain", given, "a dict by constant")
+    if given and not isinstance(estimator, NLS):
+        raise ValueError(f"uncertain constants need the estimator nls: got {estimator.name}")
+    values = {name: float(value) for name, value in plant.constants._asdict().items()}
+    sd = dict.fromkeys(values, 0.0)
+    for name, spread in (given or {}).items():
+        if name not in values:
+            raise unknown(f"{plant.definition.name} constant", name, values or ["none"])
+        try:
+            is_part = isinstance(spread, str) and spread.endswith("%")
+            number = float(spread[:-1]) / 100 * abs(values[name]) if is_part else float(spread)
+        except (TypeError, ValueError):
+            raise ValueError(f"uncertain {name!r} must be a number or 5%: got {spread!r}") from None
+        if not (np.isfinite(number) and number > 0):
+            raise ValueError(f"standard deviation of {name!r} must be above 0: got {spread}")
+        sd[name] = number
+    return np.array(list(sd.values()), float)
+
+
+def _open_sides(
+    description: PlantDescription, ends: Float[np.ndarray, "param end"]
+) -> tuple[str, ...]:
+    """A sentence for each interval that the data do not close."""
+    told = []
+    for part, (low, high) in zip(description.parameters, ends, strict=True):
+        is_open = np.isinf(low) or (part.positive and low == 0), np.isinf(high)
+        if any(is_open):
+            side = "to either side" if all(is_open) else "above" if is_open[1] else "below"
+            told.append(
+                f"{part.name} is practically not identifiable: its 95 % interval is open {side}"
+            )
+    return tuple(told)
+
+
 def _starts_at(record: Record, plant: AbstractPlant) -> bool:
     """Whether the sidecar says that the record starts at this plant's initial state."""
     states = record.metadata.get("plant", {}).get("states", [])
@@ -281,7 +349,7 @@ def _linear_inputs(
             )
         if word not in _HOLDS:
             raise ValueError(f"hold_input of {name!r} must be constant or linear: got {word!r}")
-    return np.array([by_name.get(name) == "linear" for name in names])
+    return np.array([by_name.get(name) == "linear" for name in names], bool)
 
 
 def _require_complete(
@@ -308,16 +376,26 @@ def _require_complete(
             )
 
 
-def _check_lengths(plant: AbstractPlant, records: Sequence[Record], known: bool) -> None:
-    d = plant.definition
-    unknowns = len(d.parameters) + (0 if known else len(d.states))
-    needed = max(10, -(-3 * unknowns // len(d.outputs)))
-    for record in records:
-        if len(record.time) < needed:
-            raise ValueError(
-                f"{record.source}: {len(record.time)} samples are too short a record; "
-                f"{needed} or more are needed for {unknowns} unknowns"
-            )
+def _require_enough(
+    plant: AbstractPlant, records: Sequence[Record], num_params: int, knows_state: bool
+) -> None:
+    """Raises ValueError where there are not more measured values than unknowns."""
+    where = " and ".join(record.source or "the record" for record in records)
+    if any(len(record.time) < 2 for record in records):
+        raise ValueError(f"{where}: a record needs at least two samples")
+    values = sum(int(np.isfinite(record.outputs).sum()) for record in records)
+    parts = sum(len(_parts(record)) for record in records)
+    states = 0 if knows_state and parts == len(records) else parts * len(plant.definition.states)
+    if values <= num_params + states:
+        raise ValueError(
+            f"{where}: {values} measured values for {num_params + states} unknowns ({num_params} "
+            f"parameters, {states} initial states); more values than unknowns are needed"
+        )
+
+
+def _parts(record: Record) -> list[slice]:
+    """Parts without a gap in time; without inputs nothing is unknown in a gap."""
+    return unbroken(record.time) if record.inputs.shape[1] else [slice(0, len(record.time))]
 
 
 def _sampled_as(records: Sequence[Record], plant: AbstractPlant) -> AbstractPlant:
@@ -331,14 +409,14 @@ def _sampled_as(records: Sequence[Record], plant: AbstractPlant) -> AbstractPlan
     sampled = plant.changed(dt=usual)
     if _are_even(records, usual):
         return sampled
-    steps = [np.diff(r.time[part]).max() for r in records for part in unbroken(r.time)]
+    steps = [np.diff(r.time[part]).max() for r in records for part in _parts(r)]
     longest = plant.changed(dt=max(steps))
     return eqx.tree_at(lambda p: p.dt, longest, sampled.dt)
 
 
 def _are_even(records: Sequence[Record], dt: float) -> bool:
     """Whether all parts of the records are sampled with this time."""
-    parts = [record.time[part] for record in records for part in unbroken(record.time)]
+    parts = [record.time[part] for record in records for part in _parts(record)]
     own = [(time[-1] - time[0]) / (time.size - 1) for time in parts]
     return all(map(is_even, parts)) and bool(np.allclose(own, dt, rtol=1e-3, atol=0))
 
@@ -354,7 +432,7 @@ def _experiments(
 
     A general form, in which no input needs to be linear, shares one compilation.
     """
-    parts = [(record, part) for record in records for part in unbroken(record.time)]
+    parts = [(record, part) for record in records for part in _parts(record)]
     inputs = [record.inputs[part] for record, part in parts]
     outputs = [record.outputs[part] for record, part in parts]
     evenly = _are_even(records, float(plant.dt))
@@ -378,7 +456,7 @@ def _by_record(
     experiments, joined = iter(values), []
     for record in records:
         own = np.full(record.outputs.shape, np.nan)
-        for part in unbroken(record.time):
+        for part in _parts(record):
             rows = part.stop - part.start
             own[part] = next(experiments)[:rows]
         joined.append(np.where(np.isfinite(record.outputs), own, np.nan))
@@ -475,15 +553,16 @@ def _estimate(
 ) -> Estimate:
     """An estimate; the search is repeated where it may have missed the best one.
 
-    Where more than noise is left, it begins at several starts; where it does not converge, it
-    has longer segments.
+    Where more than noise is left, or a short record cannot tell, it begins at several starts;
+    where it does not converge, it has longer segments.
     """
     arguments = plant, experiments, start, jax.device_put(free)
     estimate = jax.device_get(estimator(*arguments))
     if not isinstance(estimator, NLS):
         return estimate
-    is_small = experiments.valid.size <= _SIZE_OF_MANY_STARTS
-    if estimator.num_starts == 1 and is_small and not _is_noise(plant, experiments, estimate):
+    size = experiments.valid.size
+    is_in_doubt = size < _TELLING or not _is_noise(plant, experiments, estimate)
+    if estimator.num_starts == 1 and size <= _SIZE_OF_MANY_STARTS and is_in_doubt:
         estimator = dataclasses.replace(estimator, num_starts=_STARTS)
         estimate = jax.device_get(estimator(*arguments))
     num_samples = experiments.valid.shape[1]
@@ -555,23 +634,27 @@ def _confidence(
     estimator: AbstractEstimator,
     fit: _Fit,
     whiteness: Mapping[str, float],
-) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Covariance of the estimates, and the sentences of the verdict."""
-    covariance = np.asarray(fit.estimate.covariance)
+    uncertain: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray | None, tuple[str, ...]]:
+    """Covariance of the estimates, its degrees of freedom, and the sentences of the verdict."""
+    covariance, degrees = np.asarray(fit.estimate.covariance), fit.estimate.degrees
     if not fit.is_successful:
         sentence = Status(int(fit.estimate.status)).sentence
         needed = f"; {estimator.name} needs {estimator.needs}" if estimator.needs else ""
-        return covariance, (*fit.reasons, sentence + needed)
+        return covariance, degrees, (*fit.reasons, sentence + needed)
     names = names_of(plant.definition.parameters)
     parameters = zip(plant.definition.parameters, fit.estimate.params, strict=True)
     size = np.array([float(value) if p.positive else p.scale for p, value in parameters])
     remarks = ()
     coloured = [name for name, p in whiteness.items() if p < RARE]
-    if coloured and isinstance(estimator, NLS):
+    if (coloured or uncertain.any()) and isinstance(estimator, NLS):
         estimate, free = jax.device_put((fit.estimate, fit.free))
-        S, residual = estimator.sensitivity(plant, experiments, estimate, free)
-        robust = robust_covariance(np.asarray(S), np.asarray(residual))
+        S, residual = map(np.asarray, estimator.sensitivity(plant, experiments, estimate, free))
+    if coloured and isinstance(estimator, NLS):
+        robust, its_degrees = robust_covariance(S, residual, np.asarray(experiments.valid))
         robust = np.outer(size, size) * robust[: len(names), : len(names)]
+        is_wider = np.diag(robust) > np.diag(covariance)
+        degrees = np.where(is_wider, its_degrees[: len(names)], degrees)
         covariance = widened(covariance, robust)
         remarks = (
             "the intervals allow for coloured noise, not for an error in the plant's equations",
@@ -581,8 +664,19 @@ def _confidence(
     remarks = tuple(
         f"the residual of {' and '.join(coloured)} is not white: {remark}" for remark in remarks
     )
+    if uncertain.any() and isinstance(estimator, NLS):
+        to_constants = np.asarray(estimator.constant_sensitivity(plant, experiments, estimate))
+        effect = effect_of_constants(S, to_constants)[: len(names)] * uncertain
+        effect *= size[:, None]
+        covariance, degrees = with_independent(covariance, degrees, effect @ effect.T)
+        told = [
+            f"{c.name} ({sd:.3g} {c.unit})".replace(" )", ")")
+            for c, sd in zip(plant.definition.constants, uncertain, strict=True)
+            if sd
+        ]
+        remarks = (*remarks, f"the intervals include the standard deviation of {', '.join(told)}")
     seen = identifiability(names, covariance / np.outer(size, size), fit.free)
-    return covariance, (*fit.reasons, seen, *remarks)
+    return covariance, degrees, (*fit.reasons, seen, *remarks)
 
 
 def _fitted(description: PlantDescription, record: Record, residual: np.ndarray) -> Fitted:

@@ -121,7 +121,8 @@ class Segments(eqx.Module):
 def over_segments(values: Array) -> Array:
     """Values by block, experiment and segment as values by experiment and segment."""
     values = jnp.moveaxis(values, 0, 1)
-    return values.reshape(len(values), -1, *values.shape[3:])
+    num_experiments, num_blocks, in_block, *rest = values.shape  # no -1: inputs may have no column
+    return values.reshape(num_experiments, num_blocks * in_block, *rest)
 
 
 def in_blocks(values: Array, num_blocks: int) -> Array:
@@ -292,7 +293,8 @@ class MultipleShooting:
             return jax.jacfwd(outputs_and_end, has_aux=True)(point, steps)
 
         shape = starts.shape[:2]
-        flat = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), (starts, block.steps))
+        count = shape[0] * shape[1]
+        flat = jax.tree.map(lambda a: a.reshape(count, *a.shape[2:]), (starts, block.steps))
         (slope, end_slope), (outputs, end) = jax.tree.map(
             lambda a: a.reshape(*shape, *a.shape[1:]), jax.vmap(differentiated)(*flat)
         )

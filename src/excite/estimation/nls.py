@@ -105,6 +105,31 @@ class NLS(AbstractEstimator):
         S = problem.sensitivity(estimate.params, estimate.initial_state)
         return S / sd[None, None, :, None], estimate.residual / sd[None, None]
 
+    def weights(
+        self, plant: AbstractPlant, experiments: Experiments, estimate: Estimate
+    ) -> Float[Array, " output"]:
+        """The standard deviations over which the residual of an estimate counts."""
+        problem = _Problem(plant, experiments, estimate.params, None)
+        is_estimated = self.noise == "estimated"
+        return problem.noise_sd(estimate.residual) if is_estimated else problem.assumed_sd
+
+    @eqx.filter_jit
+    def constant_sensitivity(
+        self, plant: AbstractPlant, experiments: Experiments, estimate: Estimate
+    ) -> Float[Array, "experiment sample output constant"]:
+        """Derivative of the outputs with respect to the known constants, weighted like these."""
+        sd = self.weights(plant, experiments, estimate)
+        names = plant.constants._fields
+
+        def outputs(values: Array) -> Array:
+            changed = plant.changed(**dict(zip(names, values, strict=True)))
+            simulated = simulate_experiments(
+                changed, estimate.params, experiments, estimate.initial_state
+            )
+            return -residual_of(experiments, simulated)
+
+        return jax.jacfwd(outputs)(jnp.stack(plant.constants)) / sd[None, None, :, None]
+
     def _search(self, problem: _Problem) -> _Found:
         """The minimum."""
         experiments, plant = problem.experiments, problem.plant
@@ -227,12 +252,17 @@ class _Problem(eqx.Module):
         unit = jax.random.uniform(jax.random.key(0), (count, len(width)), float, -1.0, 1.0)
         return self.start[None] + width[None] * unit
 
+    @property
+    def degrees(self) -> Float[Array, " output"]:
+        """Degrees of freedom of each output's residual: values less its share of the unknowns."""
+        num_experiments, num_states = self.experiments.initial_state.shape
+        states = 0 if self.experiments.initial_state_known else num_experiments * num_states
+        spent = (jnp.sum(self.free) + states) / self.num_outputs
+        return jnp.maximum(jnp.sum(self.experiments.valid, axis=(0, 1)) - spent, 1.0)
+
     def noise_sd(self, residual: Array) -> Array:
         """Standard deviation of each output's residual, corrected for the number of unknowns."""
-        num_states = 0 if self.experiments.initial_state_known else self.state_scales.size
-        spent = jnp.sum(self.free) + num_states * residual.shape[0]
-        count = jnp.sum(self.experiments.valid, axis=(0, 1)) - spent / self.num_outputs
-        sd = jnp.sqrt(jnp.sum(residual**2, axis=(0, 1)) / jnp.maximum(count, 1.0))
+        sd = jnp.sqrt(jnp.sum(residual**2, axis=(0, 1)) / self.degrees)
         return jnp.maximum(sd, self.rounding)  # noise-free data keep a finite weight
 
     def sensitivity(self, params: Params, initial_state: Array) -> Array:
@@ -269,8 +299,9 @@ class _Problem(eqx.Module):
             initial_state = found.point.starts[:, 0] * self.state_scales[None]
         # H of the weighted outputs, and V of their scores, whose sd is not the assumed one.
         ratio = (sd / found.sd)[None, :, None, None]
-        each = jnp.einsum("eokp,eokq->opq", columns, columns)
-        H, V = jnp.sum(each, axis=0), jnp.einsum("o,opq->pq", ratio[0, :, 0, 0] ** 2, each)
+        by_output = jnp.einsum("eokp,eokq->opq", columns, columns)
+        H = jnp.sum(by_output, axis=0)
+        V = jnp.einsum("o,opq->pq", ratio[0, :, 0, 0] ** 2, by_output)
         held = jnp.diag(jnp.where(self.free, 0.0, 1.0))
         active = jnp.outer(self.free, self.free)
         # Over the columns' lengths: one parameter that hardly acts leaves the others' digits.
@@ -278,6 +309,10 @@ class _Problem(eqx.Module):
         cosines = jnp.where(active, H / jnp.outer(length, length), 0.0) + held
         inverse = jnp.where(active, jnp.linalg.inv(cosines) / jnp.outer(length, length), 0.0)
         relative = inverse @ V @ inverse
+        # Of a sum of estimated variances (F. Satterthwaite, Biometrics Bulletin 2, 1946).
+        parts = jnp.einsum("o,pq,oqr,rp->op", ratio[0, :, 0, 0] ** 2, inverse, by_output, inverse)
+        spread = jnp.sum(parts**2 / self.degrees[:, None], axis=0)
+        degrees = jnp.where(spread > 0, jnp.sum(parts, axis=0) ** 2 / spread, jnp.inf)
         information = jnp.einsum("eokp,eokq->pq", columns / ratio, columns / ratio)
         return Estimate(
             params=params,
@@ -287,6 +322,7 @@ class _Problem(eqx.Module):
             initial_state=initial_state,
             residual=found.residual,
             costs=found.costs,
+            degrees=jnp.full_like(degrees, jnp.inf) if noise_is_known else degrees,
         )
 
 

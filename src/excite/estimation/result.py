@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .. import __version__
-from ..description import HALF_95, Named, PlantDescription, names_of
+from ..description import Named, PlantDescription, names_of
 from ..files import csv_text, new_run_folder, write_json
 from ..record import Record, write_record
 from ..record.rows import USABLE, EstimateSummary
@@ -56,6 +56,7 @@ class Identification:
         status: in a few words; docs/reference/machine-readable.md lists them.
         params, std_error: by parameter, in its unit, as attribute or item; the error of a held
             one is nan.
+        intervals: 95 % interval of each parameter.
         held: parameters not estimated: not identifiable and held at their start value, or
             held at a bound that they reached.
         covariance, information: of the estimates; see `excite.estimation.Estimate`.
@@ -72,6 +73,7 @@ class Identification:
     status: str
     params: Named[float]
     std_error: Named[float]
+    intervals: Named[tuple[float, float]]
     held: tuple[str, ...]
     covariance: Float[np.ndarray, "param param"]
     information: Float[np.ndarray, "param param"]
@@ -89,9 +91,12 @@ class Identification:
         return self.status in USABLE
 
     def ci95(self, name: str) -> tuple[float, float]:
-        """95 % interval of a parameter; symmetric, estimate ± 1.96 standard errors."""
-        half = HALF_95 * self.std_error[name]
-        return self.params[name] - half, self.params[name] + half
+        """95 % interval of a parameter: estimate ± t standard errors, or by profile likelihood.
+
+        t is 1.96 where the noise is known; where its size is estimated from the residual, it is
+        that of Student's distribution. An end where a profile stays open is infinite.
+        """
+        return self.intervals[name]
 
     def fit(self) -> dict[str, float]:
         """Fit in percent by output, over all records together."""

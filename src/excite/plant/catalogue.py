@@ -125,6 +125,15 @@ def _check_plant(plant: AbstractPlant, where: str) -> None:
             raise ValueError(f"{name} of {where} returns shape {shape}; ({count},) is needed")
 
 
+def require_inputs(plant: AbstractPlant) -> None:
+    """Raises ValueError for a plant without inputs, for which no experiment can be designed."""
+    if not plant.definition.inputs:
+        raise ValueError(
+            f"plant {plant.definition.name!r} has no inputs: there is no signal to design or to "
+            "play, and no policy to train"
+        )
+
+
 def with_sensor(
     plant: AbstractPlant,
     noise_sd: Mapping[str, float] | None,
