@@ -19,6 +19,7 @@ _FEW = 15
 """Samples of a residual below which the fit itself correlates it too much to be tested."""
 _MOST_LAGS = 25  # of an autoregression
 _STATIONARY = 0.999  # largest partial autocorrelation
+_LEAST = 1e-4  # of its inverse transfer function, where rounding leaves less
 _CORRECTIONS = 3  # of the autocovariances for what the fit took along
 
 
@@ -220,7 +221,8 @@ class Autoregression:
 
     def transfer(self, length: int) -> Complex[np.ndarray, " frequency"]:
         """1 / A(w) at the frequencies of a real Fourier transform of `length` values."""
-        return 1 / np.fft.rfft(np.append(1.0, -self.coefficients), length)
+        inverse = np.fft.rfft(np.append(1.0, -self.coefficients), length)
+        return 1 / np.where(np.abs(inverse) < _LEAST, _LEAST, inverse)
 
     def spectrum(self, length: int) -> Float[np.ndarray, " frequency"]:
         """Power at these frequencies."""

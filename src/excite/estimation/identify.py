@@ -756,7 +756,7 @@ def _remedies(found: Sequence[Suspect]) -> tuple[str, ...]:
     """Sentences on the suspects, the likeliest first."""
     if not found:
         return ()
-    others = [f"{s.name} ({100 * s.reduction:.2g} %)" for s in found[1:4] if s.reduction > 0]
+    others = [f"{s.name} ({100 * s.reduction:.3g} %)" for s in found[1:4] if s.reduction > 0]
     less = (f"less likely: {', '.join(others)}",) if others else ()
     return (f"likely cause: {found[0].sentence}", *less)
 

@@ -2,7 +2,7 @@
 
 Each suspect is one effect with one parameter. The plant with all of them is fitted once for each,
 with the others switched off, so that one compilation serves all. A suspect is named where it
-explains more than chance; the one that gains most likelihood comes first.
+explains more than chance; the best by the Bayesian information criterion comes first.
 """
 
 from __future__ import annotations
@@ -51,6 +51,10 @@ class Suspect:
     p_value: float
     remedy: str
 
+    def evidence(self, num_values: int) -> float:
+        """Half the gain by the Bayesian information criterion: a parameter has its price."""
+        return self.log_likelihood - (self.value is not None) * math.log(num_values) / 2
+
     @property
     def sentence(self) -> str:
         """The suspect in words."""
@@ -65,7 +69,7 @@ class Suspect:
         else:
             what = f"{self.name} = {self.value:.4g} ± {self.std_error:.2g} {self.unit}"
         return (
-            f"with {what} the sum of squared residuals would be {100 * self.reduction:.2g} % "
+            f"with {what} the sum of squared residuals would be {100 * self.reduction:.3g} % "
             f"smaller ({self.remedy})"
         )
 
@@ -79,7 +83,7 @@ def suspects(
     free: Bool[np.ndarray, " param"],
     plant_word: str,
 ) -> tuple[Suspect, ...]:
-    """The suspects that explain more than chance, in the order of the likelihood that they gain.
+    """The suspects that explain more than chance, the likeliest first.
 
     Args:
         stacked: the experiments of a plant, with some inputs linear between samples.
@@ -141,7 +145,7 @@ def suspects(
         yield outliers(before, valid, tests)
 
     found = [s for s in all_suspects() if s is not None]
-    return tuple(sorted(found, key=lambda s: -s.log_likelihood))
+    return tuple(sorted(found, key=lambda s: -s.evidence(int(valid.sum()))))
 
 
 def _neutral(whole: AbstractPlant, params: Params) -> Params:

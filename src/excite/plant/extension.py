@@ -114,6 +114,7 @@ class Extended(AbstractPlant):
     def derivative(
         self, state: Float[Array, " state"], input: Float[Array, " input"], params: Params
     ) -> Float[Array, " state"]:
+        """Of the plain plant's states, then of those of lags and drifts."""
         plain, added = self._plain(), list(state[len(self.plain.definition.states) :])
         own_state = state[: len(state) - len(added)]
         slopes, friction = [], jnp.zeros_like(own_state)
@@ -140,6 +141,7 @@ class Extended(AbstractPlant):
         return jnp.concatenate([slope, jnp.stack(slopes)]) if slopes else slope
 
     def output(self, state: Float[Array, " state"], params: Params) -> Float[Array, " output"]:
+        """Of the plain plant, with biases and drifts."""
         num_own = len(self.plain.definition.states)
         output = self._plain().output(state[:num_own], self._own(params))
         drifts = list(state[num_own + sum(e.kind == "lag" for e in self.extensions) :])
@@ -152,6 +154,7 @@ class Extended(AbstractPlant):
         return output
 
     def delay(self, params: Params) -> Float[Array, " input"] | None:
+        """Of the plain plant, and the added ones."""
         delay = self._plain().delay(self._own(params))
         for e in self.extensions:
             if e.kind == "delay":
