@@ -20,7 +20,7 @@ FILE = f"{Path(__file__).parent / 'kinetics.py'}:Conversion"
 
 def measured(plant: type, noise: float = 0.02) -> Record:
     """A record at ten uneven instants, made without the package."""
-    values = concentrations(**TRUTH)[:, -len(plant.definition.outputs) :]
+    values = concentrations(TRUTH["k1"], TRUTH["k2"])[:, -len(plant.definition.outputs) :]
     noisy = values + noise * np.random.default_rng(3).normal(size=values.shape)
     return Record(TIME, np.zeros((len(TIME), 0)), noisy, source="kinetics.csv")
 

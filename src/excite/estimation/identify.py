@@ -292,8 +292,10 @@ def _uncertain(
         if name not in values:
             raise unknown(f"{plant.definition.name} constant", name, values or ["none"])
         try:
-            is_part = isinstance(spread, str) and spread.endswith("%")
-            number = float(spread[:-1]) / 100 * abs(values[name]) if is_part else float(spread)
+            if isinstance(spread, str) and spread.endswith("%"):
+                number = float(spread[:-1]) / 100 * abs(values[name])
+            else:
+                number = float(spread)
         except (TypeError, ValueError):
             raise ValueError(f"uncertain {name!r} must be a number or 5%: got {spread!r}") from None
         if not (np.isfinite(number) and number > 0):
@@ -635,48 +637,50 @@ def _confidence(
     fit: _Fit,
     whiteness: Mapping[str, float],
     uncertain: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray | None, tuple[str, ...]]:
+) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
     """Covariance of the estimates, its degrees of freedom, and the sentences of the verdict."""
-    covariance, degrees = np.asarray(fit.estimate.covariance), fit.estimate.degrees
+    names = names_of(plant.definition.parameters)
+    covariance, its = np.asarray(fit.estimate.covariance), fit.estimate.degrees
+    degrees = np.full(len(names), np.inf) if its is None else np.asarray(its)
     if not fit.is_successful:
         sentence = Status(int(fit.estimate.status)).sentence
         needed = f"; {estimator.name} needs {estimator.needs}" if estimator.needs else ""
         return covariance, degrees, (*fit.reasons, sentence + needed)
-    names = names_of(plant.definition.parameters)
     parameters = zip(plant.definition.parameters, fit.estimate.params, strict=True)
     size = np.array([float(value) if p.positive else p.scale for p, value in parameters])
-    remarks = ()
-    coloured = [name for name, p in whiteness.items() if p < RARE]
-    if (coloured or uncertain.any()) and isinstance(estimator, NLS):
+    coloured, remarks = [name for name, p in whiteness.items() if p < RARE], []
+    not_white = f"the residual of {' and '.join(coloured)} is not white: the intervals"
+    if not isinstance(estimator, NLS):
+        if coloured:
+            remarks.append(f"{not_white} assume white noise, and are too narrow")
+    elif coloured or uncertain.any():
         estimate, free = jax.device_put((fit.estimate, fit.free))
         S, residual = map(np.asarray, estimator.sensitivity(plant, experiments, estimate, free))
-    if coloured and isinstance(estimator, NLS):
-        robust, its_degrees = robust_covariance(S, residual, np.asarray(experiments.valid))
-        robust = np.outer(size, size) * robust[: len(names), : len(names)]
-        is_wider = np.diag(robust) > np.diag(covariance)
-        degrees = np.where(is_wider, its_degrees[: len(names)], degrees)
-        covariance = widened(covariance, robust)
-        remarks = (
-            "the intervals allow for coloured noise, not for an error in the plant's equations",
-        )
-    elif coloured:
-        remarks = ("the intervals assume white noise, and are too narrow",)
-    remarks = tuple(
-        f"the residual of {' and '.join(coloured)} is not white: {remark}" for remark in remarks
-    )
-    if uncertain.any() and isinstance(estimator, NLS):
-        to_constants = np.asarray(estimator.constant_sensitivity(plant, experiments, estimate))
-        effect = effect_of_constants(S, to_constants)[: len(names)] * uncertain
-        effect *= size[:, None]
-        covariance, degrees = with_independent(covariance, degrees, effect @ effect.T)
-        told = [
-            f"{c.name} ({sd:.3g} {c.unit})".replace(" )", ")")
-            for c, sd in zip(plant.definition.constants, uncertain, strict=True)
-            if sd
-        ]
-        remarks = (*remarks, f"the intervals include the standard deviation of {', '.join(told)}")
+        if coloured:
+            robust, its = robust_covariance(S, residual, np.asarray(experiments.valid))
+            robust = np.outer(size, size) * robust[: len(names), : len(names)]
+            is_wider = np.diag(robust) > np.diag(covariance)
+            degrees = np.where(is_wider, its[: len(names)], degrees)
+            covariance = widened(covariance, robust)
+            remarks.append(
+                f"{not_white} allow for coloured noise, not for an error in the plant's equations"
+            )
+        if uncertain.any():
+            to_constants = np.asarray(estimator.constant_sensitivity(plant, experiments, estimate))
+            effect = effect_of_constants(S, to_constants)[: len(names)] * uncertain[None]
+            effect = effect * size[:, None]
+            covariance, degrees = with_independent(covariance, degrees, effect @ effect.T)
+            remarks.append(
+                f"the intervals include the standard deviation of {_told(plant, uncertain)}"
+            )
     seen = identifiability(names, covariance / np.outer(size, size), fit.free)
     return covariance, degrees, (*fit.reasons, seen, *remarks)
+
+
+def _told(plant: AbstractPlant, uncertain: np.ndarray) -> str:
+    """The uncertain constants with their standard deviations."""
+    pairs = zip(plant.definition.constants, uncertain, strict=True)
+    return ", ".join(f"{c.name} ({f'{sd:.3g} {c.unit}'.strip()})" for c, sd in pairs if sd)
 
 
 def _fitted(description: PlantDescription, record: Record, residual: np.ndarray) -> Fitted:

@@ -262,17 +262,15 @@ class MultipleShooting:
             return jax.vmap(lambda u, dt, v: delayed(u, delay, dt, v))(*arguments)
 
         now, change = jax.jvp(acting, (delay,), (jnp.ones_like(delay),))
-        first, last, *change = map(cut, (*now, *change))
-        steps = Steps(first, s.dt, last, tuple(change))
-        return dataclasses.replace(self.segments, steps=steps)
+        (first, last), change = jax.tree.map(cut, (now, change))
+        return dataclasses.replace(self.segments, steps=Steps(first, s.dt, last, change))
 
     def advance(self, x: Array, now: Steps, params: Params, delay: Array | None = None) -> Array:
         """State one sample later; `delay` is that of the inputs, for the derivatives."""
-        input, dt, next_input, change = now
-        if change is not None and delay is not None:
-            more = self.plant.delay(params) - delay
-            input, next_input = input + more * change[0], next_input + more * change[1]
-        return step(self.plant, x, input, params, dt, next_input)
+        ends, own = (now.inputs, now.next_inputs), self.plant.delay(params)
+        if now.change is not None and delay is not None and own is not None:
+            ends = jax.tree.map(lambda u, slope: u + (own - delay) * slope, ends, now.change)
+        return step(self.plant, x, ends[0], params, now.dt, ends[1])
 
     def shoot(self, z: Array, starts: Array, next_starts: Array, block: Segments) -> Shots:
         """Simulates the segments of one block."""

@@ -176,7 +176,7 @@ def _channel(whole: AbstractPlant, name: str) -> str:
 
 def _cost(estimate: Estimate) -> float:
     """Sum of squares at the end of a search; infinite where it diverged."""
-    cost = float(np.min(estimate.costs))
+    cost = math.inf if estimate.costs is None else float(np.min(estimate.costs))
     return cost if math.isfinite(cost) else math.inf
 
 

@@ -127,8 +127,7 @@ def name_of(given: object) -> str:
         return LOOP + name_of(given.signal)
     if not issubclass(kind, AbstractExcitation):
         return "policy" if isinstance(given, Policy) else "replay"
-    shipped = {c: word for word, c in EXCITATIONS.items()}
-    shipped[NoInput] = "no input"
+    shipped = {c: word for word, c in EXCITATIONS.items()} | {NoInput: "no input"}
     return shipped.get(kind, kind.__name__)  # pyright: ignore[reportArgumentType, reportCallIssue]
 
 

@@ -65,8 +65,8 @@ class LiveEstimate:
 
     def _keep(self, estimate: Estimate) -> None:
         if int(estimate.status) == Status.SUCCESSFUL:
-            estimate = jax.device_get(estimate)
-            half = half_95(estimate.covariance, estimate.degrees)
+            covariance, degrees = map(np.asarray, (estimate.covariance, estimate.degrees))
+            half = half_95(covariance, degrees)
             names = names_of(self._plant.definition.parameters)
             values = zip(map(float, estimate.params), map(float, half), strict=True)
             self._latest = {n: Interval(*v) for n, v in zip(names, values, strict=True)}
