@@ -90,6 +90,21 @@ def test_an_input_that_would_act_before_it_is_chosen_is_refused():
         simulate("aero2+delay", params={"delay_voltage": -0.05})
 
 
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda out: ex.design("aero2+delay", steps=10, out=out),
+        lambda out: ex.train("aero2+delay", out=out),
+        lambda out: ex.run(plant="aero2+delay", out=out),
+    ],
+    ids=["design", "train", "run"],
+)
+def test_designs_policies_and_rigs_refuse_a_delay(use, tmp_path):
+    with pytest.raises(ValueError, match=r"plant 'aero2\+delay_voltage' delays its inputs"):
+        use(tmp_path / "out.csv")
+    assert not list(tmp_path.iterdir())
+
+
 def test_no_delay_changes_nothing():
     rng = np.random.default_rng(3)
     u, dt = jnp.asarray(rng.normal(size=(50, 2))), jnp.asarray(rng.uniform(0.1, 0.2, 50))

@@ -126,11 +126,19 @@ def _check_plant(plant: AbstractPlant, where: str) -> None:
 
 
 def require_inputs(plant: AbstractPlant) -> None:
-    """Raises ValueError for a plant without inputs, for which no experiment can be designed."""
+    """Raises ValueError for a plant without inputs, or with inputs that act late.
+
+    Designs, policies, studies and rigs need inputs that act at once.
+    """
     if not plant.definition.inputs:
         raise ValueError(
             f"plant {plant.definition.name!r} has no inputs: there is no signal to design or to "
             "play, and no policy to train"
+        )
+    if plant.delay(plant.nominal) is not None:
+        raise ValueError(
+            f"plant {plant.definition.name!r} delays its inputs: it can be simulated and "
+            "identified, but not be used for designs, policies, studies and rigs"
         )
 
 
