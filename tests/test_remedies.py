@@ -90,6 +90,15 @@ def test_the_remedy_is_a_plant_that_explains_the_record(effect):
     assert result.suspects == ()
 
 
+def test_a_plant_with_an_extension_may_leave_out_another():
+    """The order of the effects is not that in which they are found."""
+    both = "aero2+coulomb_pitch_rate+delay_voltage"
+    record = unnamed(ex.simulate(both, "multisine", seed=4))
+    first = ex.identify(record, "aero2+coulomb", initial_state="known").suspects[0]
+    assert first.remedy == f"--plant {both}"
+    assert first.value == pytest.approx(0.05, rel=0.05)
+
+
 def test_a_record_of_the_very_plant_has_no_suspect():
     for seed in range(3):
         record = unnamed(ex.simulate("aero2", "multisine", seed=seed))

@@ -94,17 +94,17 @@ def suspects(
     """
     names = [name for name in extensions_of(plant) if not name.startswith("bias_")]
     whole = extended(plant, names)
-    neutral = _neutral(whole, params)
+    neutral, all_names = _neutral(whole, params), names_of(whole.definition.parameters)
+    own = {name for name, is_free in zip(params._fields, free, strict=True) if is_free}
     search = dataclasses.replace(estimator, num_starts=1, known=())
+    as_given = stacked(whole, linear)
+    valid, tests = np.asarray(as_given.valid), len(names) + len(linear) + 1
 
-    def fitted(start: Params, chosen: str | None, linear: np.ndarray = linear) -> Estimate:
-        own = np.array([*free, *(name == chosen for name in names)])
-        return jax.device_get(search(whole, stacked(whole, linear), *jax.device_put((start, own))))
+    def fitted(data: Experiments, start: Params, *chosen: str) -> Estimate:
+        is_free = np.array([name in own or name in chosen for name in all_names])
+        return jax.device_get(search(whole, data, *jax.device_put((start, is_free))))
 
-    valid = np.asarray(stacked(whole, linear).valid)
-    none = fitted(neutral, None)
-    tests = len(names) + len(linear) + 1
-    before = np.asarray(none.residual)
+    before = np.asarray(fitted(as_given, neutral).residual)
 
     def suspect(
         name: str, estimate: Estimate, freedoms: int, remedy: str, index: int | None = None
@@ -131,17 +131,16 @@ def suspects(
 
     def all_suspects() -> Iterator[Suspect | None]:
         for name in names:
-            index = names_of(whole.definition.parameters).index(name)
-            begins = _begins(whole, stacked(whole, linear), name)
-            found = [fitted(neutral._replace(**{name: floats(b)}), name) for b in begins]
-            best = min(found, key=_cost)
+            begins = [neutral._replace(**{name: floats(b)}) for b in _begins(whole, as_given, name)]
+            best = min((fitted(as_given, begin, name) for begin in begins), key=_cost)
             freedoms = 2 if name.startswith("drift_") else 1
-            yield suspect(name, best, freedoms, f"--plant {plant_word}+{name}", index)
+            remedy = f"--plant {plant_word}+{name}"
+            yield suspect(name, best, freedoms, remedy, all_names.index(name))
         for i, channel in enumerate(names_of(plant.definition.inputs)):
             other = linear ^ (np.arange(len(linear)) == i)
             word = "linear" if other[i] else "constant"
-            with_other = fitted(neutral, None, other)
-            yield suspect(f"{word}_{channel}", with_other, 1, f"--hold-input {channel}={word}")
+            found = fitted(stacked(whole, other), neutral)
+            yield suspect(f"{word}_{channel}", found, 1, f"--hold-input {channel}={word}")
         yield outliers(before, valid, tests)
 
     found = [s for s in all_suspects() if s is not None]
@@ -150,9 +149,11 @@ def suspects(
 
 def _neutral(whole: AbstractPlant, params: Params) -> Params:
     """The estimate, and values of all suspects that have no effect."""
-    rest = whole.definition.parameters[len(params) :]
-    largest = {p.name: 1e6 * p.nominal for p in rest if p.name.startswith("saturation_")}
-    return whole.Params(*params, *(floats(largest.get(p.name, 0.0)) for p in rest))
+    values = {
+        p.name: floats(1e6 * p.nominal if p.name.startswith("saturation_") else 0.0)
+        for p in whole.definition.parameters
+    }
+    return whole.Params(**{**values, **params._asdict()})
 
 
 def _begins(whole: AbstractPlant, experiments: Experiments, name: str) -> Sequence[float]:
