@@ -63,6 +63,7 @@ _NOTHING_SEEN = (
     "(--start)?"
 )
 _STARTS, _SIZE_OF_MANY_STARTS = 8, 50_000  # measured values up to which so many are tried
+_SIZE_OF_SUSPECTS = 10_000  # measured values up to which suspects are tried
 _TELLING = 50  # measured values from which the residual tells whether the search missed something
 _FREE = 100.0  # scales of a parameter of free sign that are small for its standard error
 _SAME = 1e-6  # relative difference of sums of squares at one minimum
@@ -740,7 +741,7 @@ def _suspects(
     """What the plant may leave out, where more than noise is left; not for long records."""
     if not isinstance(estimator, NLS) or not fit.is_successful:
         return ()
-    if experiments.valid.size > _SIZE_OF_MANY_STARTS:
+    if experiments.valid.size > _SIZE_OF_SUSPECTS:
         return ()
     residual, valid = np.asarray(fit.estimate.residual), np.asarray(experiments.valid)
     if _is_noise(plant, experiments, fit.estimate) and outliers(residual, valid) is None:

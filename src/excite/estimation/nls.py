@@ -48,6 +48,7 @@ class NLS(AbstractEstimator):
             its scale), the size of the noise from the residual; "known": that follows from
             the declaration, too; "estimated": the weights follow from the residual, too.
         known: names of parameters that are held where the search starts.
+        is_near: the search starts near the minimum, and leaves out its first phase.
     """
 
     tolerance: float = eqx.field(static=True, default=1e-4)
@@ -56,6 +57,7 @@ class NLS(AbstractEstimator):
     num_starts: int = eqx.field(static=True, default=1)
     noise: Noise = eqx.field(static=True, default="declared")
     known: tuple[str, ...] = eqx.field(static=True, default=())
+    is_near: bool = eqx.field(static=True, default=False)
     name: str = eqx.field(static=True, default="nls", kw_only=True)
 
     @eqx.filter_jit
@@ -157,7 +159,9 @@ class NLS(AbstractEstimator):
         first = experiments.initial_state / problem.state_scales[None]
         starts = jnp.tile(first[:, None], (1, segments.shape[1], 1))
         sd = problem.assumed_sd
-        if self.num_starts == 1:
+        if self.is_near:
+            found = search(shooting.chained(Point(problem.start, starts)), sd)
+        elif self.num_starts == 1:
             found = search(matched(problem.start), sd)
         else:
             around = jnp.stack([problem.start, *problem.starts_around(self.num_starts - 2)])

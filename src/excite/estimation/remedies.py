@@ -1,7 +1,7 @@
 """What the plant's equations may leave out, when a residual is not noise.
 
 Each suspect is one effect with one parameter. The plant with all of them is fitted once for each,
-with the others switched off, so that one compilation serves all. A suspect is named where it
+with the others switched off, all side by side. A suspect is named where it
 explains more than chance; the best by the Bayesian information criterion comes first.
 """
 
@@ -9,11 +9,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Bool, Float
 
 from ..description import RARE, names_of
 from ..plant import AbstractPlant, Params, floats
@@ -24,6 +27,7 @@ from .nls import NLS
 
 Residual = Float[np.ndarray, "experiment sample output"]
 
+_STEPS = 30  # most steps of one fit
 _FREEDOMS = 2.0, 3.0, 4.0, 6.0, 10.0, 20.0  # of Student's t for outliers
 _FAR = 4.0  # standard deviations of the bulk beyond which a sample is an outlier
 
@@ -93,18 +97,29 @@ def suspects(
         plant_word: the plant on the command line.
     """
     names = [name for name in extensions_of(plant) if not name.startswith("bias_")]
-    whole = extended(plant, names)
+    whole, num_inputs = extended(plant, names), len(linear)
     neutral, all_names = _neutral(whole, params), names_of(whole.definition.parameters)
-    own = {name for name, is_free in zip(params._fields, free, strict=True) if is_free}
-    search = dataclasses.replace(estimator, num_starts=1, known=())
-    as_given = stacked(whole, linear)
-    valid, tests = np.asarray(as_given.valid), len(names) + len(linear) + 1
-
-    def fitted(data: Experiments, start: Params, *chosen: str) -> Estimate:
-        is_free = np.array([name in own or name in chosen for name in all_names])
-        return jax.device_get(search(whole, data, *jax.device_put((start, is_free))))
-
-    before = np.asarray(fitted(as_given, neutral).residual)
+    own = [name for name, is_free in zip(params._fields, free, strict=True) if is_free]
+    data = stacked(whole, np.ones(num_inputs, bool))
+    trials = [_Trial("", neutral, linear)]
+    for name in names:
+        trials += [
+            _Trial(name, neutral._replace(**{name: floats(b)}), linear)
+            for b in _begins(whole, data, name)
+        ]
+    for i, channel in enumerate(names_of(plant.definition.inputs)):
+        other = linear ^ (np.arange(num_inputs) == i)
+        trials.append(_Trial(f"{'linear' if other[i] else 'constant'}_{channel}", neutral, other))
+    is_free = np.array([[n in own or n == t.name for n in all_names] for t in trials])
+    starts = np.array([[float(value) for value in t.start] for t in trials])
+    ends = np.array([t.linear for t in trials])
+    search = dataclasses.replace(estimator, num_starts=1, known=(), is_near=True, max_steps=_STEPS)
+    found = jax.device_get(
+        _all_fitted(search, whole, data, *jax.device_put((starts, is_free, ends)))
+    )
+    estimates = [jax.tree.map(lambda leaf, i=i: leaf[i], found) for i in range(len(trials))]
+    valid, tests = np.asarray(data.valid), len(names) + num_inputs + 1
+    before = np.asarray(estimates[0].residual)
 
     def suspect(
         name: str, estimate: Estimate, freedoms: int, remedy: str, index: int | None = None
@@ -129,22 +144,46 @@ def suspects(
             remedy=remedy,
         )
 
-    def all_suspects() -> Iterator[Suspect | None]:
-        for name in names:
-            begins = [neutral._replace(**{name: floats(b)}) for b in _begins(whole, as_given, name)]
-            best = min((fitted(as_given, begin, name) for begin in begins), key=_cost)
-            freedoms = 2 if name.startswith("drift_") else 1
-            remedy = f"--plant {plant_word}+{name}"
-            yield suspect(name, best, freedoms, remedy, all_names.index(name))
-        for i, channel in enumerate(names_of(plant.definition.inputs)):
-            other = linear ^ (np.arange(len(linear)) == i)
-            word = "linear" if other[i] else "constant"
-            found = fitted(stacked(whole, other), neutral)
-            yield suspect(f"{word}_{channel}", found, 1, f"--hold-input {channel}={word}")
-        yield outliers(before, valid, tests)
+    best: dict[str, Estimate] = {}
+    for trial, estimate in zip(trials[1:], estimates[1:], strict=True):
+        best[trial.name] = min(best.get(trial.name, estimate), estimate, key=_cost)
+    named = [outliers(before, valid, tests)]
+    for name, estimate in best.items():
+        if name in names:
+            freedoms, remedy = 1 + name.startswith("drift_"), f"--plant {plant_word}+{name}"
+            named.append(suspect(name, estimate, freedoms, remedy, all_names.index(name)))
+        else:
+            word, _, channel = name.partition("_")
+            named.append(suspect(name, estimate, 1, f"--hold-input {channel}={word}"))
+    likely = [s for s in named if s is not None]
+    return tuple(sorted(likely, key=lambda s: -s.evidence(int(valid.sum()))))
 
-    found = [s for s in all_suspects() if s is not None]
-    return tuple(sorted(found, key=lambda s: -s.evidence(int(valid.sum()))))
+
+class _Trial(NamedTuple):
+    """A fit with one suspect: its name, where it starts, and which inputs are linear."""
+
+    name: str
+    start: Params
+    linear: Bool[np.ndarray, " input"]
+
+
+@eqx.filter_jit
+def _all_fitted(
+    search: NLS,
+    plant: AbstractPlant,
+    data: Experiments,
+    starts: Float[Array, "trial param"],
+    free: Bool[Array, "trial param"],
+    linear: Bool[Array, "trial input"],
+) -> Estimate:
+    """All trials side by side; `data` has all inputs linear between samples."""
+
+    def fitted(start: Array, free: Array, linear: Array) -> Estimate:
+        ends = jnp.where(linear, data.next_inputs, data.inputs)
+        own = dataclasses.replace(data, next_inputs=ends)
+        return search(plant, own, plant.Params(*start), free)
+
+    return jax.vmap(fitted)(starts, free, linear)
 
 
 def _neutral(whole: AbstractPlant, params: Params) -> Params:
