@@ -30,7 +30,7 @@ from .contract import (
 )
 from .multiple_shooting import MultipleShooting, Point, Segments
 
-_FAR = 30.0  # logarithm of a positive parameter over its nominal value
+_FAR = 30.0  # largest logarithm of a positive parameter over its nominal value
 Noise = Literal["declared", "known", "estimated"]
 
 
@@ -239,13 +239,13 @@ class _Problem(eqx.Module):
     def params(self, z: Float[Array, " param"]) -> Float[Array, " param"]:
         """Parameters at search coordinates; held ones stay at the start.
 
-        A positive one that the data do not tell from zero, or from infinity, ends far away.
+        A positive one stays within a factor of exp(30) of its nominal value.
         """
         d = self.plant.definition
         usual = to_search(d, self.plant.nominal)
         positive = jnp.asarray([p.positive for p in d.parameters])
         beyond = jax.lax.stop_gradient(z - jnp.clip(z, usual - _FAR, usual + _FAR))
-        z = z - jnp.where(positive, beyond, 0.0)  # its derivative goes on
+        z = z - jnp.where(positive, beyond, 0.0)  # the derivative is kept beyond the limit
         return from_search(d, jnp.where(self.free, z, self.start))
 
     def starts_around(self, count: int) -> Float[Array, "start param"]:
