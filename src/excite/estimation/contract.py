@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import abc
 import enum
+import math
 from collections.abc import Sequence
 from typing import ClassVar, TypeAlias
 
@@ -125,8 +126,7 @@ class Estimate(eqx.Module):
         status: a `Status`.
         initial_state: known or estimated.
         residual: measured minus simulated outputs, zero where padded.
-        costs: weighted sum of squares at the end of each search, infinite where it did not
-            converge; None for estimators that do not search.
+        cost: weighted sum of squares at the end of a search; infinite where there is none.
         degrees: degrees of freedom of Student's t for each parameter's interval, infinite where
             the noise is known; None counts as infinite.
     """
@@ -137,8 +137,14 @@ class Estimate(eqx.Module):
     status: Int[Array, ""]
     initial_state: Float[Array, "experiment state"]
     residual: Float[Array, "experiment sample output"]
-    costs: Float[Array, " start"] | None = None
+    cost: Float[Array, ""] | float = math.inf
     degrees: Float[Array, " param"] | None = None
+
+
+def quality(estimate: Estimate) -> float:
+    """The cost, smaller is better; of two alike a successful estimate counts more."""
+    cost = float(estimate.cost) * (1.0 if int(estimate.status) == Status.SUCCESSFUL else 1.01)
+    return cost if math.isfinite(cost) else math.inf
 
 
 class AbstractEstimator(eqx.Module):

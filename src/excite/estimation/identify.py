@@ -36,7 +36,10 @@ from .contract import (
     Experiments,
     Status,
     bound_reached,
+    from_search,
+    quality,
     stack_experiments,
+    to_search,
 )
 from .diagnosis import (
     chance_of_fit,
@@ -51,12 +54,11 @@ from .diagnosis import (
 )
 from .nls import NLS
 from .profile import profile_intervals
-from .remedies import Suspect, outliers, suspects
+from .remedies import HOLDS, Suspect, outliers, suspects
 from .result import Fitted, Identification
 
 InitialState = Literal["auto", "free", "known"]
 Intervals = Literal["linear", "profile"]
-_HOLDS = "constant", "linear"  # an input between samples
 _NOTHING_SEEN = (
     "no parameter is identifiable from the data; are columns, signs and units right, and does the "
     "input move the plant beyond the noise? or did the search begin too far from the truth "
@@ -66,7 +68,7 @@ _STARTS, _SIZE_OF_MANY_STARTS = 8, 50_000  # measured values up to which so many
 _SIZE_OF_SUSPECTS = 10_000  # measured values up to which suspects are tried
 _TELLING = 50  # measured values from which the residual tells whether the search missed something
 _FREE = 100.0  # scales of a parameter of free sign that are small for its standard error
-_SAME = 1e-6  # relative difference of sums of squares at one minimum
+_SAME = 0.01  # difference of sums of squares at one minimum, over the noise
 _BY_CHANCE = 1e-3  # a fit with a larger p-value explains nothing
 
 
@@ -187,7 +189,7 @@ def identify(
     )
     wrong = _wrong_structure(structure, estimator) if fit.is_successful else ()
     others = tuple(s for record in [*records, *validation] for s in _other_plant(record, plant))
-    found = _suspects(plant, records, experiments, estimator, fit, linear)
+    found = _suspects(plant, records, experiments, estimator, begin, fit, linear)
     verdict = (*others, *wrong, *_remedies(found), *_agreement(fit), *verdict)
     names, d = names_of(plant.definition.parameters), plant.description
     values = np.array([float(value) for value in fit.estimate.params])
@@ -350,7 +352,7 @@ def _linear_inputs(
                 f"plant {plant.definition.name!r} has no input {name!r} to hold; it has "
                 f"{', '.join(names)}"
             )
-        if word not in _HOLDS:
+        if word not in HOLDS:
             raise ValueError(f"hold_input of {name!r} must be constant or linear: got {word!r}")
     return np.array([by_name.get(name) == "linear" for name in names], bool)
 
@@ -429,17 +431,15 @@ def _experiments(
     records: Sequence[Record],
     known: bool,
     linear: np.ndarray,
-    is_general: bool = False,
 ) -> Experiments:
     """The parts of all records without gaps, as experiments.
 
-    A general form, in which no input needs to be linear, shares one compilation.
+    They have next inputs even where all are held: one program is compiled for both.
     """
     parts = [(record, part) for record in records for part in _parts(record)]
     inputs = [record.inputs[part] for record, part in parts]
     outputs = [record.outputs[part] for record, part in parts]
     evenly = _are_even(records, float(plant.dt))
-    next_inputs = [np.where(linear, rows[1:], rows[:-1]) for rows in inputs]
     seen = [np.isfinite(rows) for rows in outputs]
     return stack_experiments(
         plant,
@@ -447,7 +447,7 @@ def _experiments(
         outputs,
         known,
         dt=None if evenly else [np.diff(record.time[part]) for record, part in parts],
-        next_inputs=next_inputs if is_general or linear.any() else None,
+        next_inputs=[np.where(linear, rows[1:], rows[:-1]) for rows in inputs],
         seen=None if all(rows.all() for rows in seen) else seen,
     )
 
@@ -481,12 +481,16 @@ def _known(plant: AbstractPlant, estimator: AbstractEstimator) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Fit:
-    """An estimate, its free and known parameters, and a sentence for each held one."""
+    """An estimate, its free and known parameters, and a sentence for each held one.
+
+    `others` are the ends of searches that began elsewhere.
+    """
 
     estimate: Estimate
     free: np.ndarray
     known: np.ndarray
     reasons: tuple[str, ...]
+    others: Sequence[Estimate] = ()
 
     def has_ended_in(self, status: Status) -> bool:
         return int(self.estimate.status) == status
@@ -530,9 +534,9 @@ def _fit_seen(
     names = names_of(plant.definition.parameters)
     known = _known(plant, estimator)
     free, reasons = ~known, ()
+    found = _estimate(plant, experiments, estimator, start, free)
     while True:
-        estimate = _estimate(plant, experiments, estimator, start, free)
-        fit = _Fit(estimate, free, known, reasons)
+        fit = _Fit(found[0], free, known, reasons, found[1:])
         # ARX estimates all parameters or none.
         if not isinstance(estimator, NLS) or fit.has_ended_in(Status.NOT_FINITE):
             return fit
@@ -540,11 +544,14 @@ def _fit_seen(
         if held is None:
             return fit
         chosen, value, why = held
-        start = start._replace(**{names[chosen]: floats(value)})
+        start, last = (
+            params._replace(**{names[chosen]: floats(value)}) for params in (start, found[0].params)
+        )
         free = free & (np.arange(len(names)) != chosen)
         reasons = (*reasons, why)
         if not free.any():
             raise ValueError(_NOTHING_SEEN)
+        found = _estimate(plant, experiments, estimator, start, free, [last])
 
 
 def _estimate(
@@ -553,29 +560,40 @@ def _estimate(
     estimator: AbstractEstimator,
     start: Params,
     free: np.ndarray,
-) -> Estimate:
-    """An estimate; the search is repeated where it may have missed the best one.
+    others: Sequence[Params] | None = None,
+) -> list[Estimate]:
+    """Estimates, the best first; the search is repeated where it may have missed the best one.
 
-    Where more than noise is left, or a short record cannot tell, it begins at several starts;
-    where it does not converge, it has longer segments.
+    Where more than noise is left, or a short record cannot tell, it begins at other starts as
+    well, default random ones; where it does not converge, it has longer segments.
     """
-    arguments = plant, experiments, start, jax.device_put(free)
-    estimate = jax.device_get(estimator(*arguments))
+
+    def search(estimator: AbstractEstimator, start: Params) -> Estimate:
+        return jax.device_get(estimator(plant, experiments, *jax.device_put((start, free))))
+
+    found = [search(estimator, start)]
     if not isinstance(estimator, NLS):
-        return estimate
-    size = experiments.valid.size
-    is_in_doubt = size < _TELLING or not _is_noise(plant, experiments, estimate)
-    if estimator.num_starts == 1 and size <= _SIZE_OF_MANY_STARTS and is_in_doubt:
-        estimator = dataclasses.replace(estimator, num_starts=_STARTS)
-        estimate = jax.device_get(estimator(*arguments))
-    num_samples = experiments.valid.shape[1]
+        return found
+    size, num_samples = experiments.valid.size, experiments.valid.shape[1]
+    is_in_doubt = size < _TELLING or not _is_noise(plant, experiments, found[0])
+    if size <= _SIZE_OF_MANY_STARTS and is_in_doubt:
+        others = _starts_around(plant, start, free) if others is None else others
+        found += [search(estimator, other) for other in others]
+        found.sort(key=quality)
     length = estimator.length_of_segments(plant, num_samples)
-    while int(estimate.status) == Status.ITERATIONS_EXHAUSTED and length < num_samples:
+    while int(found[0].status) == Status.ITERATIONS_EXHAUSTED and length < num_samples:
         length *= 4
-        longer = dataclasses.replace(estimator, segment_length=length)
-        again = jax.device_get(longer(*arguments))
-        estimate = again if int(again.status) == Status.SUCCESSFUL else estimate
-    return estimate
+        longer = search(dataclasses.replace(estimator, segment_length=length), start)
+        found = [longer] if int(longer.status) == Status.SUCCESSFUL else found
+    return found
+
+
+def _starts_around(plant: AbstractPlant, start: Params, free: np.ndarray) -> list[Params]:
+    """Random starts around one, always the same: up to a factor of three away."""
+    d, z = plant.definition, to_search(plant.definition, start)
+    width = np.where(free, [np.log(3) if p.positive else 2.0 for p in d.parameters], 0.0)
+    unit = np.random.default_rng(0).uniform(-1, 1, (_STARTS - 1, len(width)))
+    return [plant.Params(*from_search(d, z + width * row)) for row in unit]
 
 
 def _is_noise(plant: AbstractPlant, experiments: Experiments, estimate: Estimate) -> bool:
@@ -735,6 +753,7 @@ def _suspects(
     records: Sequence[Record],
     experiments: Experiments,
     estimator: AbstractEstimator,
+    start: Params,
     fit: _Fit,
     linear: np.ndarray,
 ) -> tuple[Suspect, ...]:
@@ -747,14 +766,14 @@ def _suspects(
     if _is_noise(plant, experiments, fit.estimate) and outliers(residual, valid) is None:
         return ()
 
-    def stacked(plant: AbstractPlant, linear: np.ndarray) -> Experiments:
-        return _experiments(plant, records, experiments.initial_state_known, linear, True)
-
     name, plus, extensions = plant.definition.name.partition("+")
     word = (
         f"{name if name in PLANTS else 'FILE.py:' + plain_kind(plant).__name__}{plus}{extensions}"
     )
-    return suspects(plant, stacked, linear, estimator, fit.estimate.params, fit.free, word)
+    stacked = partial(_experiments, plant, records, experiments.initial_state_known)
+    return suspects(
+        plant, experiments, stacked, linear, estimator, start, fit.estimate, ~fit.known, word
+    )
 
 
 def _remedies(found: Sequence[Suspect]) -> tuple[str, ...]:
@@ -768,11 +787,12 @@ def _remedies(found: Sequence[Suspect]) -> tuple[str, ...]:
 
 def _agreement(fit: _Fit) -> tuple[str, ...]:
     """A sentence on how many of several starts ended at the estimate."""
-    costs = np.asarray(fit.estimate.costs)
-    if not fit.is_successful or costs.size <= 1:
+    if not fit.is_successful or not fit.others:
         return ()
-    same = np.sum(costs <= (1 + _SAME) * np.min(costs))
-    return (f"{same} of {costs.size} starts of the search ended at this estimate",)
+    ends = [fit.estimate, *fit.others]
+    most = (1 + _SAME / fit.estimate.residual.size) * float(fit.estimate.cost)
+    same = sum(float(end.cost) <= most for end in ends)
+    return (f"{same} of {len(ends)} starts of the search ended at this estimate",)
 
 
 def _require_explanation(

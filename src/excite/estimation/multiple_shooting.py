@@ -59,6 +59,8 @@ _GROWTH, _SHRINKING = 10.0, 0.1  # of the radius after a good and after a refuse
 _CAREFUL = 2.0  # growth after a step was refused
 _LARGEST = {True: 1.0, False: 10.0}
 """Change in one step of the logarithm of a positive parameter, of a free one over its scale."""
+_IDLE = 1e-3  # a gain of the last step, over the noise, that ends a search without steps left
+_SHORT = 0.3  # part of a step below which the radius shrinks
 _MOST = 1e30  # largest damping over the squared length of a column
 _CLOSED = 1e-6  # a gap that is closed to first order leaves its square
 _BLOCK = 2**14
@@ -212,6 +214,7 @@ class _Search(NamedTuple):
     sweep: Sweep
     cost: Float[Array, ""]
     predicted: Float[Array, ""]
+    gained: Float[Array, ""]
     radius: Float[Array, ""]
     growth: Float[Array, ""]
     part: Float[Array, ""]
@@ -490,21 +493,6 @@ class MultipleShooting:
         found = jax.lax.while_loop(goes_on, match, begin)
         return _where(found.is_closed, found.here, found.best)
 
-    def chained(self, start: Point) -> Point:
-        """The start states of all segments from one simulation."""
-        params = self.plant.Params(*self.params_at(start.z))
-
-        def segment(state: Array, steps: Steps) -> tuple[Array, Array]:
-            def advance(x: Array, now: Steps) -> tuple[Array, None]:
-                return self.advance(x, now, params), None
-
-            end, _ = jax.lax.scan(advance, state * self.scales, steps)
-            return end / self.scales, state
-
-        steps = jax.tree.map(over_segments, self.delayed(start.z).steps)
-        chain = jax.vmap(lambda first, steps: jax.lax.scan(segment, first, steps)[1])
-        return start._replace(starts=chain(start.starts[:, 0], steps))
-
     def weighted(self, sweep: Sweep, sd: Array) -> Float[Array, "experiment unknown unknown"]:
         """The triangle of all outputs over their standard deviations; unknowns, then value."""
         triangles = sweep.triangles / sd[None, :, None, None]
@@ -589,19 +577,33 @@ class MultipleShooting:
             accepted = (gained >= _ACCEPTED * hoped) | is_equal | is_bold | (s.steps == 0)
             best, sweep, cost = _where(accepted, (s.here, sweep, cost), (s.best, s.sweep, s.cost))
             triangle = self.weighted(sweep, sd)
-            grown = jnp.where(gained > _GOOD * hoped, s.growth, 1.0)
-            radius = jnp.clip(s.radius * jnp.where(accepted, grown, _SHRINKING), 1e-9, 1e18)
+            is_good = gained > _GOOD * hoped
+            # Where the residual is large a step may be too long, and its direction right: a part
+            # of it is tried before the radius shrinks.
+            shrinking = jnp.where(s.part > _SHORT, 1.0, _SHRINKING)
+            grown = jnp.where(is_good, s.growth, 1.0)
+            radius = jnp.clip(s.radius * jnp.where(accepted, grown, shrinking), 1e-9, 1e18)
             growth = jnp.where(accepted, s.growth, _CAREFUL)
-            part = jnp.where(accepted, jnp.minimum(2 * s.part, 1.0), 0.5 * s.part)
+            longer = jnp.where(is_good, jnp.minimum(2 * s.part, 1.0), s.part)
+            part = jnp.where(accepted, longer, 0.5 * s.part)
             change, outputs = self.limited_step(sweep.moves, triangle, 1 / radius)
             reached = jnp.sum((triangle[..., -1] + outputs) ** 2)
             least = jnp.maximum(tolerance**2 * cost / count, rounding**2)
             is_closed = jnp.max(jnp.abs(sweep.moves[..., -1])) < _CLOSED
             settled = accepted & is_closed & (jnp.sum(outputs**2) <= least)
             here = jax.tree.map(lambda at, by: at + part * by, best, change)
-            predicted = cost + part * (reached - cost)
             return _Search(
-                here, best, sweep, cost, predicted, radius, growth, part, s.steps + 1, settled
+                here=here,
+                best=best,
+                sweep=sweep,
+                cost=cost,
+                predicted=cost + part * (reached - cost),
+                gained=jnp.where(accepted, gained, s.gained),
+                radius=radius,
+                growth=growth,
+                part=part,
+                steps=s.steps + 1,
+                converged=settled,
             )
 
         def goes_on(s: _Search) -> Array:
@@ -615,6 +617,7 @@ class MultipleShooting:
             sweep=jax.tree.map(lambda a: jnp.zeros(a.shape), nothing),
             cost=jnp.asarray(jnp.inf),
             predicted=jnp.asarray(0.0),
+            gained=jnp.asarray(jnp.inf),
             radius=jnp.asarray(1e3),
             growth=jnp.asarray(_GROWTH),
             part=jnp.asarray(1.0),
@@ -624,7 +627,8 @@ class MultipleShooting:
         found = jax.lax.while_loop(goes_on, improve, search)
         # The last step is taken too; it is too small for the sweep to change.
         point = _where(found.converged, found.here, found.best)
-        return point, found.sweep, found.converged
+        is_idle = found.gained <= _IDLE * found.cost / count
+        return point, found.sweep, found.converged | (found.steps == max_steps) & is_idle
 
 
 def _next_width(width: Array, mean_square: Array, is_first: Array) -> Array:

@@ -42,22 +42,17 @@ class NLS(AbstractEstimator):
             this part of its standard error.
         max_steps: of the search.
         segment_length: of multiple shooting [samples], default one for the record's length.
-        num_starts: of the search: the given one, the same without the first phase, and random
-            ones around it, side by side. The smallest sum of squares counts.
         noise: "declared": an output's weight follows from its declared noise (without one, from
             its scale), the size of the noise from the residual; "known": that follows from
             the declaration, too; "estimated": the weights follow from the residual, too.
         known: names of parameters that are held where the search starts.
-        is_near: the search starts near the minimum, and leaves out its first phase.
     """
 
     tolerance: float = eqx.field(static=True, default=1e-4)
     max_steps: int = eqx.field(static=True, default=100)
     segment_length: int | None = eqx.field(static=True, default=None)
-    num_starts: int = eqx.field(static=True, default=1)
     noise: Noise = eqx.field(static=True, default="declared")
     known: tuple[str, ...] = eqx.field(static=True, default=())
-    is_near: bool = eqx.field(static=True, default=False)
     name: str = eqx.field(static=True, default="nls", kw_only=True)
 
     @eqx.filter_jit
@@ -149,27 +144,12 @@ class NLS(AbstractEstimator):
                 max_steps=self.max_steps,
             )
             misfit = sweep.misfit.reshape(segments.shape[0], -1, problem.num_outputs)
-            residual = -misfit[:, :num_samples]
-            cost = jnp.sum((residual / sd[None, None]) ** 2)[None]
-            return _Found(point, converged, sweep.triangles, residual, sd, cost)
-
-        def matched(z: Array) -> Point:
-            return shooting.matched(Point(z, starts), sd)
+            return _Found(point, converged, sweep.triangles, -misfit[:, :num_samples], sd)
 
         first = experiments.initial_state / problem.state_scales[None]
         starts = jnp.tile(first[:, None], (1, segments.shape[1], 1))
         sd = problem.assumed_sd
-        if self.is_near:
-            found = search(shooting.chained(Point(problem.start, starts)), sd)
-        elif self.num_starts == 1:
-            found = search(matched(problem.start), sd)
-        else:
-            around = jnp.stack([problem.start, *problem.starts_around(self.num_starts - 2)])
-            one = shooting.chained(Point(problem.start, starts))
-            points = jax.tree.map(
-                lambda many, one: jnp.concatenate([many, one[None]]), jax.vmap(matched)(around), one
-            )
-            found = _best(jax.vmap(search, in_axes=(0, None))(points, sd))
+        found = search(shooting.matched(Point(problem.start, starts), sd), sd)
         if self.noise == "estimated" and problem.num_outputs > 1:
             found = search(found.point, problem.noise_sd(found.residual))
         return found
@@ -189,15 +169,6 @@ class _Found(NamedTuple):
     triangles: Float[Array, "experiment output column column"]
     residual: Float[Array, "experiment sample output"]
     sd: Float[Array, " output"]
-    costs: Float[Array, " start"]
-
-
-def _best(found: _Found) -> _Found:
-    """The best of several searches; one that converged counts more than one that did not."""
-    costs = jnp.where(jnp.isfinite(found.costs[:, 0]), found.costs[:, 0], jnp.inf)
-    best = jnp.lexsort((costs, ~found.converged))[0]
-    chosen = jax.tree.map(lambda a: a[best], found)
-    return chosen._replace(sd=found.sd[0], costs=jnp.where(found.converged, costs, jnp.inf))
 
 
 class _Problem(eqx.Module):
@@ -247,14 +218,6 @@ class _Problem(eqx.Module):
         beyond = jax.lax.stop_gradient(z - jnp.clip(z, usual - _FAR, usual + _FAR))
         z = z - jnp.where(positive, beyond, 0.0)  # the derivative is kept beyond the limit
         return from_search(d, jnp.where(self.free, z, self.start))
-
-    def starts_around(self, count: int) -> Float[Array, "start param"]:
-        """Random search coordinates around the start, always the same: factors up to three."""
-        width = jnp.asarray(
-            [math.log(3) if p.positive else 2.0 for p in self.plant.definition.parameters]
-        )
-        unit = jax.random.uniform(jax.random.key(0), (count, len(width)), float, -1.0, 1.0)
-        return self.start[None] + width[None] * unit
 
     @property
     def degrees(self) -> Float[Array, " output"]:
@@ -325,7 +288,7 @@ class _Problem(eqx.Module):
             status=_status(values, found.residual, relative, found.converged),
             initial_state=initial_state,
             residual=found.residual,
-            costs=found.costs,
+            cost=jnp.sum((found.residual / found.sd[None, None]) ** 2),
             degrees=jnp.full_like(degrees, jnp.inf) if noise_is_known else degrees,
         )
 

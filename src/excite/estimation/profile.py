@@ -49,7 +49,6 @@ def profile_intervals(
         sd = np.asarray(estimator.weights(plant, experiments, estimate))
         plant = plant.changed(sensor=Sensor(floats(sd), floats(0 * sd)))
         estimator = dataclasses.replace(estimator, noise="declared")
-    estimator = dataclasses.replace(estimator, num_starts=1)
     S, residual = estimator.sensitivity(plant, experiments, estimate, jax.device_put(free))
     unit = np.sqrt(np.diag(inverse_information(np.asarray(S))))[: len(free)]
     size = np.abs(np.asarray(relative_size(plant, estimate.params)))
@@ -67,7 +66,7 @@ def profile_intervals(
             if int(found.status) != Status.SUCCESSFUL:
                 return math.inf
             nearest["params"] = found.params
-            return float(np.min(found.costs)) - least
+            return float(found.cost) - least
 
         return excess
 

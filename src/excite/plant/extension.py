@@ -115,43 +115,45 @@ class Extended(AbstractPlant):
         self, state: Float[Array, " state"], input: Float[Array, " input"], params: Params
     ) -> Float[Array, " state"]:
         """Of the plain plant's states, then of those of lags and drifts."""
-        plain, added = self._plain(), list(state[len(self.plain.definition.states) :])
-        own_state = state[: len(state) - len(added)]
-        slopes, friction = [], jnp.zeros_like(own_state)
+        own_states = len(self.plain.definition.states)
+        inputs, added, slopes = list(input), list(state[own_states:]), []
+        friction = [jnp.asarray(0.0)] * own_states
         for e in self.extensions:
             value, at = getattr(params, e.name), e.index
             if e.kind == "lag":
                 lagging = added.pop(0)
-                slopes.append((input[at] - lagging) / jnp.maximum(value, self._shortest_lag))
-                input = input.at[at].set(jnp.where(value > 0, lagging, input[at]))
+                slopes.append((inputs[at] - lagging) / jnp.maximum(value, self._shortest_lag))
+                inputs[at] = jnp.where(value > 0, lagging, inputs[at])
             elif e.kind == "offset":
-                input = input.at[at].add(value)
+                inputs[at] += value
             elif e.kind == "saturation":
-                input = input.at[at].set(jnp.clip(input[at], -value, value))
+                inputs[at] = jnp.clip(inputs[at], -value, value)
             elif e.kind == "dead_zone":
-                input = input.at[at].add(-jnp.clip(input[at], -value, value))
+                inputs[at] -= jnp.clip(inputs[at], -value, value)
             elif e.kind == "coulomb":
                 smooth = _SHARP * self.definition.states[at].scale
-                friction = friction.at[at].add(value * jnp.tanh(state[at] / smooth))
+                friction[at] += value * jnp.tanh(state[at] / smooth)
             elif e.kind == "drag":
-                friction = friction.at[at].add(value * state[at] * jnp.abs(state[at]))
+                friction[at] += value * state[at] * jnp.abs(state[at])
             elif e.kind == "drift":
                 slopes.append(value)
-        slope = plain.derivative(own_state, input, self._own(params)) - friction
+        acting = jnp.stack(inputs) if inputs else input
+        slope = self._plain().derivative(state[:own_states], acting, self._own(params))
+        slope = slope - jnp.stack(friction)
         return jnp.concatenate([slope, jnp.stack(slopes)]) if slopes else slope
 
     def output(self, state: Float[Array, " state"], params: Params) -> Float[Array, " output"]:
         """Of the plain plant, with biases and drifts."""
         num_own = len(self.plain.definition.states)
-        output = self._plain().output(state[:num_own], self._own(params))
+        outputs = list(self._plain().output(state[:num_own], self._own(params)))
         drifts = list(state[num_own + sum(e.kind == "lag" for e in self.extensions) :])
         for e in self.extensions:
             value = getattr(params, e.name)
             if e.kind == "bias":
-                output = output.at[e.index].add(value)
+                outputs[e.index] += value
             elif e.kind == "drift":
-                output = output.at[e.index].add(jnp.where(value != 0, drifts.pop(0), 0.0))
-        return output
+                outputs[e.index] += jnp.where(value != 0, drifts.pop(0), 0.0)
+        return jnp.stack(outputs)
 
     def delay(self, params: Params) -> Float[Array, " input"] | None:
         """Of the plain plant, and the added ones."""
