@@ -164,7 +164,6 @@ def test_a_part_that_makes_no_sense_is_refused_in_a_sentence(build, sentence):
     ({"band": (1.0, 0.5)}, "got 1 to 0.5 Hz"),
     ({"band": (0.1, 5.1)}, "got 0.1 to 5.1 Hz"),
     ({"states": ()}, "plant 'spring' has no states"),
-    ({"inputs": ()}, "plant 'spring' has no inputs"),
     ({"outputs": ()}, "plant 'spring' has no outputs"),
     ({"parameters": ()}, "plant 'spring' has no parameters"),
     ({"states": (State("x", "m"), State("x", "m"))}, "states of 'spring' repeat a name"),

@@ -4,7 +4,9 @@ import scipy.stats
 from experiments import autoregressive
 
 from excite.estimation.diagnosis import (
+    Autoregression,
     chance_of_fit,
+    coloured_noise,
     correlation,
     fit_percent,
     ljung_box,
@@ -224,6 +226,11 @@ TIME = np.arange(N) / N
 REGRESSORS = np.column_stack([np.ones(N), np.sin(6 * TIME), np.cos(9 * TIME + 0.4)])
 
 
+def robust(S: np.ndarray, residual: np.ndarray) -> np.ndarray:
+    """The covariance where nothing is missing."""
+    return robust_covariance(S, residual, np.ones(residual.shape, bool))[0]
+
+
 def white_covariance(X: np.ndarray, residual: np.ndarray) -> np.ndarray:
     return np.linalg.inv(X.T @ X) * np.mean(residual**2)
 
@@ -235,65 +242,92 @@ def regressions(rho: float, count: int = 300) -> tuple[np.ndarray, np.ndarray, n
     estimates = noise @ inverse.T
     residuals = noise - estimates @ REGRESSORS.T
     S = REGRESSORS[None, :, None, :]
-    robust = [np.diag(robust_covariance(S, r[None, :, None])) for r in residuals]
+    found = [np.diag(robust(S, r[None, :, None])) for r in residuals]
     white = [np.diag(white_covariance(REGRESSORS, r)) for r in residuals]
     true = np.sqrt(np.mean(estimates**2, axis=0))
-    return true, np.sqrt(np.mean(robust, axis=0)), np.sqrt(np.mean(white, axis=0))
+    return true, np.sqrt(np.mean(found, axis=0)), np.sqrt(np.mean(white, axis=0))
 
 
 def test_robust_standard_errors_hold_for_noise_that_remembers():
-    true, robust, white = regressions(0.9)
-    assert np.all(np.abs(robust / true - 1) < 0.25)
+    true, found, white = regressions(0.9)
+    assert np.all(np.abs(found / true - 1) < 0.1)
     assert np.all(true > 2 * white)  # what they repair
 
 
 def test_robust_standard_errors_of_white_noise_are_the_usual_ones():
-    true, robust, white = regressions(0.0)
-    np.testing.assert_allclose(robust, white, rtol=0.05)
-    np.testing.assert_allclose(robust, true, rtol=0.1)
+    true, found, white = regressions(0.0)
+    np.testing.assert_allclose(found, white, rtol=0.02)
+    np.testing.assert_allclose(found, true, rtol=0.1)
 
 
-def test_robust_covariance_is_bartletts_sum_over_lags():
-    rng = np.random.default_rng(6)
-    S = rng.normal(size=(1, 400, 1, 2))
-    residual = autoregressive(rng, (1, 1, 400), 0.7).swapaxes(1, 2)
-    rho = np.sum(residual[:, 1:] * residual[:, :-1]) / np.sum(residual**2)
-    width = int(1.1447 * ((2 * rho / (1 - rho**2)) ** 2 * 400) ** (1 / 3))
-    assert width > 5
-    scores = S[0, :, 0] * residual[0]
-    V = scores.T @ scores
-    for lag in range(1, width):
-        gamma = scores[lag:].T @ scores[:-lag]
-        V += (1 - lag / width) * (gamma + gamma.T)
-    H = np.linalg.inv(S[0, :, 0].T @ S[0, :, 0])
-    np.testing.assert_allclose(robust_covariance(S, residual), H @ V @ H, rtol=1e-9)
+def test_an_autoregression_is_found_with_its_covariance():
+    noise = autoregressive(np.random.default_rng(6), (1, 4000), 0.7)
+    own = np.array([noise[0, lag:] @ noise[0, : 4000 - lag] / 4000 for lag in range(11)])
+    found = Autoregression.of(own, 4000)
+    assert len(found.coefficients) == 1
+    assert found.coefficients[0] == pytest.approx(0.7, abs=0.03)
+    rows = np.random.default_rng(7).normal(size=(1, 60, 2))
+    lags = np.arange(60)
+    toeplitz = found.coefficients[0] ** np.abs(np.subtract.outer(lags, lags))
+    toeplitz *= found.variance / (1 - found.coefficients[0] ** 2)
+    np.testing.assert_allclose(found.times(rows)[0], toeplitz @ rows[0], rtol=1e-9)
+    variance, spread = found.variances(rows)
+    np.testing.assert_allclose(variance, np.diag(rows[0].T @ toeplitz @ rows[0]), rtol=1e-9)
+    assert np.all(spread > 2 * variance**2 / 4000)
+
+
+@pytest.mark.parametrize("rho", [0.5, 0.9])
+def test_noise_is_found_without_what_the_fit_took_along(rho):
+    """In short records with many unknowns the residual remembers less than the noise."""
+    time = np.linspace(0, 1, 150)
+    X = np.stack([time**0, time, time**2, np.sin(9 * time), np.cos(9 * time)], axis=1)
+    noise = autoregressive(np.random.default_rng(8), (300, 150), rho)
+    residuals = noise - noise @ np.linalg.pinv(X).T @ X.T
+    everywhere = np.ones((1, 150, 1), bool)
+    found = [
+        coloured_noise(X[None, :, None], r[None, :, None], everywhere)[0].coefficients[:1].sum()
+        for r in residuals
+    ]
+    plain = np.sum(residuals[:, 1:] * residuals[:, :-1], axis=1) / np.sum(residuals**2, axis=1)
+    assert rho - np.mean(found) < 0.5 * (rho - np.mean(plain))
+
+
+def test_missing_samples_are_left_out():
+    rng = np.random.default_rng(9)
+    S, noise = rng.normal(size=(1, 3000, 1, 2)), autoregressive(rng, (1, 3000), 0.8)[..., None]
+    valid = rng.random((1, 3000, 1)) < 0.7
+    held = S * valid[..., None]
+    whole = robust(S, noise)
+    part, degrees = robust_covariance(held, noise * valid, valid)
+    np.testing.assert_allclose(np.diag(part), np.diag(whole) / 0.7, rtol=0.25)
+    assert np.all((degrees > 50) & (degrees < 3000))
 
 
 def test_experiments_side_by_side_share_their_information():
     rng = np.random.default_rng(7)
     S = rng.normal(size=(1, 300, 2, 2))
     residual = rng.normal(size=(1, 300, 2))
-    one = robust_covariance(S, residual)
-    two = robust_covariance(np.concatenate([S, S]), np.concatenate([residual, residual]))
-    np.testing.assert_allclose(two, one / 2, rtol=1e-9)
+    one = robust(S, residual)
+    two = robust(np.concatenate([S, S]), np.concatenate([residual, residual]))
+    np.testing.assert_allclose(two, one / 2, rtol=0.02, atol=1e-6)
 
 
 def test_robust_covariance_follows_the_units_of_the_unknowns():
     rng = np.random.default_rng(8)
     S, residual = rng.normal(size=(2, 200, 1, 3)), rng.normal(size=(2, 200, 1))
     units = np.array([1e-4, 1.0, 3e5])
-    expected = robust_covariance(S, residual) * np.outer(units, units)
-    np.testing.assert_allclose(robust_covariance(S / units, residual), expected, rtol=1e-8)
+    expected = robust(S, residual) * np.outer(units, units)
+    np.testing.assert_allclose(robust(S / units, residual), expected, rtol=1e-8)
 
 
 def test_an_unknown_without_influence_gets_no_covariance():
     rng = np.random.default_rng(9)
     S, residual = rng.normal(size=(1, 200, 1, 3)), rng.normal(size=(1, 200, 1))
     S[..., 1] = 0.0
-    covariance = robust_covariance(S, residual)
+    covariance = robust(S, residual)
     assert np.all(covariance[1] == 0)
     assert np.all(covariance[:, 1] == 0)
-    rest = robust_covariance(S[..., [0, 2]], residual)
+    rest = robust(S[..., [0, 2]], residual)
     np.testing.assert_allclose(covariance[np.ix_([0, 2], [0, 2])], rest, rtol=1e-9)
 
 

@@ -304,7 +304,7 @@ def test_parameters_are_those_of_the_command_line(name, made, capsys, monkeypatc
          "residual white (p = 0.0300), does not follow the input (p = 0.0400)"),
         (1e-9, 0.009, ["no", "1.00e-09", "yes", "0.00900"],
          "residual not white (p = 1.00e-09), follows the input (p = 0.00900)"),
-        (None, math.nan, ["–", "–", "–", "–"], "residual too small to be tested"),
+        (None, math.nan, ["–", "–", "–", "–"], "residual too small or too short to be tested"),
     ],
 )  # fmt: skip
 def test_a_residual_is_judged_at_one_percent_everywhere(white, structure, cells, words, here):

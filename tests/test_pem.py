@@ -193,7 +193,7 @@ def fitted_to_many(
     inputs = jnp.asarray(levels(plant, length))
     keys = jax.random.split(jax.random.key(1), count)
     measured = disturbed(plant, true, jnp.asarray(sigma), inputs, keys)
-    pem = PEM(num_starts=1)
+    pem = PEM()
 
     @eqx.filter_jit
     def fit(plant: AbstractPlant, inputs: jax.Array, measured: jax.Array) -> Estimate:
@@ -234,7 +234,7 @@ def test_without_disturbance_it_is_least_squares():
     record = record_of(AERO2, PRBS(), params=spread_params(AERO2))
     u, y = jnp.asarray(record.inputs[:-1]), jnp.asarray(record.outputs)
     e = experiments_of(AERO2, u, y, True)
-    by_pem, by_nls = PEM(num_starts=1)(AERO2, e), NLS()(AERO2, e)
+    by_pem, by_nls = PEM()(AERO2, e), NLS()(AERO2, e)
     sd = np.sqrt(np.diagonal(by_nls.covariance))
     away = np.abs(np.array(by_pem.params) - np.array(by_nls.params)) / sd
     assert by_pem.status == Status.SUCCESSFUL
@@ -245,7 +245,7 @@ def test_without_disturbance_it_is_least_squares():
 def test_data_without_any_noise_give_the_true_parameters():
     true = spread_params(TANK)
     u = jnp.asarray(levels(TANK, 200))
-    found = PEM(num_starts=1)(TANK, experiments_of(TANK, u, response(TANK, true, u), True))
+    found = PEM()(TANK, experiments_of(TANK, u, response(TANK, true, u), True))
     assert found.status == Status.SUCCESSFUL
     np.testing.assert_allclose(found.params, true, rtol=1e-6)
 
@@ -266,7 +266,7 @@ def tank_record(seed: int, length: int = 300, name: str = "r.csv") -> Record:
 @cache
 def identified() -> Identification:
     """A disturbed tank with a held-out record."""
-    return identify(tank_record(1), TANK, PEM(num_starts=1), validate=tank_record(2, name="v.csv"))
+    return identify(tank_record(1), TANK, PEM(), validate=tank_record(2, name="v.csv"))
 
 
 def test_the_errors_of_the_prediction_are_white_and_those_of_the_simulation_larger():
@@ -326,7 +326,7 @@ def test_uneven_records_with_missing_samples_and_a_known_parameter():
     result = identify(
         [spoiled, other],
         TANK,
-        PEM(num_starts=1),
+        PEM(),
         hold={"loss": float(TRUE.loss)},
         start={"area": 3.0},
     )

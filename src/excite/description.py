@@ -241,10 +241,12 @@ class PlantDescription:
 
     Attributes:
         name: used by the command line, studies and records.
-        states, inputs, outputs, parameters, constants: in the order of their arrays.
+        states, inputs, outputs, parameters, constants: in the order of their arrays. A plant may
+            have no inputs: a free decay, a reaction, a body that cools.
         dt: sampling time [s]; inputs are held over it.
         substeps: Runge-Kutta steps in one `dt`.
-        band: lowest and highest frequency [Hz] that a signal excites by default.
+        band: lowest and highest frequency [Hz] that a signal excites by default; left out, a
+            hundredth and a half of the largest one, half the sampling rate.
     """
 
     name: str
@@ -253,7 +255,7 @@ class PlantDescription:
     outputs: tuple[Output, ...]
     parameters: tuple[Parameter, ...]
     dt: float
-    band: tuple[float, float]
+    band: tuple[float, float] = (0.0, 0.0)
     constants: tuple[Constant, ...] = ()
     substeps: int = 1
 
@@ -261,8 +263,9 @@ class PlantDescription:
         if not isinstance(self.name, str):
             raise wrong_type("name of a plant", self.name, "a text")
         object.__setattr__(self, "dt", float(self.dt))
-        object.__setattr__(self, "band", (float(self.band[0]), float(self.band[1])))
         _require(math.isfinite(self.dt) and self.dt > 0, f"dt must be positive: got {self.dt}")
+        low, high = self.band if any(self.band) else (0.005 / self.dt, 0.25 / self.dt)
+        object.__setattr__(self, "band", (float(low), float(high)))
         _require(self.substeps >= 1, f"substeps must be at least 1: got {self.substeps}")
         _require(
             0 < self.band[0] < self.band[1] <= 0.5 / self.dt,
@@ -272,7 +275,8 @@ class PlantDescription:
         for kind in ("states", "inputs", "outputs", "parameters", "constants"):
             parts = getattr(self, kind)
             names = [part.name for part in parts]
-            _require(bool(parts) or kind == "constants", f"plant {self.name!r} has no {kind}")
+            may_lack = kind in ("inputs", "constants")
+            _require(bool(parts) or may_lack, f"plant {self.name!r} has no {kind}")
             _require(len(set(names)) == len(names), f"{kind} of {self.name!r} repeat a name")
         columns = {"time", *names_of(self.inputs)}
         _require(

@@ -265,7 +265,7 @@ class InformationResult:
 
 def information(
     plant: PlantLike,
-    excitation: ExcitationLike = "chirp",
+    excitation: ExcitationLike | None = None,
     *,
     options: Mapping[str, object] | None = None,
     steps: int | None = None,

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from . import __version__
 from .description import names_of, wrong_type
-from .excitation import AbstractExcitation, PolicyExcitation, Replay
+from .excitation import AbstractExcitation, NoInput, PolicyExcitation, Replay
 from .excitation.catalogue import ExcitationLike, excitation_and_origin, name_of
 from .files import json_ready
 from .plant import AbstractPlant, Params, params_from
@@ -75,6 +75,56 @@ def step(
     return jax.lax.scan(substep, state, jnp.arange(n), unroll=min(n, 4))[0]
 
 
+def delayed(
+    inputs: Float[Array, "time input"],
+    delay: Float[Array, " input"],
+    dt: Float[Array, " time"],
+    next_inputs: Float[Array, "time input"] | None = None,
+) -> tuple[Float[Array, "time input"], Float[Array, "time input"]]:
+    """Inputs after a delay, at the beginning and the end of each step, and linear in between.
+
+    In each step they have the mean and the first moment of the delayed input: a double
+    integrator is at its exact state at every sample. They are continuous in the delay.
+
+    Args:
+        delay: of each input [s]; negative for one that acts earlier.
+        dt: time from each sample to the next [s].
+        next_inputs: see `response`.
+    """
+    times = jnp.concatenate([jnp.zeros(1), jnp.cumsum(dt)])
+
+    def after(u: Array, u_next: Array, delay: Array) -> tuple[Array, Array]:
+        centre = jnp.mean(u)  # its integrals stay small, and keep their digits
+        u, u_next = u - centre, u_next - centre
+        slope = jnp.append((u_next - u) / jnp.where(dt > 0, dt, 1.0), 0.0)
+        first = _summed(dt * (u + u_next) / 2)
+        second = _summed(dt * first[:-1] + dt**2 * (u / 3 + u_next / 6))
+
+        acting = jnp.append(u, u_next[-1])
+
+        def integrals(t: Array) -> tuple[Array, Array]:
+            """The input integrated once and twice; it is constant before and after the record."""
+            k = jnp.clip(jnp.searchsorted(times, t) - 1, 0, len(u))
+            past = t - times[k]
+            a, b, c, s = second[k], first[k], acting[k], jnp.where(past > 0, slope[k], 0.0)
+            return b + past * (c + past * s / 2), a + past * (b + past * (c / 2 + past * s / 6))
+
+        once, twice = integrals(times - delay)
+        steps = jnp.where(dt > 0, dt, 1.0)
+        mean = jnp.diff(once) / steps
+        moment = (once[:-1] + once[1:]) / 2 - jnp.diff(twice) / steps
+        return centre + mean - 6 * moment / steps, centre + mean + 6 * moment / steps
+
+    return jax.vmap(after, in_axes=(1, 1, 0), out_axes=1)(
+        inputs, inputs if next_inputs is None else next_inputs, delay
+    )
+
+
+def _summed(values: Array) -> Array:
+    """Cumulative sums, beginning with zero."""
+    return jnp.concatenate([jnp.zeros(1), jnp.cumsum(values)])
+
+
 @eqx.filter_jit
 def response(
     plant: AbstractPlant,
@@ -91,6 +141,9 @@ def response(
         next_inputs: see `step`.
     """
     start = plant.initial_state if initial_state is None else initial_state
+    if (delay := plant.delay(params)) is not None:
+        dt = jnp.full(len(inputs), plant.dt) if dt is None else dt
+        inputs, next_inputs = delayed(inputs, delay, dt, next_inputs)
 
     def advance(state: Array, now: tuple) -> tuple[Array, Array]:
         input, dt, next_input = now
@@ -113,6 +166,17 @@ def measure(
     return noisy + jax.lax.stop_gradient(rounded - noisy)
 
 
+def _delayed_step(
+    past: Float[Array, "time input"], delay: Float[Array, " input"], k: Array
+) -> tuple[Array, Array]:
+    """`delayed` for step k of held inputs; the delay is in steps."""
+    whole = jnp.floor(delay).astype(int)
+    part, inputs = delay - whole, jnp.arange(past.shape[1])
+    new, old = (past[jnp.maximum(k - whole - more, 0), inputs] for more in (0, 1))
+    mean, half = new + part * (old - new), 3 * part * (1 - part) * (new - old)
+    return mean - half, mean + half
+
+
 @eqx.filter_jit
 def run_episode(
     plant: AbstractPlant,
@@ -130,16 +194,28 @@ def run_episode(
     noise_keys = jax.random.split(sensor_key, num_steps + 1)
     lower, upper = plant.input_limits
 
-    def advance(carry: tuple, noise_key: PRNGKeyArray) -> tuple[tuple, tuple]:
-        state, memory = carry
+    delay = plant.delay(params)
+
+    def moved(state: Array, past: Array, input: Array, k: Array) -> tuple[Array, Array]:
+        if delay is None:
+            return step(plant, state, input, params), past
+        past = past.at[k].set(input)
+        first, last = _delayed_step(past, delay / plant.dt, k)
+        return step(plant, state, first, params, next_input=last), past
+
+    def advance(carry: tuple, now: tuple) -> tuple[tuple, tuple]:
+        (state, past, memory), (noise_key, k) = carry, now
         output = plant.output(state, params)
         measured = measure(plant, output, noise_key)
         memory, input = excitation(memory, measured)
         input = jnp.clip(input, lower, upper)
-        return (step(plant, state, input, params), memory), (input, measured, output)
+        state, past = moved(state, past, input, k)
+        return (state, past, memory), (input, measured, output)
 
-    start = plant.initial_state, excitation.init(plant, num_steps, excitation_key)
-    (state, _), (inputs, measured, outputs) = jax.lax.scan(advance, start, noise_keys[:-1])
+    past = jnp.zeros((0 if delay is None else num_steps, len(lower)))
+    start = plant.initial_state, past, excitation.init(plant, num_steps, excitation_key)
+    steps = noise_keys[:-1], jnp.arange(num_steps)
+    (state, *_), (inputs, measured, outputs) = jax.lax.scan(advance, start, steps)
     last = plant.output(state, params)
     return Trajectory(
         time=jnp.arange(num_steps + 1) * plant.dt,
@@ -178,7 +254,7 @@ class Experiment:
     def of(
         cls,
         plant: PlantLike,
-        excitation: ExcitationLike = "chirp",
+        excitation: ExcitationLike | None = None,
         *,
         options: Mapping[str, object] | None = None,
         steps: int | None = None,
@@ -198,13 +274,19 @@ class Experiment:
             chosen = chosen.changed(dt=excitation.dt)
         if not isinstance(options, Mapping | None):
             raise wrong_type("options", options, "a dict by name")
+        if excitation is None:
+            excitation = "chirp" if chosen.definition.inputs else NoInput()
+        elif not chosen.definition.inputs and not isinstance(excitation, Record):
+            raise ValueError(
+                f"plant {chosen.definition.name!r} has no inputs: leave the excitation out"
+            )
         name = excitation if isinstance(excitation, str) else name_of(excitation)
         found, origin = excitation_and_origin(excitation, options or {}, chosen)
         source = excitation.source if isinstance(excitation, Record) else ""
         num_steps = experiment_length(found, source or name, steps, isinstance(excitation, Record))
-        return cls(
-            chosen, params_from(chosen, params), found, name, origin, num_steps, _checked(seed)
-        )
+        values = params_from(chosen, params)
+        _require_causal(chosen, values)
+        return cls(chosen, values, found, name, origin, num_steps, _checked(seed))
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -271,6 +353,19 @@ def experiment_length(
     return steps or usual
 
 
+def _require_causal(plant: AbstractPlant, params: Params) -> None:
+    """Raises ValueError where an input would act before it is chosen."""
+    delay = plant.delay(params)
+    for name, value in zip(
+        names_of(plant.definition.inputs), () if delay is None else delay, strict=False
+    ):
+        if value < 0:
+            raise ValueError(
+                f"input {name!r} has a delay of {float(value):g} s; it must be zero or more in a "
+                "simulation (only a recorded input can be late)"
+            )
+
+
 def _checked(seed: object) -> int | PRNGKeyArray:
     if isinstance(seed, jax.Array) and jnp.issubdtype(seed.dtype, jax.dtypes.prng_key):
         if seed.shape == ():
@@ -284,7 +379,7 @@ def _checked(seed: object) -> int | PRNGKeyArray:
 
 def simulate(
     plant: PlantLike,
-    excitation: ExcitationLike = "chirp",
+    excitation: ExcitationLike | None = None,
     *,
     options: Mapping[str, object] | None = None,
     steps: int | None = None,
@@ -305,7 +400,8 @@ def simulate(
             its class.
         excitation: a name (`ex.excitations()` lists them), an excitation or its class, a
             policy, the file of a policy or of a signal, a record to replay, or an array of
-            inputs by sample and input [input units].
+            inputs by sample and input [input units]. Default a chirp; a plant without inputs
+            takes none.
         options: of the excitation, by name.
         steps: length [samples]; default 500, or that of a policy, a record or a signal.
         params: true parameters that differ from the nominal ones, by name or as the

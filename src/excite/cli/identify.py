@@ -43,6 +43,13 @@ from .options import (
     "sidecar says that the record starts there.",
 )
 @click.option(
+    "--intervals",
+    type=click.Choice(["linear", "profile"]),
+    default="linear",
+    show_default=True,
+    help="From standard errors, or from the profile likelihood (slower; sides may be open).",
+)
+@click.option(
     "--start",
     type=NUMBERS,
     multiple=True,
@@ -53,6 +60,12 @@ from .options import (
     type=NUMBERS,
     multiple=True,
     help="Known values, not to be estimated: tau=0.162.",
+)
+@click.option(
+    "--uncertain",
+    type=NAMES,
+    multiple=True,
+    help="Standard deviation of known constants, which widens the intervals: m=5%,g=0.02.",
 )
 @click.option(
     "--validate",
@@ -123,8 +136,9 @@ def identify(
             files,
             options["plant"],
             options["estimator"],
-            **{name: merged(options[name]) for name in ("start", "hold")},
+            **{name: merged(options[name]) for name in ("start", "hold", "uncertain")},
             initial_state=options["initial_state"],
+            intervals=options["intervals"],
             hold_input=NAMES.convert(hold_input, None, None) if "=" in hold_input else hold_input,
             validate=options["validate"],
             columns=merged(options["column"]),

@@ -36,7 +36,7 @@ def excitation_options(command: Callable[..., Any]) -> Callable[..., Any]:
             click.option("--excitation", metavar="NAME",
                          help=f"{', '.join(signals())}, loop-NAME around one of them, a shipped "
                          "policy, or a file: policy (.safetensors) or signal (.csv, .mat); default "
-                         "chirp."),
+                         "chirp, and none for a plant without inputs."),
             click.option("--set", "settings", type=VALUES, multiple=True,
                          help="Options of the excitation, such as amplitude=5 (the message about "
                          "an unknown one lists them); of a loop also gain, damping."),
@@ -65,7 +65,7 @@ def given_experiment(plant: str, file: Path | None, options: Mapping[str, Any]) 
     from ..plant.catalogue import plant_from
     from ..record import read_record
 
-    chosen, excitation = plant_from(plant), options["excitation"] or "chirp"
+    chosen, excitation = plant_from(plant), options["excitation"]
     if file is not None:
         if options["settings"] or options["excitation"]:
             raise ValueError("an input file takes the place of --excitation and --set")

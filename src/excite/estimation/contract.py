@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import abc
 import enum
+import math
 from collections.abc import Sequence
 from typing import ClassVar, TypeAlias
 
@@ -82,7 +83,8 @@ def stack_experiments(
     """Experiments of any lengths side by side; each has one more output than inputs.
 
     Args:
-        dt, next_inputs: see `Experiments`.
+        dt: see `Experiments`.
+        next_inputs: see `Experiments`.
         seen: False where an output was not measured; its value is ignored.
     """
     xp = jnp if any(isinstance(rows, jax.core.Tracer) for rows in (*inputs, *measured)) else np
@@ -141,8 +143,9 @@ class Estimate(eqx.Module):
         initial_state: known or estimated.
         residual: measured minus simulated outputs, or minus predicted ones where there is a
             prediction; zero where padded.
-        costs: weighted sum of squares at the end of each search, infinite where it did not
-            converge; None for estimators that do not search.
+        cost: weighted sum of squares at the end of a search; infinite where there is none.
+        degrees: degrees of freedom of Student's t for each parameter's interval, infinite where
+            the noise is known; None counts as infinite.
         prediction: of estimators that take the plant as disturbed.
     """
 
@@ -152,8 +155,15 @@ class Estimate(eqx.Module):
     status: Int[Array, ""]
     initial_state: Float[Array, "experiment state"]
     residual: Float[Array, "experiment sample output"]
-    costs: Float[Array, " start"] | None = None
+    cost: Float[Array, ""] | float = math.inf
+    degrees: Float[Array, " param"] | None = None
     prediction: Prediction | None = None
+
+
+def quality(estimate: Estimate) -> float:
+    """The cost, smaller is better; of two alike a successful estimate counts more."""
+    cost = float(estimate.cost) * (1.0 if int(estimate.status) == Status.SUCCESSFUL else 1.01)
+    return cost if math.isfinite(cost) else math.inf
 
 
 class AbstractEstimator(eqx.Module):

@@ -7,9 +7,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Complex, Float
+
+from ..description import HALF_95
+
+_FEW = 15
+"""Samples of a residual below which the fit itself correlates it too much to be tested."""
+_MOST_LAGS = 25  # of an autoregression
+_STATIONARY = 0.999  # largest partial autocorrelation
+_LEAST = 1e-4  # of its inverse transfer function, where rounding leaves less
+_CORRECTIONS = 3  # of the autocovariances for what the fit took along
 
 
 def fit_percent(
@@ -29,13 +40,13 @@ def ljung_box(*residuals: Float[np.ndarray, " _sample"], num_lags: int = 25) -> 
 
     G. Ljung and G. Box, "On a measure of lack of fit in time series models", Biometrika
     65, 1978; statistics and degrees of freedom of several records add up. Not a number for
-    residuals of zeros.
+    residuals of zeros, and for fewer than 15 samples, which do not tell.
     """
     statistic, degrees = 0.0, 0
     for residual in residuals:
         n, centred = residual.size, residual - residual.mean()
         lags, power = np.arange(1, min(num_lags, n // 5) + 1), float(centred @ centred)
-        if power == 0:
+        if power == 0 or n < _FEW:
             continue
         r = np.array([centred[lag:] @ centred[:-lag] for lag in lags]) / power
         statistic += float(n * (n + 2) * np.sum(r**2 / (n - lags)))
@@ -66,6 +77,8 @@ def input_dependence(
         before = _lagged(record, past).reshape(len(record), past, record.shape[1])
         filtered = record - np.einsum("spi,p->si", before, memory)
         regressors = _lagged(filtered, lags)[past + lags :]
+        if not regressors.size:
+            continue
         left, sizes, _ = np.linalg.svd(regressors - regressors.mean(axis=0), full_matrices=False)
         seen = left[:, sizes > 1e-6 * max(sizes[0], 1e-300)]
         power = float(np.mean((white - white.mean()) ** 2))
@@ -83,6 +96,17 @@ def _lagged(
     starts = range(num_lags - 1, -1, -1)
     columns = [padded[start : start + len(values)] for start in starts]
     return np.concatenate(columns, axis=1) if columns else np.zeros((len(values), 0))
+
+
+def innovations(residuals: Sequence[Float[np.ndarray, " _sample"]]) -> list[np.ndarray]:
+    """What residuals do not follow from their own past: the errors of an autoregression.
+
+    One autoregression, of order 10 at most, is fitted to all of them.
+    """
+    order = min(10, sum(r.size for r in residuals) // 20)
+    past = [_lagged(r[:, None], order) for r in residuals]
+    memory = np.linalg.lstsq(np.concatenate(past), np.concatenate(residuals), rcond=None)[0]
+    return [r - own @ memory for r, own in zip(residuals, past, strict=True)]
 
 
 def chance_of_fit(
@@ -130,6 +154,30 @@ def incomplete_beta(a: float, b: float, x: float) -> float:
     return math.exp(logarithm) / a / (1 + fraction)
 
 
+@cache
+def student_95(degrees: float) -> float:
+    """Half of a 95 % interval in standard deviations, by Student's t; 1.96 for infinitely many."""
+    if degrees > 1e6:
+        return HALF_95
+    t, step, n = HALF_95, 1.0, max(degrees, 1.0)
+    scale = math.lgamma((n + 1) / 2) - math.lgamma(n / 2) - math.log(math.pi * n) / 2
+    while step > 1e-9 * t:  # Newton's method from below, where the tail is convex
+        density = math.exp(scale - (n + 1) / 2 * math.log1p(t**2 / n))
+        step = (incomplete_beta(n / 2, 0.5, n / (n + t**2)) - 0.05) / (2 * density)
+        t += step
+    return t
+
+
+def half_95(
+    covariance: Float[np.ndarray, "param param"], degrees: Float[np.ndarray, " param"] | None
+) -> Float[np.ndarray, " param"]:
+    """Half of each parameter's 95 % interval; `degrees` as in an estimate."""
+    sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    if degrees is None:
+        return HALF_95 * sd
+    return sd * np.array([student_95(float(n)) for n in degrees])
+
+
 def correlation(covariance: Float[np.ndarray, "param param"]) -> Float[np.ndarray, "param param"]:
     """Correlation of the estimates; NaN for a parameter without variance."""
     sd = np.sqrt(np.diag(covariance))
@@ -137,33 +185,194 @@ def correlation(covariance: Float[np.ndarray, "param param"]) -> Float[np.ndarra
         return covariance / np.outer(sd, sd)
 
 
-def robust_covariance(
-    sensitivity: Float[np.ndarray, "experiment time output unknown"],
-    residual: Float[np.ndarray, "experiment time output"],
-) -> Float[np.ndarray, "unknown unknown"]:
-    """Covariance of a least-squares estimate whose residual is correlated in time.
+@dataclass(frozen=True)
+class Autoregression:
+    """Coloured noise: each value from the ones before it, and from white noise.
 
-    H^-1 V H^-1 with H = S' S and V the long-run covariance of the scores S_k' r_k, by
-    Bartlett's window with the bandwidth of D. Andrews ("Heteroskedasticity and
-    autocorrelation consistent covariance matrix estimation", Econometrica 59, 1991) for
-    the autocorrelation of the residual. Both arguments are over the noise's standard
-    deviation. Undetermined directions get zero.
+    Attributes:
+        coefficients: of the values 1, 2, ... samples before.
+        variance: of the white noise.
+        count: values that it was fitted to, less the unknowns that were fitted, too.
     """
+
+    coefficients: Float[np.ndarray, " lag"]
+    variance: float
+    count: float
+
+    @classmethod
+    def of(cls, autocovariance: Float[np.ndarray, " lag"], count: float) -> Autoregression:
+        """The one whose order the Bayesian information criterion chooses.
+
+        By the recursion of N. Levinson and J. Durbin; `autocovariance` begins with lag zero.
+        """
+        found = cls(np.zeros(0), float(autocovariance[0]), count)
+        best, least = found, math.inf
+        for order in range(len(autocovariance)):
+            if order:
+                known, a = autocovariance[order - 1 : 0 : -1], found.coefficients
+                partial = (autocovariance[order] - a @ known) / found.variance
+                partial = float(np.clip(partial, -_STATIONARY, _STATIONARY))
+                a = np.append(a - partial * a[::-1], partial)
+                found = cls(a, found.variance * (1 - partial**2), count)
+            criterion = count * math.log(max(found.variance, 1e-300)) + order * math.log(count)
+            if criterion < least:
+                best, least = found, criterion
+        return best
+
+    def transfer(self, length: int) -> Complex[np.ndarray, " frequency"]:
+        """1 / A(w) at the frequencies of a real Fourier transform of `length` values."""
+        inverse = np.fft.rfft(np.append(1.0, -self.coefficients), length)
+        return 1 / np.where(np.abs(inverse) < _LEAST, _LEAST, inverse)
+
+    def spectrum(self, length: int) -> Float[np.ndarray, " frequency"]:
+        """Power at these frequencies."""
+        return self.variance * np.abs(self.transfer(length)) ** 2
+
+    def times(
+        self, rows: Float[np.ndarray, "experiment sample column"]
+    ) -> Float[np.ndarray, "experiment sample column"]:
+        """The covariance of the noise of each experiment times the columns."""
+        length = _long_enough(rows.shape[1])
+        transformed = np.fft.rfft(rows, length, axis=1) * self.spectrum(length)[None, :, None]
+        return np.fft.irfft(transformed, length, axis=1)[:, : rows.shape[1]]
+
+    def variances(
+        self, weights: Float[np.ndarray, "experiment sample column"]
+    ) -> tuple[Float[np.ndarray, " column"], Float[np.ndarray, " column"]]:
+        """Variance of weighted sums of the noise, and the variance of these variances.
+
+        The latter follows from the large-sample covariance of the coefficients (P. Brockwell and
+        R. Davis, Time Series: Theory and Methods, 2nd ed. 1991, section 8.1).
+        """
+        length = _long_enough(weights.shape[1])
+        power = np.sum(np.abs(np.fft.rfft(weights, length, axis=1)) ** 2, axis=0)
+        power[1:-1] *= 2  # and the same at negative frequencies
+        parts = power / length * self.spectrum(length)[:, None]
+        variance, order = parts.sum(axis=0), len(self.coefficients)
+        spread = 2 * variance**2 / self.count
+        if order:
+            delay = np.exp(-2j * np.pi * np.arange(length // 2 + 1) / length)
+            lags = delay[:, None] ** np.arange(1, order + 1)
+            slope = parts.T @ (2 * np.real(lags * self.transfer(length)[:, None]))
+            own = np.fft.irfft(self.spectrum(length), length)[:order]
+            toeplitz = own[np.abs(np.subtract.outer(np.arange(order), np.arange(order)))]
+            covariance = self.variance / self.count * np.linalg.inv(toeplitz)
+            spread += np.einsum("cp,pq,cq->c", slope, covariance, slope)
+        return variance, spread
+
+
+def _long_enough(num_samples: int) -> int:
+    """A length of Fourier transforms in which samples at the end do not touch the first ones."""
+    return 2 ** math.ceil(math.log2(max(2 * num_samples, 1024)))
+
+
+def _lagged_products(
+    first: Float[np.ndarray, "experiment sample column"],
+    second: Float[np.ndarray, "experiment sample column"],
+    num_lags: int,
+) -> Float[np.ndarray, " lag"]:
+    """Sums of first[k] second[k + lag] over experiments, samples and columns, from lag zero on."""
+    length = _long_enough(first.shape[1])
+    a, b = (np.fft.rfft(rows, length, axis=1) for rows in (first, second))
+    return np.fft.irfft(np.sum(a.conj() * b, axis=(0, 2)), length)[: num_lags + 1]
+
+
+def coloured_noise(
+    sensitivity: Float[np.ndarray, "experiment sample output unknown"],
+    residual: Float[np.ndarray, "experiment sample output"],
+    valid: Bool[np.ndarray, "experiment sample output"],
+) -> list[Autoregression]:
+    """The noise of each output, from the residual of a least-squares fit.
+
+    The fit takes some of the noise along: of noise of covariance G, the residual has
+    (1 - P) G (1 - P) with P the projection on the sensitivities. The autocovariances of the
+    residual are corrected for it, with G from the autoregression found before.
+    """
+    num_outputs, num_unknowns = sensitivity.shape[2:]
+    basis, sizes, _ = np.linalg.svd(sensitivity.reshape(-1, num_unknowns), full_matrices=False)
+    basis = basis[:, sizes > 1e-10 * max(sizes[0], 1e-300)].reshape(*residual.shape, -1)
+    counts = valid.sum(axis=(0, 1)) - basis.shape[-1] / num_outputs
+    lags = [int(np.clip(count // 10, 0, _MOST_LAGS)) for count in counts]
+
+    def products(rows: np.ndarray, o: int) -> np.ndarray:
+        return _lagged_products(rows[..., o, None], rows[..., o, None], lags[o])
+
+    raw = [products(residual, o) for o in range(num_outputs)]
+    pairs = [np.maximum(products(valid.astype(float), o), 1.0) for o in range(num_outputs)]
+    noise = [
+        Autoregression.of(r / p, max(float(count), 1.0))
+        for r, p, count in zip(raw, pairs, counts, strict=True)
+    ]
+    for _ in range(_CORRECTIONS):
+        through = [
+            process.times(basis[:, :, o]) * valid[:, :, o, None] for o, process in enumerate(noise)
+        ]
+        common = sum(
+            np.einsum("etu,etv->uv", basis[:, :, o], rows) for o, rows in enumerate(through)
+        )
+        for o, rows in enumerate(through):
+            own = basis[:, :, o]
+            taken = _lagged_products(own, rows, lags[o]) + _lagged_products(rows, own, lags[o])
+            taken -= _lagged_products(own @ common, own, lags[o])
+            noise[o] = Autoregression.of((raw[o] + taken) / pairs[o], noise[o].count)
+    return noise
+
+
+def robust_covariance(
+    sensitivity: Float[np.ndarray, "experiment sample output unknown"],
+    residual: Float[np.ndarray, "experiment sample output"],
+    valid: Bool[np.ndarray, "experiment sample output"],
+) -> tuple[Float[np.ndarray, "unknown unknown"], Float[np.ndarray, " unknown"]]:
+    """Covariance of a least-squares estimate in coloured noise, and its degrees of freedom.
+
+    H^-1 S' G S H^-1 with H = S' S and G the covariance of an autoregression fitted to each
+    output's residual. The degrees of freedom are those of a chi-squared variable whose
+    variance, relative to its mean, is that of the variance found (F. Satterthwaite, "An
+    approximate distribution of estimates of variance components", Biometrics Bulletin 2,
+    1946). Sensitivity and residual are over the standard deviation of the weights.
+    Undetermined directions get zero.
+    """
+    inverse = inverse_information(sensitivity)
+    count = len(inverse)
+    covariance, variance, spread = np.zeros((count, count)), np.zeros(count), np.zeros(count)
+    for o, noise in enumerate(coloured_noise(sensitivity, residual, valid)):
+        weights = sensitivity[:, :, o] @ inverse
+        covariance += np.einsum("etu,etv->uv", weights, noise.times(weights))
+        own, its_spread = noise.variances(weights)
+        variance, spread = variance + own, spread + its_spread
+    degrees = np.full(count, np.inf)
+    np.divide(2 * variance**2, spread, out=degrees, where=spread > 0)
+    return covariance, degrees
+
+
+def inverse_information(
+    sensitivity: Float[np.ndarray, "experiment sample output unknown"],
+) -> Float[np.ndarray, "unknown unknown"]:
+    """(S' S)^-1; zero in undetermined directions."""
     H = np.einsum("etou,etov->uv", sensitivity, sensitivity)
     size = np.sqrt(np.diag(H))
     size[size == 0] = 1.0
-    inverse = np.linalg.pinv(H / np.outer(size, size), hermitian=True) / np.outer(size, size)
-    scores = np.einsum("etou,eto->etu", sensitivity, residual)
-    length = residual.shape[1]
-    rho = np.sum(residual[:, 1:] * residual[:, :-1]) / max(np.sum(residual**2), 1e-300)
-    rho = min(abs(rho), 1 - 1 / length)
-    alpha = (2 * rho / (1 - rho**2)) ** 2
-    width = int(np.clip(1.1447 * (alpha * length) ** (1 / 3), 1, length // 3))
-    # Sums over every window of `width` samples: their squares are Bartlett's estimate.
-    padded = np.pad(scores, ((0, 0), (width, width - 1), (0, 0))).cumsum(axis=1)
-    sums = padded[:, width:] - padded[:, :-width]
-    V = np.einsum("etu,etv->uv", sums, sums) / width
-    return inverse @ V @ inverse
+    return np.linalg.pinv(H / np.outer(size, size), hermitian=True) / np.outer(size, size)
+
+
+def effect_of_constants(
+    sensitivity: Float[np.ndarray, "experiment sample output unknown"],
+    to_constants: Float[np.ndarray, "experiment sample output constant"],
+) -> Float[np.ndarray, "unknown constant"]:
+    """Derivative of a least-squares estimate with respect to constants that it takes as known."""
+    rows = np.einsum("etou,etoc->uc", sensitivity, to_constants)
+    return -inverse_information(sensitivity) @ rows
+
+
+def with_independent(
+    covariance: Float[np.ndarray, "param param"],
+    degrees: Float[np.ndarray, " param"],
+    other: Float[np.ndarray, "param param"],
+) -> tuple[Float[np.ndarray, "param param"], Float[np.ndarray, " param"]]:
+    """An estimated covariance and its degrees of freedom, with a known one added."""
+    total, own = np.diag(covariance) + np.diag(other), np.diag(covariance)
+    growth = np.where(own > 0, total / np.where(own > 0, own, 1.0), 1.0)
+    return covariance + other, degrees * growth**2
 
 
 def widened(

@@ -14,11 +14,12 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..description import HALF_95, RARE, Named, PlantDescription, names_of, wrong_type
+from ..description import HALF_95, RARE, Named, PlantDescription, names_of, unknown, wrong_type
 from ..files import json_ready
 from ..information import identifiability, worst_seen
 from ..plant import AbstractPlant, Params, floats, params_from
 from ..plant.catalogue import PLANTS, PlantLike, plant_from
+from ..plant.extension import plain_kind
 from ..record import (
     Record,
     described_in,
@@ -37,33 +38,42 @@ from .contract import (
     Prediction,
     Status,
     bound_reached,
+    from_search,
+    quality,
     residual_of,
     simulate_experiments,
     stack_experiments,
+    to_search,
 )
 from .diagnosis import (
     chance_of_fit,
+    effect_of_constants,
     fit_percent,
+    half_95,
     input_dependence,
     ljung_box,
     robust_covariance,
     widened,
+    with_independent,
 )
 from .nls import NLS
 from .pem import PEM
+from .profile import profile_intervals
+from .remedies import HOLDS, Suspect, outliers, suspects
 from .result import Fitted, Identification, Noise, Predicted
 
 InitialState = Literal["auto", "free", "known"]
-_HOLDS = "constant", "linear"  # an input between samples
+Intervals = Literal["linear", "profile"]
 _NOTHING_SEEN = (
     "no parameter is identifiable from the data; are columns, signs and units right, and does the "
     "input move the plant beyond the noise? or did the search begin too far from the truth "
     "(--start)?"
 )
 _STARTS, _SIZE_OF_MANY_STARTS = 8, 50_000  # measured values up to which so many are tried
-_BETTER = 0.01  # part of the sum of squares that another hold of an input must gain to be told
+_SIZE_OF_SUSPECTS = 10_000  # measured values up to which suspects are tried
+_TELLING = 50  # measured values from which the residual tells whether the search missed something
 _FREE = 100.0  # scales of a parameter of free sign that are small for its standard error
-_SAME = 1e-6  # relative difference of sums of squares at one minimum
+_SAME = 0.01  # difference of sums of squares at one minimum, over the noise
 _BY_CHANCE = 1e-3  # a fit with a larger p-value explains nothing
 
 
@@ -78,7 +88,9 @@ def identify(
     *,
     start: Mapping[str, float] | Params | None = None,
     hold: Mapping[str, float] | None = None,
+    uncertain: Mapping[str, float | str] | None = None,
     initial_state: InitialState = "auto",
+    intervals: Intervals = "linear",
     hold_input: str | Mapping[str, str] = "constant",
     validate: RecordLike | Sequence[RecordLike] = (),
     columns: Mapping[str, str] | None = None,
@@ -98,15 +110,19 @@ def identify(
         0.0125
 
     Args:
-        records: a record or the path of an experiment file, or several, with one sampling time.
+        records: a record or the path of an experiment file, or several.
         plant: a name, `path/to/file.py:ClassName`, a plant or its class; its constants and
             sensor are taken as known, its dt is replaced by that of the records. Default the
             plant that the first record's sidecar names.
         estimator: a name (`ex.estimators()` lists them), an estimator or its class.
         start: where the search begins, by name; default the nominal parameters.
         hold: values of parameters that are known and not estimated, by name.
+        uncertain: standard deviation of known constants, by name: {"m": 0.02} in the constant's
+            unit, {"m": "5%"} of its value. It widens the intervals.
         initial_state: "known" (the plant's), "free" (estimated too), or "auto": known
             where every sidecar says so.
+        intervals: "linear": from standard errors; "profile": from the profile likelihood, which
+            follows a curved likelihood and may stay open to one side, and takes longer.
         hold_input: "constant": an input keeps its value until the next sample; "linear": it runs
             straight to the next value; or one of them by the input's name.
         validate: records for which only the initial state is fitted.
@@ -118,9 +134,8 @@ def identify(
         rows: rows of the files to use, counted from 0: slice(100, 1000, 5) or "100:1000:5".
 
     Raises:
-        ValueError: for records too short, of different sampling times, or in which no
-            parameter can be identified, for a file that cannot be used, and for a name or a
-            value that is not allowed.
+        ValueError: for records too short, or in which no parameter can be identified, for a
+            file that cannot be used, and for a name or a value that is not allowed.
         TypeError: for an argument of another type.
     """
     given = _listed(records, "records")
@@ -128,6 +143,11 @@ def identify(
         raise ValueError("no record is given")
     plant = plant_from(_plant_of(given[0]) if plant is None else plant)
     estimator, begin = _chosen(estimator, plant, start, hold)
+    if intervals not in get_args(Intervals):
+        raise ValueError(f"intervals {intervals!r} are not one of: linear, profile")
+    if intervals == "profile" and not isinstance(estimator, NLS):
+        raise ValueError(f"profile intervals need the estimator nls: got {estimator.name}")
+    uncertain_sd = _uncertain(plant, estimator, uncertain)
     if initial_state not in get_args(InitialState):
         raise ValueError(f"initial state {initial_state!r} is not one of: known, free, auto")
     read = partial(
@@ -147,12 +167,14 @@ def identify(
     known = initial_state == "known" or (
         initial_state == "auto" and all(_starts_at(record, plant) for record in records)
     )
-    _check_lengths(plant, [*records, *validation], known)
+    _require_enough(plant, records, int(np.sum(~_known(plant, estimator))), known)
+    for record in validation:
+        _require_enough(plant, [record], 0, False)
     linear = _linear_inputs(plant, hold_input)
     if not isinstance(estimator, AbstractSearch):
         _require_complete(estimator, [*records, *validation], linear)
     plant = _sampled_as([*records, *validation], plant)
-    known = known and all(len(unbroken(record.time)) == 1 for record in records)
+    known = known and all(len(_parts(record)) == 1 for record in records)
     experiments = _experiments(plant, records, known, linear)
     fit = _fit(plant, experiments, estimator, begin)
     residual = _residuals(plant, records, experiments, estimator, fit)
@@ -167,25 +189,36 @@ def identify(
         name: _dependence(residual, records, i, plant.definition.outputs[i].scale)
         for i, name in enumerate(whiteness)
     }
-    covariance, verdict = _confidence(plant, experiments, estimator, fit, whiteness)
+    covariance, degrees, verdict = _confidence(
+        plant, experiments, estimator, fit, whiteness, uncertain_sd
+    )
     wrong = _wrong_structure(structure, estimator) if fit.is_successful else ()
     others = tuple(s for record in [*records, *validation] for s in _other_plant(record, plant))
-    other_hold = _other_hold(plant, records, experiments, estimator, fit, linear)
-    verdict = (*others, *wrong, *_agreement(fit), *verdict, *other_hold)
+    found = _suspects(plant, records, experiments, estimator, begin, fit, linear)
+    verdict = (*others, *wrong, *_remedies(found), *_agreement(fit), *verdict)
     names, d = names_of(plant.definition.parameters), plant.description
+    values = np.array([float(value) for value in fit.estimate.params])
     sd = np.where(fit.free, np.sqrt(np.maximum(np.diag(covariance), 0.0)), np.nan)
+    half = np.where(fit.free, half_95(covariance, degrees), np.nan)
+    ends = np.stack([values - half, values + half], axis=1)
+    if intervals == "profile" and isinstance(estimator, NLS) and fit.is_successful:
+        estimate = jax.device_put(fit.estimate)
+        ends = profile_intervals(plant, experiments, estimator, estimate, fit.free, half)
+        verdict = (*verdict, *_open_sides(plant.definition, ends))
     return Identification(
         plant=d,
         estimator=estimator.name,
         status=fit.status,
-        params=Named(zip(names, map(float, fit.estimate.params), strict=True)),
-        std_error=Named(zip(names, map(float, sd), strict=True)),
+        params=Named(zip(names, values.tolist(), strict=True)),
+        std_error=Named(zip(names, sd.tolist(), strict=True)),
+        intervals=Named(zip(names, map(tuple, ends.tolist()), strict=True)),
         held=tuple(n for n, is_free in zip(names, fit.free, strict=True) if not is_free),
         covariance=covariance,
         information=np.asarray(fit.estimate.information),
         whiteness=whiteness,
         structure=structure,
         verdict=verdict,
+        suspects=found,
         fitted=fitted,
         validation=tuple(
             _validated(plant, record, linear, estimator, fit.estimate) for record in validation
@@ -212,7 +245,7 @@ def _plant_of(record: RecordLike) -> str:
     is_read = isinstance(record, Record)
     where = (record.source if is_read else str(record)) or "the record"
     name = (record.description if is_read else described_in(Path(record))).name
-    if name not in PLANTS:
+    if name.partition("+")[0] not in PLANTS:
         raise ValueError(
             f"{where} is of plant {name!r}, which does not come with the package: give the plant "
             "as path/to/file.py:ClassName, as an object or as a class"
@@ -254,6 +287,47 @@ def _chosen(
     return dataclasses.replace(method, known=names), begin
 
 
+def _uncertain(
+    plant: AbstractPlant, estimator: AbstractEstimator, given: Mapping[str, float | str] | None
+) -> Float[np.ndarray, " constant"]:
+    """Standard deviation of each known constant, zero where none is given."""
+    if not isinstance(given, Mapping | None):
+        raise wrong_type("uncertain", given, "a dict by constant")
+    if given and not isinstance(estimator, NLS):
+        raise ValueError(f"uncertain constants need the estimator nls: got {estimator.name}")
+    values = {name: float(value) for name, value in plant.constants._asdict().items()}
+    sd = dict.fromkeys(values, 0.0)
+    for name, spread in (given or {}).items():
+        if name not in values:
+            raise unknown(f"{plant.definition.name} constant", name, values or ["none"])
+        try:
+            if isinstance(spread, str) and spread.endswith("%"):
+                number = float(spread[:-1]) / 100 * abs(values[name])
+            else:
+                number = float(spread)
+        except (TypeError, ValueError):
+            raise ValueError(f"uncertain {name!r} must be a number or 5%: got {spread!r}") from None
+        if not (np.isfinite(number) and number > 0):
+            raise ValueError(f"standard deviation of {name!r} must be above 0: got {spread}")
+        sd[name] = number
+    return np.array(list(sd.values()), float)
+
+
+def _open_sides(
+    description: PlantDescription, ends: Float[np.ndarray, "param end"]
+) -> tuple[str, ...]:
+    """A sentence for each interval that the data do not close."""
+    told = []
+    for part, (low, high) in zip(description.parameters, ends, strict=True):
+        is_open = np.isinf(low) or (part.positive and low == 0), np.isinf(high)
+        if any(is_open):
+            side = "to either side" if all(is_open) else "above" if is_open[1] else "below"
+            told.append(
+                f"{part.name} is practically not identifiable: its 95 % interval is open {side}"
+            )
+    return tuple(told)
+
+
 def _starts_at(record: Record, plant: AbstractPlant) -> bool:
     """Whether the sidecar says that the record starts at this plant's initial state."""
     states = record.metadata.get("plant", {}).get("states", [])
@@ -284,9 +358,9 @@ def _linear_inputs(
                 f"plant {plant.definition.name!r} has no input {name!r} to hold; it has "
                 f"{', '.join(names)}"
             )
-        if word not in _HOLDS:
+        if word not in HOLDS:
             raise ValueError(f"hold_input of {name!r} must be constant or linear: got {word!r}")
-    return np.array([by_name.get(name) == "linear" for name in names])
+    return np.array([by_name.get(name) == "linear" for name in names], bool)
 
 
 def _require_complete(
@@ -313,16 +387,26 @@ def _require_complete(
             )
 
 
-def _check_lengths(plant: AbstractPlant, records: Sequence[Record], known: bool) -> None:
-    d = plant.definition
-    unknowns = len(d.parameters) + (0 if known else len(d.states))
-    needed = max(10, -(-3 * unknowns // len(d.outputs)))
-    for record in records:
-        if len(record.time) < needed:
-            raise ValueError(
-                f"{record.source}: {len(record.time)} samples are too short a record; "
-                f"{needed} or more are needed for {unknowns} unknowns"
-            )
+def _require_enough(
+    plant: AbstractPlant, records: Sequence[Record], num_params: int, knows_state: bool
+) -> None:
+    """Raises ValueError where there are not more measured values than unknowns."""
+    where = " and ".join(record.source or "the record" for record in records)
+    if any(len(record.time) < 2 for record in records):
+        raise ValueError(f"{where}: a record needs at least two samples")
+    values = sum(int(np.isfinite(record.outputs).sum()) for record in records)
+    parts = sum(len(_parts(record)) for record in records)
+    states = 0 if knows_state and parts == len(records) else parts * len(plant.definition.states)
+    if values <= num_params + states:
+        raise ValueError(
+            f"{where}: {values} measured values for {num_params + states} unknowns ({num_params} "
+            f"parameters, {states} initial states); more values than unknowns are needed"
+        )
+
+
+def _parts(record: Record) -> list[slice]:
+    """Parts without a gap in time; without inputs nothing is unknown in a gap."""
+    return unbroken(record.time) if record.inputs.shape[1] else [slice(0, len(record.time))]
 
 
 def _sampled_as(records: Sequence[Record], plant: AbstractPlant) -> AbstractPlant:
@@ -336,14 +420,14 @@ def _sampled_as(records: Sequence[Record], plant: AbstractPlant) -> AbstractPlan
     sampled = plant.changed(dt=usual)
     if _are_even(records, usual):
         return sampled
-    steps = [np.diff(r.time[part]).max() for r in records for part in unbroken(r.time)]
+    steps = [np.diff(r.time[part]).max() for r in records for part in _parts(r)]
     longest = plant.changed(dt=max(steps))
     return eqx.tree_at(lambda p: p.dt, longest, sampled.dt)
 
 
 def _are_even(records: Sequence[Record], dt: float) -> bool:
     """Whether all parts of the records are sampled with this time."""
-    parts = [record.time[part] for record in records for part in unbroken(record.time)]
+    parts = [record.time[part] for record in records for part in _parts(record)]
     own = [(time[-1] - time[0]) / (time.size - 1) for time in parts]
     return all(map(is_even, parts)) and bool(np.allclose(own, dt, rtol=1e-3, atol=0))
 
@@ -353,17 +437,15 @@ def _experiments(
     records: Sequence[Record],
     known: bool,
     linear: np.ndarray,
-    is_general: bool = False,
 ) -> Experiments:
     """The parts of all records without gaps, as experiments.
 
-    A general form, in which no input needs to be linear, shares one compilation.
+    They have next inputs even where all are held: one program is compiled for both.
     """
-    parts = [(record, part) for record in records for part in unbroken(record.time)]
+    parts = [(record, part) for record in records for part in _parts(record)]
     inputs = [record.inputs[part] for record, part in parts]
     outputs = [record.outputs[part] for record, part in parts]
     evenly = _are_even(records, float(plant.dt))
-    next_inputs = [np.where(linear, rows[1:], rows[:-1]) for rows in inputs]
     seen = [np.isfinite(rows) for rows in outputs]
     return stack_experiments(
         plant,
@@ -371,7 +453,7 @@ def _experiments(
         outputs,
         known,
         dt=None if evenly else [np.diff(record.time[part]) for record, part in parts],
-        next_inputs=next_inputs if is_general or linear.any() else None,
+        next_inputs=[np.where(linear, rows[1:], rows[:-1]) for rows in inputs],
         seen=None if all(rows.all() for rows in seen) else seen,
     )
 
@@ -383,7 +465,7 @@ def _by_record(
     experiments, joined = iter(values), []
     for record in records:
         own = np.full(record.outputs.shape, np.nan)
-        for part in unbroken(record.time):
+        for part in _parts(record):
             rows = part.stop - part.start
             own[part] = next(experiments)[:rows]
         joined.append(np.where(np.isfinite(record.outputs), own, np.nan))
@@ -405,12 +487,16 @@ def _known(plant: AbstractPlant, estimator: AbstractEstimator) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Fit:
-    """An estimate, its free and known parameters, and a sentence for each held one."""
+    """An estimate, its free and known parameters, and a sentence for each held one.
+
+    `others` are the ends of searches that began elsewhere.
+    """
 
     estimate: Estimate
     free: np.ndarray
     known: np.ndarray
     reasons: tuple[str, ...]
+    others: Sequence[Estimate] = ()
 
     def has_ended_in(self, status: Status) -> bool:
         return int(self.estimate.status) == status
@@ -454,9 +540,9 @@ def _fit_seen(
     names = names_of(plant.definition.parameters)
     known = _known(plant, estimator)
     free, reasons = ~known, ()
+    found = _estimate(plant, experiments, estimator, start, free)
     while True:
-        estimate = _estimate(plant, experiments, estimator, start, free)
-        fit = _Fit(estimate, free, known, reasons)
+        fit = _Fit(found[0], free, known, reasons, found[1:])
         # ARX estimates all parameters or none.
         if not isinstance(estimator, AbstractSearch) or fit.has_ended_in(Status.NOT_FINITE):
             return fit
@@ -464,11 +550,14 @@ def _fit_seen(
         if held is None:
             return fit
         chosen, value, why = held
-        start = start._replace(**{names[chosen]: floats(value)})
+        start, last = (
+            params._replace(**{names[chosen]: floats(value)}) for params in (start, found[0].params)
+        )
         free = free & (np.arange(len(names)) != chosen)
         reasons = (*reasons, why)
         if not free.any():
             raise ValueError(_NOTHING_SEEN)
+        found = _estimate(plant, experiments, estimator, start, free, [last])
 
 
 def _estimate(
@@ -477,28 +566,43 @@ def _estimate(
     estimator: AbstractEstimator,
     start: Params,
     free: np.ndarray,
-) -> Estimate:
-    """An estimate; the search is repeated where it may have missed the best one.
+    others: Sequence[Params] | None = None,
+) -> list[Estimate]:
+    """Estimates, the best first; the search is repeated where it may have missed the best one.
 
-    Where more than noise is left, it begins at several starts; where it does not converge, it
-    has longer segments.
+    Where more than noise is left, or a short record cannot tell, it begins at other starts as
+    well, default random ones; where it does not converge, it has longer segments.
     """
-    arguments = plant, experiments, start, jax.device_put(free)
-    estimate = jax.device_get(estimator(*arguments))
+
+    def search(estimator: AbstractEstimator, start: Params) -> Estimate:
+        return jax.device_get(estimator(plant, experiments, *jax.device_put((start, free))))
+
+    if isinstance(estimator, PEM):  # it begins where least squares ends
+        first = _estimate(plant, experiments, NLS(known=estimator.known), start, free, others)
+        start = first[0].params
+    found = [search(estimator, start)]
     if not isinstance(estimator, NLS):
-        return estimate
-    is_small = experiments.valid.size <= _SIZE_OF_MANY_STARTS
-    if estimator.num_starts == 1 and is_small and not _is_noise(plant, experiments, estimate):
-        estimator = dataclasses.replace(estimator, num_starts=_STARTS)
-        estimate = jax.device_get(estimator(*arguments))
-    num_samples = experiments.valid.shape[1]
+        return found
+    size, num_samples = experiments.valid.size, experiments.valid.shape[1]
+    is_in_doubt = size < _TELLING or not _is_noise(plant, experiments, found[0])
+    if size <= _SIZE_OF_MANY_STARTS and is_in_doubt:
+        others = _starts_around(plant, start, free) if others is None else others
+        found += [search(estimator, other) for other in others]
+        found.sort(key=quality)
     length = estimator.length_of_segments(plant, num_samples)
-    while int(estimate.status) == Status.ITERATIONS_EXHAUSTED and length < num_samples:
+    while int(found[0].status) == Status.ITERATIONS_EXHAUSTED and length < num_samples:
         length *= 4
-        longer = dataclasses.replace(estimator, segment_length=length)
-        again = jax.device_get(longer(*arguments))
-        estimate = again if int(again.status) == Status.SUCCESSFUL else estimate
-    return estimate
+        longer = search(dataclasses.replace(estimator, segment_length=length), start)
+        found = [longer] if int(longer.status) == Status.SUCCESSFUL else found
+    return found
+
+
+def _starts_around(plant: AbstractPlant, start: Params, free: np.ndarray) -> list[Params]:
+    """Random starts around one, always the same: up to a factor of three away."""
+    d, z = plant.definition, to_search(plant.definition, start)
+    width = np.where(free, [np.log(3) if p.positive else 2.0 for p in d.parameters], 0.0)
+    unit = np.random.default_rng(0).uniform(-1, 1, (_STARTS - 1, len(width)))
+    return [plant.Params(*from_search(d, z + width * row)) for row in unit]
 
 
 def _is_noise(plant: AbstractPlant, experiments: Experiments, estimate: Estimate) -> bool:
@@ -560,34 +664,51 @@ def _confidence(
     estimator: AbstractEstimator,
     fit: _Fit,
     whiteness: Mapping[str, float],
-) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Covariance of the estimates, and the sentences of the verdict."""
-    covariance = np.asarray(fit.estimate.covariance)
+    uncertain: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
+    """Covariance of the estimates, its degrees of freedom, and the sentences of the verdict."""
+    names = names_of(plant.definition.parameters)
+    covariance, its = np.asarray(fit.estimate.covariance), fit.estimate.degrees
+    degrees = np.full(len(names), np.inf) if its is None else np.asarray(its)
     if not fit.is_successful:
         sentence = Status(int(fit.estimate.status)).sentence
         needed = f"; {estimator.name} needs {estimator.needs}" if estimator.needs else ""
-        return covariance, (*fit.reasons, sentence + needed)
-    names = names_of(plant.definition.parameters)
+        return covariance, degrees, (*fit.reasons, sentence + needed)
     parameters = zip(plant.definition.parameters, fit.estimate.params, strict=True)
     size = np.array([float(value) if p.positive else p.scale for p, value in parameters])
-    remarks = ()
-    coloured = [name for name, p in whiteness.items() if p < RARE]
-    if coloured and isinstance(estimator, NLS):
+    coloured, remarks = [name for name, p in whiteness.items() if p < RARE], []
+    not_white = f"the residual of {' and '.join(coloured)} is not white: the intervals"
+    if not isinstance(estimator, NLS):
+        if coloured:
+            remarks.append(f"{not_white} assume white noise, and are too narrow")
+    elif coloured or uncertain.any():
         estimate, free = jax.device_put((fit.estimate, fit.free))
-        S, residual = estimator.sensitivity(plant, experiments, estimate, free)
-        robust = robust_covariance(np.asarray(S), np.asarray(residual))
-        robust = np.outer(size, size) * robust[: len(names), : len(names)]
-        covariance = widened(covariance, robust)
-        remarks = (
-            "the intervals allow for coloured noise, not for an error in the plant's equations",
-        )
-    elif coloured:
-        remarks = ("the intervals assume white noise, and are too narrow",)
-    remarks = tuple(
-        f"the residual of {' and '.join(coloured)} is not white: {remark}" for remark in remarks
-    )
+        S, residual = map(np.asarray, estimator.sensitivity(plant, experiments, estimate, free))
+        if coloured:
+            robust, its = robust_covariance(S, residual, np.asarray(experiments.valid))
+            robust = np.outer(size, size) * robust[: len(names), : len(names)]
+            is_wider = np.diag(robust) > np.diag(covariance)
+            degrees = np.where(is_wider, its[: len(names)], degrees)
+            covariance = widened(covariance, robust)
+            remarks.append(
+                f"{not_white} allow for coloured noise, not for an error in the plant's equations"
+            )
+        if uncertain.any():
+            to_constants = np.asarray(estimator.constant_sensitivity(plant, experiments, estimate))
+            effect = effect_of_constants(S, to_constants)[: len(names)] * uncertain[None]
+            effect = effect * size[:, None]
+            covariance, degrees = with_independent(covariance, degrees, effect @ effect.T)
+            remarks.append(
+                f"the intervals include the standard deviation of {_told(plant, uncertain)}"
+            )
     seen = identifiability(names, covariance / np.outer(size, size), fit.free)
-    return covariance, (*fit.reasons, seen, *remarks)
+    return covariance, degrees, (*fit.reasons, seen, *remarks)
+
+
+def _told(plant: AbstractPlant, uncertain: np.ndarray) -> str:
+    """The uncertain constants with their standard deviations."""
+    pairs = zip(plant.definition.constants, uncertain, strict=True)
+    return ", ".join(f"{c.name} ({f'{sd:.3g} {c.unit}'.strip()})" for c, sd in pairs if sd)
 
 
 def _fitted_all(
@@ -714,50 +835,51 @@ def _wrong_structure(
     )
 
 
-def _other_hold(
+def _suspects(
     plant: AbstractPlant,
     records: Sequence[Record],
     experiments: Experiments,
     estimator: AbstractEstimator,
+    start: Params,
     fit: _Fit,
     linear: np.ndarray,
-) -> tuple[str, ...]:
-    """A sentence where an input that is held fits better as linear, or the other way round."""
+) -> tuple[Suspect, ...]:
+    """What the plant may leave out, where more than noise is left; not for long records."""
     if not isinstance(estimator, NLS) or not fit.is_successful:
         return ()
-    if _is_noise(plant, experiments, fit.estimate):
+    if experiments.valid.size > _SIZE_OF_SUSPECTS:
         return ()
-    sd = np.asarray(plant.sensor.sd)
-    scale = np.where(sd > 0, sd, [o.scale for o in plant.definition.outputs])
-    estimator = dataclasses.replace(estimator, num_starts=1)
-
-    def cost(estimate: Estimate) -> float:
-        return float(np.sum((np.asarray(estimate.residual) / scale) ** 2))
-
-    def cost_with(index: int) -> float:
-        other = linear ^ (np.arange(len(linear)) == index)
-        with_other = _experiments(plant, records, experiments.initial_state_known, other, True)
-        begin, free = jax.device_put((fit.estimate.params, fit.free))
-        return cost(jax.device_get(estimator(plant, with_other, begin, free)))
-
-    costs = [cost_with(index) for index in range(len(linear))]
-    own, best = cost(fit.estimate), int(np.argmin(costs))
-    if costs[best] > (1 - _BETTER) * own:
+    residual, valid = np.asarray(fit.estimate.residual), np.asarray(experiments.valid)
+    if _is_noise(plant, experiments, fit.estimate) and outliers(residual, valid) is None:
         return ()
-    name, word = names_of(plant.definition.inputs)[best], "constant" if linear[best] else "linear"
-    return (
-        f"with {name} {word} between samples the sum of squared residuals would be "
-        f"{100 * (1 - costs[best] / own):.2g} % smaller (--hold-input {name}={word})",
+
+    name, plus, extensions = plant.definition.name.partition("+")
+    word = (
+        f"{name if name in PLANTS else 'FILE.py:' + plain_kind(plant).__name__}{plus}{extensions}"
     )
+    stacked = partial(_experiments, plant, records, experiments.initial_state_known)
+    return suspects(
+        plant, experiments, stacked, linear, estimator, start, fit.estimate, ~fit.known, word
+    )
+
+
+def _remedies(found: Sequence[Suspect]) -> tuple[str, ...]:
+    """Sentences on the suspects, the likeliest first."""
+    if not found:
+        return ()
+    others = [f"{s.name} ({100 * s.reduction:.3g} %)" for s in found[1:4] if s.reduction > 0]
+    less = (f"less likely: {', '.join(others)}",) if others else ()
+    return (f"likely cause: {found[0].sentence}", *less)
 
 
 def _agreement(fit: _Fit) -> tuple[str, ...]:
     """A sentence on how many of several starts ended at the estimate."""
-    costs = np.asarray(fit.estimate.costs)
-    if not fit.is_successful or costs.size <= 1:
+    if not fit.is_successful or not fit.others:
         return ()
-    same = np.sum(costs <= (1 + _SAME) * np.min(costs))
-    return (f"{same} of {costs.size} starts of the search ended at this estimate",)
+    ends = [fit.estimate, *fit.others]
+    most = (1 + _SAME / fit.estimate.residual.size) * float(fit.estimate.cost)
+    same = sum(float(end.cost) <= most for end in ends)
+    return (f"{same} of {len(ends)} starts of the search ended at this estimate",)
 
 
 def _require_explanation(

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ..plant import AbstractPlant, Params
-from ..simulation import step
+from ..simulation import delayed, step
 
 _NARROW = 1e-5  # least width of a difference, over a state's scale
 
@@ -66,6 +66,11 @@ def innovations(
         noise_sd: of the sensors [output unit].
         steps: inputs, dt and next inputs of one of the `Experiments`.
     """
+    if (delay := plant.delay(params)) is not None:
+        inputs, dt, next_inputs = steps
+        dt = jnp.full(len(inputs), plant.dt) if dt is None else dt
+        inputs, next_inputs = delayed(inputs, delay, dt, next_inputs)
+        steps = inputs, dt, next_inputs
 
     def advance(belief: tuple[Array, Array], now: tuple) -> tuple[tuple[Array, Array], Innovations]:
         inputs, measured, valid = now

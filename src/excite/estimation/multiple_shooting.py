@@ -26,6 +26,7 @@ techniques for O.D.E.", Progress in Scientific Computing 2, 1983).
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple, TypeVar
 
@@ -35,8 +36,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..plant import AbstractPlant
-from ..simulation import step
+from ..plant import AbstractPlant, Params
+from ..simulation import delayed, step
 from .contract import Experiments
 
 Tree = TypeVar("Tree")
@@ -55,13 +56,28 @@ _LIMIT = 1e3
 """Largest growth of the sum of squares in one of them."""
 _ACCEPTED, _GOOD = 0.01, 0.75  # parts of the predicted reduction that a step must reach
 _GROWTH, _SHRINKING = 10.0, 0.1  # of the radius after a good and after a refused step
+_CAREFUL = 2.0  # growth after a step was refused
 _LARGEST = {True: 1.0, False: 10.0}
 """Change in one step of the logarithm of a positive parameter, of a free one over its scale."""
-_MOST = 1e3  # largest damping over the size of the rows
+_IDLE = 1e-3  # a gain of the last step, over the noise, that ends a search without steps left
+_SHORT = 0.3  # part of a step below which the radius shrinks
+_MOST = 1e30  # largest damping over the squared length of a column
 _CLOSED = 1e-6  # a gap that is closed to first order leaves its square
 _BLOCK = 2**14
 """Samples that are simulated side by side; longer records are simulated in blocks."""
 _EPS, _TINY = np.finfo(float).eps, np.finfo(float).tiny
+
+
+class Steps(NamedTuple):
+    """What acts from each sample to the next; see `Experiments`.
+
+    `change`: of inputs and next inputs with the delay of each input.
+    """
+
+    inputs: Array
+    dt: Array | None
+    next_inputs: Array | None
+    change: tuple[Array, Array] | None = None
 
 
 class Segments(eqx.Module):
@@ -70,7 +86,7 @@ class Segments(eqx.Module):
     `valid` is False for unused samples, `is_followed` for a segment after which none are used.
     """
 
-    steps: tuple[Array, Array | None, Array | None]  # inputs, dt, next inputs
+    steps: Steps
     measured: Float[Array, "block experiment segment time output"]
     valid: Bool[Array, "block experiment segment time output"]
     is_followed: Bool[Array, "block experiment segment"]
@@ -91,7 +107,7 @@ class Segments(eqx.Module):
 
         valid = cut(experiments.valid)
         return cls(
-            jax.tree.map(cut, (experiments.inputs, experiments.dt, experiments.next_inputs)),
+            jax.tree.map(cut, Steps(experiments.inputs, experiments.dt, experiments.next_inputs)),
             cut(experiments.measured),
             valid,
             in_blocks(_next(over_segments(valid.any(axis=(3, 4)))), num_blocks),
@@ -107,7 +123,8 @@ class Segments(eqx.Module):
 def over_segments(values: Array) -> Array:
     """Values by block, experiment and segment as values by experiment and segment."""
     values = jnp.moveaxis(values, 0, 1)
-    return values.reshape(len(values), -1, *values.shape[3:])
+    num_experiments, num_blocks, in_block, *rest = values.shape  # no -1: inputs may have no column
+    return values.reshape(num_experiments, num_blocks * in_block, *rest)
 
 
 def in_blocks(values: Array, num_blocks: int) -> Array:
@@ -197,7 +214,9 @@ class _Search(NamedTuple):
     sweep: Sweep
     cost: Float[Array, ""]
     predicted: Float[Array, ""]
+    gained: Float[Array, ""]
     radius: Float[Array, ""]
+    growth: Float[Array, ""]
     part: Float[Array, ""]
     steps: Int[Array, ""]
     converged: Bool[Array, ""]
@@ -225,27 +244,58 @@ class MultipleShooting:
         self.num_states = len(plant.definition.states)
         self.largest = jnp.asarray([_LARGEST[p.positive] for p in plant.definition.parameters])
 
+    def delayed(self, z: Array) -> Segments:
+        """The segments with the inputs of a plant that delays them."""
+        delay = self.plant.delay(self.plant.Params(*self.params_at(z)))
+        if delay is None:
+            return self.segments
+        (num_blocks, *_, length), s = self.segments.valid.shape[:4], self.segments.steps
+        dt = jnp.full(s.inputs.shape[:-1], self.plant.dt) if s.dt is None else s.dt
+        held = s.inputs if s.next_inputs is None else s.next_inputs
+
+        def joined(rows: Array) -> Array:
+            rows = over_segments(rows)
+            return rows.reshape(len(rows), -1, *rows.shape[3:])
+
+        def cut(rows: Array) -> Array:
+            return in_blocks(rows.reshape(len(rows), -1, length, *rows.shape[2:]), num_blocks)
+
+        def acting(delay: Array) -> tuple[Array, Array]:
+            arguments = joined(s.inputs), joined(dt), joined(held)
+            return jax.vmap(lambda u, dt, v: delayed(u, delay, dt, v))(*arguments)
+
+        now, change = jax.jvp(acting, (delay,), (jnp.ones_like(delay),))
+        (first, last), change = jax.tree.map(cut, (now, change))
+        return dataclasses.replace(self.segments, steps=Steps(first, s.dt, last, change))
+
+    def advance(self, x: Array, now: Steps, params: Params, delay: Array | None = None) -> Array:
+        """State one sample later; `delay` is that of the inputs, for the derivatives."""
+        ends, own = (now.inputs, now.next_inputs), self.plant.delay(params)
+        if now.change is not None and delay is not None and own is not None:
+            ends = jax.tree.map(lambda u, slope: u + (own - delay) * slope, ends, now.change)
+        return step(self.plant, x, ends[0], params, now.dt, ends[1])
+
     def shoot(self, z: Array, starts: Array, next_starts: Array, block: Segments) -> Shots:
         """Simulates the segments of one block."""
         n = self.num_states
+        delay = self.plant.delay(self.plant.Params(*self.params_at(z)))
 
-        def outputs_and_end(point: Array, steps: tuple) -> tuple[tuple, tuple]:
+        def outputs_and_end(point: Array, steps: Steps) -> tuple[tuple, tuple]:
             params = self.plant.Params(*self.params_at(point[n:]))
 
-            def advance(x: Array, now: tuple) -> tuple[Array, Array]:
-                input, dt, next_input = now
-                after = step(self.plant, x, input, params, dt, next_input)
-                return after, self.plant.output(x, params)
+            def advance(x: Array, now: Steps) -> tuple[Array, Array]:
+                return self.advance(x, now, params, delay), self.plant.output(x, params)
 
             end, outputs = jax.lax.scan(advance, point[:n] * self.scales, steps)
             return (found := (outputs, end / self.scales)), found
 
-        def differentiated(start: Array, steps: tuple) -> tuple:
+        def differentiated(start: Array, steps: Steps) -> tuple:
             point = jnp.concatenate([start, z])
             return jax.jacfwd(outputs_and_end, has_aux=True)(point, steps)
 
         shape = starts.shape[:2]
-        flat = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), (starts, block.steps))
+        count = shape[0] * shape[1]
+        flat = jax.tree.map(lambda a: a.reshape(count, *a.shape[2:]), (starts, block.steps))
         (slope, end_slope), (outputs, end) = jax.tree.map(
             lambda a: a.reshape(*shape, *a.shape[1:]), jax.vmap(differentiated)(*flat)
         )
@@ -257,10 +307,11 @@ class MultipleShooting:
             end_slope=jnp.where(is_followed[..., None], end_slope, 0.0),
         )
 
-    def _blocks(self, starts: Array) -> tuple[Array, Array, Segments]:
+    def _blocks(self, point: Point) -> tuple[Array, Array, Segments]:
         """Start states, those of the next segments, and segments, by block."""
-        num_blocks = len(self.segments.valid)
-        return in_blocks(starts, num_blocks), in_blocks(_next(starts), num_blocks), self.segments
+        num_blocks, starts = len(self.segments.valid), point.starts
+        here, following = (in_blocks(x, num_blocks) for x in (starts, _next(starts)))
+        return here, following, self.delayed(point.z)
 
     def sweep(self, point: Point) -> Sweep:
         """Simulates all segments, and closes their gaps to first order."""
@@ -290,9 +341,7 @@ class MultipleShooting:
             jnp.tile(first[None], (num_experiments, 1, 1)),
             jnp.zeros((num_experiments, num_outputs, width, width)),
         )
-        (_, triangles), (moves, misfit) = jax.lax.scan(
-            simulate_block, begin, self._blocks(point.starts)
-        )
+        (_, triangles), (moves, misfit) = jax.lax.scan(simulate_block, begin, self._blocks(point))
         return Sweep(over_segments(moves), triangles, over_segments(misfit))
 
     def linearised(
@@ -344,7 +393,7 @@ class MultipleShooting:
         nothing = jnp.asarray(0.0)
         begin = jnp.zeros((num_experiments, n + p + 1, n + p + 1)), nothing, nothing, 0
         (triangle, misfits, gaps, _), rows = jax.lax.scan(
-            simulate_block, begin, self._blocks(point.starts)
+            simulate_block, begin, self._blocks(point)
         )
         common = jnp.linalg.qr(triangle[:, n:, n:].reshape(-1, p + 1), mode="r")
         return Linear(over_segments(rows), common, misfits, gaps)
@@ -444,22 +493,6 @@ class MultipleShooting:
         found = jax.lax.while_loop(goes_on, match, begin)
         return _where(found.is_closed, found.here, found.best)
 
-    def chained(self, start: Point) -> Point:
-        """The start states of all segments from one simulation."""
-        params = self.plant.Params(*self.params_at(start.z))
-
-        def segment(state: Array, steps: tuple) -> tuple[Array, Array]:
-            def advance(x: Array, now: tuple) -> tuple[Array, None]:
-                input, dt, next_input = now
-                return step(self.plant, x, input, params, dt, next_input), None
-
-            end, _ = jax.lax.scan(advance, state * self.scales, steps)
-            return end / self.scales, state
-
-        steps = jax.tree.map(over_segments, self.segments.steps)
-        chain = jax.vmap(lambda first, steps: jax.lax.scan(segment, first, steps)[1])
-        return start._replace(starts=chain(start.starts[:, 0], steps))
-
     def weighted(self, sweep: Sweep, sd: Array) -> Float[Array, "experiment unknown unknown"]:
         """The triangle of all outputs over their standard deviations; unknowns, then value."""
         triangles = sweep.triangles / sd[None, :, None, None]
@@ -469,20 +502,25 @@ class MultipleShooting:
         return jnp.linalg.qr(stacked, mode="r")
 
     def newton_step(
-        self, moves: Array, triangle: Array, damping: Array
+        self, moves: Array, triangle: Array, damping: Array, more: Float[Array, " param"]
     ) -> tuple[Point, Float[Array, "experiment unknown"]]:
-        """Damped Gauss-Newton step: the change of the point, and of the weighted outputs."""
+        """Damped Gauss-Newton step: the change of the point, and of the weighted outputs.
+
+        `more` is a factor of each parameter's damping.
+        """
         n, width = self.num_states, moves.shape[-1]
         k, p = n if self.first_is_free else 0, width - n - 1
 
-        def damped(rows: Array, count: int) -> Array:
+        def damped(rows: Array, factors: Array) -> Array:
+            count = len(factors)
             squares = jnp.sum(rows[:, :count] ** 2, axis=0)
             least = _EPS**2 * jnp.sum(triangle[..., :-1] ** 2) + _TINY
-            extra = jnp.eye(count, rows.shape[-1]) * jnp.sqrt(damping * squares + least)[:, None]
+            size = jnp.sqrt(damping * factors * squares + least)
+            extra = jnp.eye(count, rows.shape[-1]) * size[:, None]
             return jnp.linalg.qr(jnp.concatenate([rows, extra]), mode="r")
 
-        R = jax.vmap(lambda own: damped(own, k))(triangle) if k else triangle
-        common = damped(R[:, k:, k:].reshape(-1, p + 1), p)
+        R = jax.vmap(lambda own: damped(own, jnp.ones(k)))(triangle) if k else triangle
+        common = damped(R[:, k:, k:].reshape(-1, p + 1), more)
         dz = -jax.scipy.linalg.solve_triangular(common[:p, :p], common[:p, p])
         change = jnp.zeros((len(R), width)).at[:, n:].set(jnp.append(dz, 1.0)[None])
         if k:
@@ -494,19 +532,20 @@ class MultipleShooting:
 
     def limited_step(
         self, moves: Array, triangle: Array, damping: Array
-    ) -> tuple[Float[Array, ""], Point, Float[Array, "experiment unknown"]]:
-        """A step with the damping raised until no search coordinate changes too much."""
+    ) -> tuple[Point, Float[Array, "experiment unknown"]]:
+        """A step in which no search coordinate changes too much; one that would is damped more."""
 
         def is_too_long(found: tuple) -> Array:
-            damping, change, _ = found
-            return (jnp.max(jnp.abs(change.z) / self.largest) > 1) & (damping < _MOST)
+            more, change, _ = found
+            return (jnp.abs(change.z) > self.largest) & (damping * more < _MOST)
 
         def shorter(found: tuple) -> tuple:
-            damping = 10 * found[0]
-            return damping, *self.newton_step(moves, triangle, damping)
+            more = jnp.where(is_too_long(found), 10 * found[0], found[0])
+            return more, *self.newton_step(moves, triangle, damping, more)
 
-        first = damping, *self.newton_step(moves, triangle, damping)
-        return jax.lax.while_loop(is_too_long, shorter, first)
+        ones = jnp.ones(len(self.largest))
+        first = ones, *self.newton_step(moves, triangle, damping, ones)
+        return jax.lax.while_loop(lambda found: jnp.any(is_too_long(found)), shorter, first)[1:]
 
     def solve(
         self,
@@ -534,21 +573,38 @@ class MultipleShooting:
             cost = jnp.sum((sweep.triangles[..., -1] / sd[None, :, None]) ** 2)
             hoped, gained = s.cost - s.predicted, s.cost - cost
             is_bold = (s.steps < _BOLD) & (cost < _LIMIT * s.cost)
-            accepted = (gained >= _ACCEPTED * hoped) | is_bold | (s.steps == 0)
+            is_equal = jnp.abs(gained) <= 100 * _EPS * cost
+            accepted = (gained >= _ACCEPTED * hoped) | is_equal | is_bold | (s.steps == 0)
             best, sweep, cost = _where(accepted, (s.here, sweep, cost), (s.best, s.sweep, s.cost))
             triangle = self.weighted(sweep, sd)
-            growth = jnp.where(gained > _GOOD * hoped, _GROWTH, 1.0)
-            radius = jnp.clip(s.radius * jnp.where(accepted, growth, _SHRINKING), 1e-9, 1e9)
-            part = jnp.where(accepted, jnp.minimum(2 * s.part, 1.0), 0.5 * s.part)
-            damping = 1 / radius
-            damping, change, outputs = self.limited_step(sweep.moves, triangle, damping)
+            is_good = gained > _GOOD * hoped
+            # Where the residual is large a step may be too long, and its direction right: a part
+            # of it is tried before the radius shrinks.
+            shrinking = jnp.where(s.part > _SHORT, 1.0, _SHRINKING)
+            grown = jnp.where(is_good, s.growth, 1.0)
+            radius = jnp.clip(s.radius * jnp.where(accepted, grown, shrinking), 1e-9, 1e18)
+            growth = jnp.where(accepted, s.growth, _CAREFUL)
+            longer = jnp.where(is_good, jnp.minimum(2 * s.part, 1.0), s.part)
+            part = jnp.where(accepted, longer, 0.5 * s.part)
+            change, outputs = self.limited_step(sweep.moves, triangle, 1 / radius)
             reached = jnp.sum((triangle[..., -1] + outputs) ** 2)
             least = jnp.maximum(tolerance**2 * cost / count, rounding**2)
             is_closed = jnp.max(jnp.abs(sweep.moves[..., -1])) < _CLOSED
             settled = accepted & is_closed & (jnp.sum(outputs**2) <= least)
             here = jax.tree.map(lambda at, by: at + part * by, best, change)
-            predicted = cost + part * (reached - cost)
-            return _Search(here, best, sweep, cost, predicted, radius, part, s.steps + 1, settled)
+            return _Search(
+                here=here,
+                best=best,
+                sweep=sweep,
+                cost=cost,
+                predicted=cost + part * (reached - cost),
+                gained=jnp.where(accepted, gained, s.gained),
+                radius=radius,
+                growth=growth,
+                part=part,
+                steps=s.steps + 1,
+                converged=settled,
+            )
 
         def goes_on(s: _Search) -> Array:
             is_sound = (s.steps == 0) | (jnp.isfinite(s.cost) & (s.part > 1e-6))
@@ -561,7 +617,9 @@ class MultipleShooting:
             sweep=jax.tree.map(lambda a: jnp.zeros(a.shape), nothing),
             cost=jnp.asarray(jnp.inf),
             predicted=jnp.asarray(0.0),
+            gained=jnp.asarray(jnp.inf),
             radius=jnp.asarray(1e3),
+            growth=jnp.asarray(_GROWTH),
             part=jnp.asarray(1.0),
             steps=jnp.asarray(0),
             converged=jnp.asarray(False),
@@ -569,7 +627,8 @@ class MultipleShooting:
         found = jax.lax.while_loop(goes_on, improve, search)
         # The last step is taken too; it is too small for the sweep to change.
         point = _where(found.converged, found.here, found.best)
-        return point, found.sweep, found.converged
+        is_idle = found.gained <= _IDLE * found.cost / count
+        return point, found.sweep, found.converged | (found.steps == max_steps) & is_idle
 
 
 def _next_width(width: Array, mean_square: Array, is_first: Array) -> Array:

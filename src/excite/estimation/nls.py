@@ -29,7 +29,7 @@ from .contract import (
 )
 from .multiple_shooting import MultipleShooting, Point, Segments
 
-_FAR = 30.0  # logarithm of a positive parameter over its nominal value
+_FAR = 30.0  # largest logarithm of a positive parameter over its nominal value
 Noise = Literal["declared", "known", "estimated"]
 
 
@@ -41,8 +41,6 @@ class NLS(AbstractSearch):
             this part of its standard error.
         max_steps: of the search.
         segment_length: of multiple shooting [samples], default one for the record's length.
-        num_starts: of the search: the given one, the same without the first phase, and random
-            ones around it, side by side. The smallest sum of squares counts.
         noise: "declared": an output's weight follows from its declared noise (without one, from
             its scale), the size of the noise from the residual; "known": that follows from
             the declaration, too; "estimated": the weights follow from the residual, too.
@@ -52,7 +50,6 @@ class NLS(AbstractSearch):
     tolerance: float = eqx.field(static=True, default=1e-4)
     max_steps: int = eqx.field(static=True, default=100)
     segment_length: int | None = eqx.field(static=True, default=None)
-    num_starts: int = eqx.field(static=True, default=1)
     noise: Noise = eqx.field(static=True, default="declared")
     known: tuple[str, ...] = eqx.field(static=True, default=())
     name: str = eqx.field(static=True, default="nls", kw_only=True)
@@ -93,6 +90,31 @@ class NLS(AbstractSearch):
         S = problem.sensitivity(estimate.params, estimate.initial_state)
         return S / sd[None, None, :, None], estimate.residual / sd[None, None]
 
+    def weights(
+        self, plant: AbstractPlant, experiments: Experiments, estimate: Estimate
+    ) -> Float[Array, " output"]:
+        """The standard deviations over which the residual of an estimate counts."""
+        problem = Problem(plant, experiments, estimate.params, None)
+        is_estimated = self.noise == "estimated"
+        return problem.noise_sd(estimate.residual) if is_estimated else problem.assumed_sd
+
+    @eqx.filter_jit
+    def constant_sensitivity(
+        self, plant: AbstractPlant, experiments: Experiments, estimate: Estimate
+    ) -> Float[Array, "experiment sample output constant"]:
+        """Derivative of the outputs with respect to the known constants, weighted like these."""
+        sd = self.weights(plant, experiments, estimate)
+        names = plant.constants._fields
+
+        def outputs(values: Array) -> Array:
+            changed = plant.changed(**dict(zip(names, values, strict=True)))
+            simulated = simulate_experiments(
+                changed, estimate.params, experiments, estimate.initial_state
+            )
+            return -residual_of(experiments, simulated)
+
+        return jax.jacfwd(outputs)(jnp.stack(plant.constants)) / sd[None, None, :, None]
+
     def _search(self, problem: Problem) -> _Found:
         """The minimum."""
         experiments, plant = problem.experiments, problem.plant
@@ -110,25 +132,12 @@ class NLS(AbstractSearch):
                 max_steps=self.max_steps,
             )
             misfit = sweep.misfit.reshape(segments.shape[0], -1, problem.num_outputs)
-            residual = -misfit[:, :num_samples]
-            cost = jnp.sum((residual / sd[None, None]) ** 2)[None]
-            return _Found(point, converged, sweep.triangles, residual, sd, cost)
-
-        def matched(z: Array) -> Point:
-            return shooting.matched(Point(z, starts), sd)
+            return _Found(point, converged, sweep.triangles, -misfit[:, :num_samples], sd)
 
         first = experiments.initial_state / problem.state_scales[None]
         starts = jnp.tile(first[:, None], (1, segments.shape[1], 1))
         sd = problem.assumed_sd
-        if self.num_starts == 1:
-            found = search(matched(problem.start), sd)
-        else:
-            around = jnp.stack([problem.start, *problem.starts_around(self.num_starts - 2)])
-            one = shooting.chained(Point(problem.start, starts))
-            points = jax.tree.map(
-                lambda many, one: jnp.concatenate([many, one[None]]), jax.vmap(matched)(around), one
-            )
-            found = _best(jax.vmap(search, in_axes=(0, None))(points, sd))
+        found = search(shooting.matched(Point(problem.start, starts), sd), sd)
         if self.noise == "estimated" and problem.num_outputs > 1:
             found = search(found.point, problem.noise_sd(found.residual))
         return found
@@ -148,15 +157,6 @@ class _Found(NamedTuple):
     triangles: Float[Array, "experiment output column column"]
     residual: Float[Array, "experiment sample output"]
     sd: Float[Array, " output"]
-    costs: Float[Array, " start"]
-
-
-def _best(found: _Found) -> _Found:
-    """The best of several searches; one that converged counts more than one that did not."""
-    costs = jnp.where(jnp.isfinite(found.costs[:, 0]), found.costs[:, 0], jnp.inf)
-    best = jnp.lexsort((costs, ~found.converged))[0]
-    chosen = jax.tree.map(lambda a: a[best], found)
-    return chosen._replace(sd=found.sd[0], costs=jnp.where(found.converged, costs, jnp.inf))
 
 
 class Problem(eqx.Module):
@@ -198,29 +198,26 @@ class Problem(eqx.Module):
     def params(self, z: Float[Array, " param"]) -> Float[Array, " param"]:
         """Parameters at search coordinates; held ones stay at the start.
 
-        A positive one that the data do not tell from zero, or from infinity, ends far away.
+        A positive one stays within a factor of exp(30) of its nominal value.
         """
         d = self.plant.definition
         usual = to_search(d, self.plant.nominal)
-        most = jnp.asarray([_FAR if p.positive else jnp.inf for p in d.parameters])
-        return from_search(
-            d, jnp.where(self.free, jnp.clip(z, usual - most, usual + most), self.start)
-        )
+        positive = jnp.asarray([p.positive for p in d.parameters])
+        beyond = jax.lax.stop_gradient(z - jnp.clip(z, usual - _FAR, usual + _FAR))
+        z = z - jnp.where(positive, beyond, 0.0)  # the derivative is kept beyond the limit
+        return from_search(d, jnp.where(self.free, z, self.start))
 
-    def starts_around(self, count: int) -> Float[Array, "start param"]:
-        """Random search coordinates around the start, always the same: factors up to three."""
-        width = jnp.asarray(
-            [math.log(3) if p.positive else 2.0 for p in self.plant.definition.parameters]
-        )
-        unit = jax.random.uniform(jax.random.key(0), (count, len(width)), float, -1.0, 1.0)
-        return self.start[None] + width[None] * unit
+    @property
+    def degrees(self) -> Float[Array, " output"]:
+        """Degrees of freedom of each output's residual: values less its share of the unknowns."""
+        num_experiments, num_states = self.experiments.initial_state.shape
+        states = 0 if self.experiments.initial_state_known else num_experiments * num_states
+        spent = (jnp.sum(self.free) + states) / self.num_outputs
+        return jnp.maximum(jnp.sum(self.experiments.valid, axis=(0, 1)) - spent, 1.0)
 
     def noise_sd(self, residual: Array) -> Array:
         """Standard deviation of each output's residual, corrected for the number of unknowns."""
-        num_states = 0 if self.experiments.initial_state_known else self.state_scales.size
-        spent = jnp.sum(self.free) + num_states * residual.shape[0]
-        count = jnp.sum(self.experiments.valid, axis=(0, 1)) - spent / self.num_outputs
-        sd = jnp.sqrt(jnp.sum(residual**2, axis=(0, 1)) / jnp.maximum(count, 1.0))
+        sd = jnp.sqrt(jnp.sum(residual**2, axis=(0, 1)) / self.degrees)
         return jnp.maximum(sd, self.rounding)  # noise-free data keep a finite weight
 
     def sensitivity(self, params: Params, initial_state: Array) -> Array:
@@ -257,8 +254,9 @@ class Problem(eqx.Module):
             initial_state = found.point.starts[:, 0] * self.state_scales[None]
         # H of the weighted outputs, and V of their scores, whose sd is not the assumed one.
         ratio = (sd / found.sd)[None, :, None, None]
-        each = jnp.einsum("eokp,eokq->opq", columns, columns)
-        H, V = jnp.sum(each, axis=0), jnp.einsum("o,opq->pq", ratio[0, :, 0, 0] ** 2, each)
+        by_output = jnp.einsum("eokp,eokq->opq", columns, columns)
+        H = jnp.sum(by_output, axis=0)
+        V = jnp.einsum("o,opq->pq", ratio[0, :, 0, 0] ** 2, by_output)
         held = jnp.diag(jnp.where(self.free, 0.0, 1.0))
         active = jnp.outer(self.free, self.free)
         # Over the columns' lengths: one parameter that hardly acts leaves the others' digits.
@@ -266,6 +264,10 @@ class Problem(eqx.Module):
         cosines = jnp.where(active, H / jnp.outer(length, length), 0.0) + held
         inverse = jnp.where(active, jnp.linalg.inv(cosines) / jnp.outer(length, length), 0.0)
         relative = inverse @ V @ inverse
+        # Of a sum of estimated variances (F. Satterthwaite, Biometrics Bulletin 2, 1946).
+        parts = jnp.einsum("o,pq,oqr,rp->op", ratio[0, :, 0, 0] ** 2, inverse, by_output, inverse)
+        spread = jnp.sum(parts**2 / self.degrees[:, None], axis=0)
+        degrees = jnp.where(spread > 0, jnp.sum(parts, axis=0) ** 2 / spread, jnp.inf)
         information = jnp.einsum("eokp,eokq->pq", columns / ratio, columns / ratio)
         return Estimate(
             params=params,
@@ -274,7 +276,8 @@ class Problem(eqx.Module):
             status=status_of_search(values, found.residual, relative, found.converged),
             initial_state=initial_state,
             residual=found.residual,
-            costs=found.costs,
+            cost=jnp.sum((found.residual / found.sd[None, None]) ** 2),
+            degrees=jnp.full_like(degrees, jnp.inf) if noise_is_known else degrees,
         )
 
 

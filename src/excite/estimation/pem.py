@@ -56,13 +56,11 @@ class PEM(AbstractSearch):
         tolerance: the search ends before a step that would change the estimate by less than
             this part of its standard error.
         max_steps: of the search.
-        num_starts: of the search by `NLS`.
         known: names of parameters that are held where the search starts.
     """
 
     tolerance: float = eqx.field(static=True, default=1e-3)
     max_steps: int = eqx.field(static=True, default=200)
-    num_starts: int = eqx.field(static=True, default=8)
     known: tuple[str, ...] = eqx.field(static=True, default=())
     name: str = eqx.field(static=True, default="pem", kw_only=True)
 
@@ -79,7 +77,7 @@ class PEM(AbstractSearch):
         others = ~jnp.asarray(self.held(plant))
         free = others if free is None else free & others
         start = plant.nominal if start is None else start
-        first = NLS(num_starts=self.num_starts)(plant, experiments, start, free)
+        first = NLS()(plant, experiments, start, free)
         likelihood = _Likelihood(plant, experiments, start, free)
         begin = likelihood.begin(first)
         return likelihood.estimate(likelihood.maximum(begin, self.tolerance, self.max_steps))
@@ -98,8 +96,8 @@ class PEM(AbstractSearch):
         likelihood = _Likelihood(plant, experiments, params, held, noise_is_free=False)
         noise = jnp.append(found.process_noise, found.noise_sd)
         begin = likelihood.at(params, noise, first.initial_state)
-        found = likelihood.maximum(begin, self.tolerance, self.max_steps)
-        return likelihood.prediction(found.here)
+        end = likelihood.maximum(begin, self.tolerance, self.max_steps)
+        return likelihood.prediction(end.here)
 
 
 class _Point(NamedTuple):
@@ -334,6 +332,7 @@ class _Likelihood:
             status=status_of_search(values, residual, relative, found.converged),
             initial_state=point.starts * self.state_scales[None],
             residual=residual,
+            cost=found.cost,
             prediction=prediction,
         )
 

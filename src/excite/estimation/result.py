@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,13 +11,14 @@ import numpy as np
 from jaxtyping import Float
 
 from .. import __version__
-from ..description import HALF_95, Named, PlantDescription, names_of
+from ..description import Named, PlantDescription, names_of
 from ..files import csv_text, new_run_folder, write_json
 from ..record import Record, write_record
 from ..record.rows import USABLE, EstimateSummary
 from ..record.table import data_frame
 from ..report.results import identification_html, identification_text, wrapped
 from .diagnosis import correlation, fit_percent
+from .remedies import Suspect
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -92,6 +93,7 @@ class Identification:
         status: in a few words; docs/reference/machine-readable.md lists them.
         params, std_error: by parameter, in its unit, as attribute or item; the error of a held
             one is nan.
+        intervals: 95 % interval of each parameter.
         held: parameters not estimated: not identifiable and held at their start value, or
             held at a bound that they reached.
         covariance, information: of the estimates; see `excite.estimation.Estimate`.
@@ -99,6 +101,7 @@ class Identification:
             residual is the error of the one-step prediction.
         structure: by output, p-value of the residual not following past inputs.
         verdict: sentences on identifiability and on the validity of the intervals.
+        suspects: what the plant may leave out, the likeliest first; see `Suspect`.
         fitted, validation: records and their simulation.
         initial_state_known: whether initial states were taken as known.
         noise: estimated with `pem`; otherwise None.
@@ -109,12 +112,14 @@ class Identification:
     status: str
     params: Named[float]
     std_error: Named[float]
+    intervals: Named[tuple[float, float]]
     held: tuple[str, ...]
     covariance: Float[np.ndarray, "param param"]
     information: Float[np.ndarray, "param param"]
     whiteness: Mapping[str, float]
     structure: Mapping[str, float]
     verdict: tuple[str, ...]
+    suspects: tuple[Suspect, ...]
     fitted: tuple[Fitted, ...]
     validation: tuple[Fitted, ...]
     initial_state_known: bool
@@ -126,9 +131,12 @@ class Identification:
         return self.status in USABLE
 
     def ci95(self, name: str) -> tuple[float, float]:
-        """95 % interval of a parameter; symmetric, estimate ± 1.96 standard errors."""
-        half = HALF_95 * self.std_error[name]
-        return self.params[name] - half, self.params[name] + half
+        """95 % interval of a parameter: estimate ± t standard errors, or by profile likelihood.
+
+        t is 1.96 where the noise is known; where its size is estimated from the residual, it is
+        that of Student's distribution. An end where a profile stays open is infinite.
+        """
+        return self.intervals[name]
 
     def fit(self) -> dict[str, float]:
         """Fit of the simulation in percent by output, over all records together."""
@@ -217,6 +225,7 @@ class Identification:
             "prediction_fit_percent": self.prediction_fit(),
             "process_noise": None if self.noise is None else dict(self.noise.process),
             "measurement_noise": None if self.noise is None else dict(self.noise.measurement),
+            "suspects": [asdict(suspect) for suspect in self.suspects],
         }
 
 

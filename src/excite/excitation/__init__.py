@@ -10,6 +10,7 @@ from .signals import PRBS as PRBS
 from .signals import Chirp as Chirp
 from .signals import Decay as Decay
 from .signals import Multisine as Multisine
+from .signals import NoInput as NoInput
 from .signals import Random as Random
 from .signals import Replay as Replay
 from .signals import Square as Square

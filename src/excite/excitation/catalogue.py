@@ -19,7 +19,17 @@ from ..record import Record, read_signal, require_playable
 from ..record.read import SIGNAL_ENDINGS
 from .contract import AbstractExcitation, AbstractShape
 from .feedback import PolicyExcitation, PositionLoop
-from .signals import PRBS, Chirp, Decay, Multisine, Random, Replay, Square, maximum_length_sequence
+from .signals import (
+    PRBS,
+    Chirp,
+    Decay,
+    Multisine,
+    NoInput,
+    Random,
+    Replay,
+    Square,
+    maximum_length_sequence,
+)
 
 EXCITATIONS: Mapping[str, type[AbstractShape]] = {
     "random": Random,
@@ -117,7 +127,7 @@ def name_of(given: object) -> str:
         return LOOP + name_of(given.signal)
     if not issubclass(kind, AbstractExcitation):
         return "policy" if isinstance(given, Policy) else "replay"
-    shipped = {c: word for word, c in EXCITATIONS.items()}
+    shipped = {c: word for word, c in EXCITATIONS.items()} | {NoInput: "no input"}
     return shipped.get(kind, kind.__name__)  # pyright: ignore[reportArgumentType, reportCallIssue]
 
 

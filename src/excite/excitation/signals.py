@@ -214,6 +214,15 @@ class Decay(AbstractShape):
         return jnp.where(jnp.arange(num_steps)[:, None] < self.pump * num_steps, wave, 0.0)
 
 
+class NoInput(AbstractSignal):
+    """What excites a plant without inputs."""
+
+    def sequence(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> Sequence:
+        """Rows of no input."""
+        del key
+        return jnp.zeros((num_steps, len(plant.definition.inputs)))
+
+
 class Replay(AbstractSignal):
     """A recorded or designed input, clipped to the plant's limits.
 

@@ -18,6 +18,7 @@ from .cart_pole import CartPole
 from .contract import AbstractPlant, Sensor, as_number, require_double_precision
 from .dc_motor import DCMotor
 from .emps import EMPS
+from .extension import extended
 from .fields import floats
 
 PLANTS: Mapping[str, type[AbstractPlant]] = {
@@ -69,15 +70,20 @@ def plant_from(given: PlantLike) -> AbstractPlant:
 def plant_named(name: str) -> AbstractPlant:
     """A shipped plant by name, or one in a user's file as `path/to/file.py:ClassName`.
 
+    Either may have extensions: `aero2+delay_voltage`.
+
     The user's file is imported, so its code runs. Take such a name only from the user's
     command line, script or study file.
 
     Raises:
         ValueError: for an unknown name, or a file without such a class.
     """
+    path, colon, class_name = name.rpartition(":")
+    plain, *extensions = class_name.split("+")
+    if extensions:
+        return extended(plant_named(f"{path}{colon}{plain}"), extensions)
     if name in PLANTS:
         return PLANTS[name]()
-    path, colon, class_name = name.rpartition(":")
     if not colon or not path.endswith(".py"):
         raise unknown("plant", name, [*PLANTS, "path/to/file.py:ClassName"])
     plant_class = class_at(Path(path), class_name, AbstractPlant, "plant")
@@ -117,6 +123,23 @@ def _check_plant(plant: AbstractPlant, where: str) -> None:
             raise ValueError(f"{name} of {where} fails: {type(error).__name__}: {error}") from error
         if shape != (count,):
             raise ValueError(f"{name} of {where} returns shape {shape}; ({count},) is needed")
+
+
+def require_inputs(plant: AbstractPlant) -> None:
+    """Raises ValueError for a plant without inputs, or with inputs that act late.
+
+    Designs, policies, studies and rigs need inputs that act at once.
+    """
+    if not plant.definition.inputs:
+        raise ValueError(
+            f"plant {plant.definition.name!r} has no inputs: there is no signal to design or to "
+            "play, and no policy to train"
+        )
+    if plant.delay(plant.nominal) is not None:
+        raise ValueError(
+            f"plant {plant.definition.name!r} delays its inputs: it can be simulated and "
+            "identified, but not be used for designs, policies, studies and rigs"
+        )
 
 
 def with_sensor(

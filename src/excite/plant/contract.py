@@ -162,6 +162,14 @@ class AbstractPlant(_Module):
     def output(self, state: Float[Array, " state"], params: Params) -> Float[Array, " output"]:
         """Noise-free outputs. An input acts only through the state."""
 
+    def delay(self, params: Params) -> Float[Array, " input"] | None:
+        """Time after which each input acts [s]; None: all inputs act at once.
+
+        It may be any number and depend on the parameters; a negative one says that the input is
+        recorded late. Before its first sample an input has its first value.
+        """
+        return None
+
     @property
     def Params(self) -> Any:  # noqa: N802  (it is a class)
         """Named-tuple class of the parameters: `plant.Params(*vector)`."""

@@ -31,13 +31,43 @@ def columns_in(path: Path) -> dict[str, np.ndarray]:
     ending = path.suffix.lower()
     try:
         if ending in TEXT_ENDINGS:
-            return read_text(path, is_own=bool(read_sidecar(path)))
+            return _by_observable(path, read_text(path, is_own=bool(read_sidecar(path))))
         if ending == ".parquet":
             return _read_parquet(path)
         columns = _read_mat(path) if ending == ".mat" else _read_hdf5(path)
     except OSError as error:
         raise ValueError(f"{path}: cannot be read ({error.strerror})") from None
     return dict(sorted(columns.items(), key=lambda column: column[1].size == 1))  # vectors first
+
+
+def _by_observable(path: Path, table: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """A PEtab measurement table, one measurement in each row, as one column per observable.
+
+    L. Schmiester et al., "PEtab: interoperable specification of parameter estimation problems in
+    systems biology", PLoS Computational Biology 17, 2021. Other tables are returned unchanged.
+    """
+    if not {"observableId", "measurement", "time"} <= table.keys():
+        return table
+    conditions = sorted(set(map(str, table.get("simulationConditionId", ["one"]))))
+    if len(conditions) > 1:
+        raise ValueError(
+            f"{path}: measured under {len(conditions)} conditions ({', '.join(conditions[:5])}); "
+            "save each as a file of its own"
+        )
+    try:
+        time, values = (table[name].astype(float) for name in ("time", "measurement"))
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: 'time' or 'measurement' is not a number ({error})") from None
+    instants, names = np.unique(time), table["observableId"].astype(str)
+    columns = {"time": instants}
+    for name in dict.fromkeys(names.tolist()):
+        own = np.full(len(instants), np.nan)
+        places = np.searchsorted(instants, time[names == name])
+        if len(np.unique(places)) < len(places):
+            raise ValueError(f"{path}: {name!r} is measured twice at the same time")
+        own[places] = values[names == name]
+        columns[name] = own
+    return columns
 
 
 @contextlib.contextmanager

@@ -93,7 +93,7 @@ def read_record(
     num_inputs = len(description.inputs)
     return Record(
         time=time,
-        inputs=np.stack(values[:num_inputs], axis=1),
+        inputs=np.reshape(values[:num_inputs], (-1, len(time))).T,
         outputs=np.reshape(values[num_inputs:], (-1, len(time))).T,
         metadata=_metadata(path, description, chosen.indices(num_samples)[0]),
         source=str(path),

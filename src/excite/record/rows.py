@@ -287,6 +287,19 @@ USABLE = ("successful", "partly identifiable")
 """Statuses of an identification that has estimates."""
 
 
+class FoundSuspect(Saved):
+    """What a plant may leave out; see `excite.estimation.remedies.Suspect`."""
+
+    name: str
+    value: float | None
+    std_error: Number
+    unit: str
+    reduction: Number
+    log_likelihood: Number
+    p_value: float
+    remedy: str
+
+
 class EstimateSummary(Saved):
     """`estimate.json`: the result of an identification as plain data.
 
@@ -309,6 +322,7 @@ class EstimateSummary(Saved):
     prediction_fit_percent: dict[str, Number] | None = None
     process_noise: dict[str, Number] | None = None
     measurement_noise: dict[str, Number] | None = None
+    suspects: tuple[FoundSuspect, ...] = ()
 
     @classmethod
     def of(cls, data: Mapping[str, object]) -> EstimateSummary:

@@ -28,9 +28,18 @@ def parameter_cells(name: str, param: EstimatedParameter) -> list[str]:
         param.unit,
         number(param.estimate, digits),
         number(param.std_error),
-        f"{number(low, digits)} to {number(high, digits)}" if math.isfinite(high) else "–",
+        _interval(low, high, digits),
         relative,
     ]
+
+
+def _interval(low: float, high: float, digits: int) -> str:
+    """Both ends; an open one, which a file does not hold, is infinite."""
+    if not (math.isfinite(low) or math.isfinite(high)):
+        return "–"
+    ends = zip((low, high), ("-∞", "∞"), strict=True)
+    shown = (number(end, digits) if math.isfinite(end) else word for end, word in ends)
+    return " to ".join(shown)
 
 
 def residual_cells(result: EstimateSummary, output: str) -> list[str]:
@@ -51,7 +60,7 @@ def residual_in_words(result: EstimateSummary, output: str) -> str:
     if follows != "–":
         word = "follows" if follows == "yes" else "does not follow"
         parts.append(f"{word} the input (p = {p_follows})")
-    return ", ".join(parts) or "residual too small to be tested"
+    return ", ".join(parts) or "residual too small or too short to be tested"
 
 
 def largest_correlation(result: EstimateSummary) -> str:

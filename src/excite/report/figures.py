@@ -70,8 +70,9 @@ def _draw_intervals(axis: matplotlib.axes.Axes, params: Mapping[str, EstimatedPa
         if not math.isfinite(error):
             axis.text(0, i, f"{name} held", color=GREY, va="center", ha="center")
             continue
-        half = 100 * HALF_95 * error / (abs(value) or math.nan)
-        axis.errorbar(0, i, xerr=half, color=BLUE, fmt="o", capsize=4, ms=4)
+        ends = [end if math.isfinite(end) else value for end in p.ci95]  # an open side has no line
+        low, high = (100 * abs(end - value) / (abs(value) or math.nan) for end in ends)
+        axis.errorbar(0, i, xerr=[[low], [high]], color=BLUE, fmt="o", capsize=4, ms=4)
         text = f"{number(value, digits_for(value, error))} {p.unit}"
         axis.annotate(text, (0, i), (0, 7), textcoords="offset points", ha="center", fontsize=8)
     axis.set_yticks(range(len(params)), params)

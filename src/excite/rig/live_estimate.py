@@ -14,8 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..description import HALF_95, names_of
+from ..description import names_of
 from ..estimation import NLS, Estimate, Experiments, Status
+from ..estimation.diagnosis import half_95
 from ..plant import AbstractPlant
 from .contract import Interval, Sample
 
@@ -64,7 +65,8 @@ class LiveEstimate:
 
     def _keep(self, estimate: Estimate) -> None:
         if int(estimate.status) == Status.SUCCESSFUL:
-            half = HALF_95 * np.sqrt(np.diag(np.asarray(estimate.covariance)))
+            covariance, degrees = map(np.asarray, (estimate.covariance, estimate.degrees))
+            half = half_95(covariance, degrees)
             names = names_of(self._plant.definition.parameters)
             values = zip(map(float, estimate.params), map(float, half), strict=True)
             self._latest = {n: Interval(*v) for n, v in zip(names, values, strict=True)}

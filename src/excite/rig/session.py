@@ -36,7 +36,7 @@ if TYPE_CHECKING or HAS_JAX:
 
     from ..excitation.catalogue import ExcitationLike, excitation_and_origin, name_of
     from ..plant import AbstractPlant
-    from ..plant.catalogue import PlantLike, plant_from
+    from ..plant.catalogue import PlantLike, plant_from, require_inputs
     from ..simulation import experiment_length
     from .excitation import ExcitationPlayer
     from .filter import FilteredPlayer, SafetyFilter
@@ -375,7 +375,9 @@ def _source(
 def _plant(plant: PlantLike | None, rig: str | AbstractRig) -> AbstractPlant | None:
     """The plant; None without JAX."""
     if HAS_JAX:
-        return plant_from(DEFAULT_POLICY if plant is None else plant)
+        chosen = plant_from(DEFAULT_POLICY if plant is None else plant)
+        require_inputs(chosen)
+        return chosen
     if plant is not None or rig == "simulated":
         raise ValueError("--plant and a simulated rig need JAX, which is not installed")
     return None

@@ -23,7 +23,14 @@ from ..excitation.catalogue import excitation_and_origin, excitation_named
 from ..files import folder_word
 from ..information import require_noise
 from ..plant import AbstractARXPlant, AbstractPlant
-from ..plant.catalogue import PLANTS, PlantLike, plant_from, plant_named, with_sensor
+from ..plant.catalogue import (
+    PLANTS,
+    PlantLike,
+    plant_from,
+    plant_named,
+    require_inputs,
+    with_sensor,
+)
 from ..policy import POLICY_ENDING
 from ..record.read import SIGNAL_ENDINGS
 from ..training.settings import GradientSettings, PPOSettings
@@ -142,11 +149,12 @@ class Study(Settings):
         """The plant with the study's sensor.
 
         Raises:
-            ValueError: for an unknown plant or output.
+            ValueError: for an unknown plant or output, and for a plant without inputs.
         """
-        own = self.sensor.items()
+        own, plant = self.sensor.items(), plant_named(self.plant)
+        require_inputs(plant)
         return with_sensor(
-            plant_named(self.plant),
+            plant,
             {n: s.noise_sd for n, s in own if s.noise_sd is not None},
             {n: s.resolution for n, s in own if s.resolution is not None},
         )
@@ -350,6 +358,7 @@ def plant_tables(
         TypeError: for an object that is no plant.
     """
     given = plant_from(plant)
+    require_inputs(given)
     word = plant if isinstance(plant, str) else _word(type(given))
     usual = given if isinstance(plant, str) else plant_named(word)
     if usual.changed(sensor=given.sensor).description.hash != given.description.hash:

@@ -24,7 +24,7 @@ from ..excitation import Replay
 from ..excitation.catalogue import EXCITATIONS, LOOP, excitation_named
 from ..information import d_optimality, require_noise
 from ..plant import AbstractPlant
-from ..plant.catalogue import PlantLike, plant_from, with_sensor
+from ..plant.catalogue import PlantLike, plant_from, require_inputs, with_sensor
 from ..record import Record, require_record_path, write_record
 from ..simulation import response, run_episode
 from .checkpoint import Progress
@@ -165,6 +165,7 @@ def design(
     if out is not None:
         require_record_path(Path(out), overwrite)
     chosen = with_sensor(plant_from(plant), noise)
+    require_inputs(chosen)
     require_noise(chosen)
     env = signal_env(chosen, steps, spread, criterion)
     worth_by_start: tuple[float, ...] = ()

@@ -15,6 +15,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import cast
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -31,6 +32,7 @@ from ..description import (
 )
 from ..estimation import NLS, Experiments, Status, stack_experiments
 from ..estimation.catalogue import ESTIMATORS
+from ..estimation.diagnosis import half_95
 from ..estimation.identify import InitialState, identify
 from ..estimation.result import Identification, write_run
 from ..excitation.catalogue import EXCITATIONS, LOOP
@@ -192,17 +194,16 @@ def _estimates(own: Experiment, run: Trajectory, information: Array) -> Iterator
     free = jnp.ones(len(own.params), bool)
     counts = np.linspace(min(_FIRST, own.num_steps + 1), own.num_steps + 1, NUM_ESTIMATES)
     for count in np.unique(counts.astype(int)):
-        estimate = NLS()(plant, _first(data, int(count)), plant.nominal, free)
+        estimate = jax.device_get(NLS()(plant, _first(data, int(count)), plant.nominal, free))
         is_good = int(estimate.status) == Status.SUCCESSFUL
-        variance = np.diag(np.asarray(estimate.covariance))
-        half = HALF_95 * np.sqrt(np.where(is_good, variance, np.nan))
+        half = half_95(estimate.covariance, estimate.degrees)
         bound = HALF_95 * np.asarray(cramer_rao_bound(information[count - 2]) * size)
         parts = plant.definition.parameters
         yield {
             "kind": "estimate",
             "k": int(count) - 1,
             "estimate": _by_name(parts, estimate.params if is_good else bound * np.nan),
-            "half": _by_name(parts, half),
+            "half": _by_name(parts, half if is_good else bound * np.nan),
             "bound": _by_name(parts, bound),
         }
 
@@ -239,7 +240,9 @@ def _given(option: str, values: Mapping[str, object]) -> list[str]:
 
 def _first(data: Experiments, count: int) -> Experiments:
     """The experiment after some samples, padded so that nothing is compiled again."""
-    return dataclasses.replace(data, valid=jnp.arange(data.valid.shape[1])[None] < count)
+    return dataclasses.replace(
+        data, valid=data.valid & (jnp.arange(data.valid.shape[1])[None, :, None] < count)
+    )
 
 
 def _outcome(
@@ -258,7 +261,7 @@ def _outcome(
     params: dict[str, ParameterRow] = {}
     for p, true, least in zip(d.parameters, map(float, own.params), bound, strict=True):
         found = None if result is None or p.name in result.held else result.params[p.name]
-        half = None if found is None or result is None else HALF_95 * result.std_error[p.name]
+        half = None if found is None or result is None else result.ci95(p.name)[1] - found
         per = abs(true) or p.scale
         params[p.name] = {
             "estimate": found,

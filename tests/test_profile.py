@@ -1,0 +1,120 @@
+"""Profile likelihood intervals, against SciPy."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import scipy.optimize
+from commands import excite
+from kinetics import TIME, TRUTH, Product, concentrations
+from test_identification import Tank, tank_record
+from test_plants_without_inputs import FILE
+
+import excite as ex
+from excite.estimation import NLS
+from excite.estimation.diagnosis import student_95
+from excite.record import Record
+
+
+def product(noise: float, time: np.ndarray = TIME, seed: int = 3) -> Record:
+    """A record of B alone, made without the package."""
+    values = concentrations(**TRUTH, time=time)[:, 1:]
+    noisy = values + noise * np.random.default_rng(seed).normal(size=values.shape)
+    return Record(time, np.zeros((len(time), 0)), noisy, source="product.csv")
+
+
+def scipys_profile(record: Record) -> np.ndarray:
+    """Both ends of the intervals of k1 and k2 by SciPy and matrix exponentials."""
+
+    def residual(rates: np.ndarray) -> np.ndarray:
+        return (concentrations(*rates, time=record.time)[:, 1:] - record.outputs).ravel()
+
+    found = scipy.optimize.least_squares(residual, [0.4, 0.3], xtol=1e-13, ftol=1e-13)
+    degrees = record.outputs.size - 2
+    limit = student_95(degrees) ** 2 * 2 * found.cost / degrees
+
+    def excess(value: float, index: int) -> float:
+        def others(free: np.ndarray) -> np.ndarray:
+            return residual(np.insert(free, index, value))
+
+        start = [found.x[1 - index]]
+        best = scipy.optimize.least_squares(others, start, xtol=1e-13, ftol=1e-13)
+        return 2 * (best.cost - found.cost) - limit
+
+    ends = [
+        [
+            scipy.optimize.brentq(excess, 0.3 * found.x[i], found.x[i], args=(i,)),
+            scipy.optimize.brentq(excess, found.x[i], 4 * found.x[i], args=(i,)),
+        ]
+        for i in range(2)
+    ]
+    return np.array(ends)
+
+
+def test_profile_intervals_of_a_reaction_are_scipys():
+    record = product(0.03)
+    result = ex.identify(record, Product, initial_state="known", intervals="profile")
+    expected = scipys_profile(record)
+    for (low, high), name in zip(expected, ("k1", "k2"), strict=True):
+        np.testing.assert_allclose(result.ci95(name), (low, high), rtol=0.002)
+        value = result.params[name]
+        assert high - value > 1.05 * (value - low)  # not symmetric
+        np.testing.assert_allclose(result.to_dict()["params"][name]["ci95"], result.ci95(name))  # pyright: ignore
+    linear = ex.identify(record, Product, initial_state="known")
+    assert linear.params == result.params
+    result.plot()
+
+
+def test_profile_intervals_of_many_samples_are_those_of_standard_errors():
+    record = tank_record(1.8)
+    linear = ex.identify(record, Tank())
+    for estimator in (NLS(), NLS(noise="estimated"), NLS(noise="known")):
+        usual = ex.identify(record, Tank(), estimator)
+        found = ex.identify(record, Tank(), estimator, intervals="profile")
+        for name in ("area", "leak"):
+            half = (usual.ci95(name)[1] - usual.ci95(name)[0]) / 2
+            np.testing.assert_allclose(found.ci95(name), usual.ci95(name), atol=0.01 * half)
+            assert usual.params[name] == pytest.approx(linear.params[name], rel=1e-6)
+
+
+def test_one_parameter_is_enough():
+    record = tank_record(1.8)
+    held = {"leak": 0.4}
+    found = ex.identify(record, Tank(), hold=held, intervals="profile")
+    usual = ex.identify(record, Tank(), hold=held)
+    np.testing.assert_allclose(found.ci95("area"), usual.ci95("area"), rtol=1e-4)
+    assert all(math.isnan(end) for end in found.ci95("leak"))
+
+
+def open_below() -> Record:
+    """Six early samples, from which the reaction may as well run in one direction only."""
+    return product(0.025, np.array([0.0, 0.4, 0.8, 1.2, 1.6, 2.0]), seed=1)
+
+
+def test_a_side_that_does_not_close_is_told():
+    result = ex.identify(open_below(), Product, initial_state="known", intervals="profile")
+    low, high = result.ci95("k2")
+    assert result.status == "successful"
+    assert low == 0
+    assert result.params["k2"] < high < math.inf
+    sentence = "k2 is practically not identifiable: its 95 % interval is open below"
+    assert sentence in result.verdict
+    result.plot()
+
+
+def test_intervals_of_another_kind_are_refused():
+    with pytest.raises(ValueError, match="profile intervals need the estimator nls: got arx-rls"):
+        ex.identify(ex.simulate("aero2", steps=40), estimator="arx-rls", intervals="profile")
+
+
+def test_the_command_line_has_profile_intervals(tmp_path):
+    record = product(0.03)
+    rows = np.column_stack([record.time, record.outputs])
+    np.savetxt(tmp_path / "r.csv", rows, delimiter=",", header="time,b", comments="")
+    words = ("identify", "r.csv", "--plant", FILE.replace("Conversion", "Product"))
+    words = (*words, "--initial-state", "known", "--intervals", "profile", "--json")
+    done = excite(*words, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    low, high = json.loads(done.stdout)["params"]["k1"]["ci95"]
+    np.testing.assert_allclose((low, high), scipys_profile(record)[0], rtol=0.01)

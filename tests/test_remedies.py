@@ -1,0 +1,148 @@
+"""What a plant leaves out is found and named."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import excite as ex
+from excite.estimation.diagnosis import innovations
+from excite.estimation.remedies import outliers
+from excite.plant.catalogue import plant_from
+from excite.plant.extension import extensions_of
+from excite.record import Record
+from excite.simulation import response
+
+# A clear effect of each kind on the shipped plants, over the parameter's usual size.
+SIZE = {
+    "delay": 2.0, "lag": 3.0, "offset": 1.0, "saturation": 0.6, "dead_zone": 4.0,
+    "coulomb": 2.0, "drag": 4.0, "drift": 2.0,
+}  # fmt: skip
+PLAYED = {
+    "aero2": "multisine",
+    "dc_motor": "multisine",
+    "emps": "loop-multisine",
+}
+
+
+def recorded(plant: str, effect: str, seed: int) -> Record:
+    """A record of a plant with an effect that its equations leave out."""
+    played = PLAYED[plant]
+    d, rng = plant_from(plant).definition, np.random.default_rng(seed)
+    params = {p.name: p.nominal * rng.uniform(0.9, 1.1) for p in d.parameters}
+    kind = next((k for k in SIZE if effect.startswith(k)), None)
+    if kind:
+        added = plant_from(f"{plant}+{effect}").definition.parameters[-1]
+        usual = added.nominal or added.scale
+        if kind == "saturation":
+            usual = float(np.abs(ex.simulate(plant, played, params=params).inputs).max())
+        params[effect] = SIZE[kind] * usual * rng.uniform(0.8, 1.25)
+        return unnamed(ex.simulate(f"{plant}+{effect}", played, params=params, seed=seed))
+    record = ex.simulate(plant, played, params=params, seed=seed)
+    outputs, sd = record.outputs.copy(), np.asarray(plant_from(plant).sensor.sd)
+    if effect == "outliers":
+        wrong = rng.random(outputs.shape) < 0.03
+        outputs += wrong * rng.normal(size=outputs.shape) * 10 * sd
+    if effect.startswith("linear"):
+        model, u = plant_from(plant), jnp.asarray(record.inputs)
+        values = model.Params(*map(jnp.asarray, params.values()))
+        steps = jnp.full(len(u) - 1, model.dt)
+        outputs = np.asarray(response(model, values, u[:-1], None, steps, u[1:]))
+        outputs = outputs + rng.normal(size=outputs.shape) * sd
+    return unnamed(Record(record.time, record.inputs, outputs, record.metadata))
+
+
+def unnamed(record: Record) -> Record:
+    """A record whose initial state is known and whose plant is not."""
+    known = {"starts_at_initial_state": True}
+    return Record(record.time, record.inputs, record.outputs, known, "log.csv")
+
+
+def effects(plant: str) -> list[str]:
+    """What can be left out of a plant; EMPS has an offset and Coulomb friction itself."""
+    # A motor of 0.5 s runs too short for drag, and for the drift of a sensor, to show.
+    own = {"emps": ("offset", "coulomb"), "dc_motor": ("drag", "drift")}.get(plant, ())
+    names = [e for e in extensions_of(plant_from(plant)) if not e.startswith(("bias", *own))]
+    inputs = [i.name for i in plant_from(plant).definition.inputs]
+    return [*names, *(f"linear_{name}" for name in inputs), "outliers"]
+
+
+@pytest.mark.parametrize(
+    "effect", ["delay_voltage", "dead_zone_voltage", "drift_pitch", "outliers"]
+)
+def test_what_the_plant_leaves_out_is_named_first(effect):
+    result = ex.identify(recorded("aero2", effect, seed=1), "aero2", initial_state="known")
+    first = result.suspects[0]
+    assert first.name == effect
+    gains = [s.log_likelihood for s in result.suspects]
+    assert gains[0] == max(gains)
+    assert any(s.startswith("likely cause: ") for s in result.verdict)
+    assert first.p_value < 1e-6
+
+
+@pytest.mark.parametrize("effect", ["delay_voltage", "coulomb_pitch_rate"])
+def test_the_remedy_is_a_plant_that_explains_the_record(effect):
+    record = recorded("aero2", effect, seed=2)
+    first = ex.identify(record, "aero2", initial_state="known").suspects[0]
+    assert first.remedy == f"--plant aero2+{effect}"
+    result = ex.identify(record, first.remedy.split()[1], initial_state="known")
+    assert result.params[effect] == pytest.approx(first.value, rel=1e-4)
+    assert result.std_error[effect] == pytest.approx(first.std_error, rel=0.05)
+    assert result.suspects == ()
+
+
+def test_a_plant_with_an_extension_may_leave_out_another():
+    """The order of the effects is not that in which they are found."""
+    both = "aero2+coulomb_pitch_rate+delay_voltage"
+    record = unnamed(ex.simulate(both, "multisine", seed=4))
+    first = ex.identify(record, "aero2+coulomb", initial_state="known").suspects[0]
+    assert first.remedy == f"--plant {both}"
+    assert first.value == pytest.approx(0.05, rel=0.05)
+
+
+def test_a_record_of_the_very_plant_has_no_suspect():
+    for seed in range(3):
+        record = unnamed(ex.simulate("aero2", "multisine", seed=seed))
+        assert ex.identify(record, "aero2").suspects == ()
+
+
+def test_coloured_noise_is_no_suspect():
+    record, rng = ex.simulate("aero2", "multisine", noise={"pitch": 0.0}), np.random.default_rng(1)
+    white, noise = 1e-3 * rng.normal(size=len(record.time)), np.zeros(len(record.time))
+    for k in range(1, len(noise)):
+        noise[k] = 0.8 * noise[k - 1] + white[k]
+    coloured = Record(record.time, record.inputs, record.outputs + noise[:, None], {}, "log.csv")
+    result = ex.identify(coloured, "aero2")
+    assert result.suspects == ()
+    assert any("is not white" in sentence for sentence in result.verdict)
+
+
+def test_innovations_of_an_autoregression_are_its_noise():
+    rng = np.random.default_rng(2)
+    white = rng.normal(size=(2, 5000))
+    coloured = np.zeros_like(white)
+    for k in range(2, 5000):
+        coloured[:, k] = 1.2 * coloured[:, k - 1] - 0.5 * coloured[:, k - 2] + white[:, k]
+    for found, noise in zip(innovations(list(coloured)), white, strict=True):
+        assert np.sqrt(np.mean((found - noise)[50:] ** 2)) < 0.06
+
+
+def test_outliers_are_counted_and_normal_noise_has_none():
+    rng = np.random.default_rng(3)
+    residual = rng.normal(size=(1, 2000, 2))
+    valid = np.ones_like(residual, bool)
+    assert outliers(residual, valid) is None
+    residual[0, ::100, 0] += 12.0
+    found = outliers(residual, valid)
+    assert found is not None
+    assert found.remedy.startswith("20 samples are more than 4 standard deviations off")
+
+
+@pytest.mark.science
+@pytest.mark.parametrize("plant", list(PLAYED))
+def test_what_each_plant_leaves_out_is_named_first(plant):
+    missed = []
+    for effect in effects(plant):
+        found = ex.identify(recorded(plant, effect, 1), plant, initial_state="known").suspects
+        if not found or found[0].name != effect:
+            missed.append((effect, [s.name for s in found[:2]]))
+    assert not missed
