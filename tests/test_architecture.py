@@ -116,9 +116,16 @@ def resolved(name: str) -> str | None:
     return None
 
 
-SHOWING = ("plot", "require_pandas", "require_matlab", "_require_hdf5", "_require_parquet")
-"""Functions that import Matplotlib's figures, or a package that not every computer has, when they
-are called."""
+SHOWING = (
+    "plot",
+    "require_pandas",
+    "require_matlab",
+    "_require_hdf5",
+    "_require_parquet",
+    "_require_least_squares",
+)
+"""Functions that import Matplotlib's figures, a package that not every computer has, or one that
+takes long to load, when they are called."""
 
 
 @cache

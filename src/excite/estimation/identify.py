@@ -601,7 +601,7 @@ def _starts_around(plant: AbstractPlant, start: Params, free: np.ndarray) -> lis
     """Random starts around one, always the same: up to a factor of three away."""
     d, z = plant.definition, to_search(plant.definition, start)
     width = np.where(free, [np.log(3) if p.positive else 2.0 for p in d.parameters], 0.0)
-    unit = np.random.default_rng(0).uniform(-1, 1, (_STARTS - 1, len(width)))
+    unit = jax.random.uniform(jax.random.key(0), (_STARTS - 1, len(width)), float, -1.0, 1.0)
     return [plant.Params(*from_search(d, z + width * row)) for row in unit]
 
 

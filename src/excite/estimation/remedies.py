@@ -12,7 +12,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import equinox as eqx
 import jax
@@ -34,6 +34,9 @@ from .contract import (
 )
 from .diagnosis import chi2_tail, innovations
 from .nls import NLS
+
+if TYPE_CHECKING:
+    from scipy.optimize import OptimizeResult
 
 Residual = Float[np.ndarray, "experiment sample output"]
 
@@ -288,17 +291,15 @@ class _Search:
 
     def fitted(self, trial: _Trial, own: np.ndarray) -> tuple[float, float, Residual]:
         """As `best`, from one point."""
-        from scipy.optimize import least_squares  # it takes a fifth of a second to load
-
         parameter = _parameter(self.whole, trial.name)
         begin = np.append(own, trial.value / parameter.scale)
         lower = np.full(len(begin), -np.inf)
         lower[-1] = -np.inf if parameter.lower is None else 0.0
         both = lru_cache(1)(lambda key: self.slopes(np.frombuffer(key), trial.name))
-        found = least_squares(
+        found = _require_least_squares()(
             lambda point: both(point.tobytes())[0],
             begin,
-            jac=lambda point: both(point.tobytes())[1],  # pyright: ignore[reportArgumentType]
+            jac=lambda point: both(point.tobytes())[1],
             bounds=(lower, np.inf),
             ftol=1e-6,
             max_nfev=_STEPS,
@@ -333,6 +334,13 @@ def _residuals(
         return residual_of(data, simulate_experiments(whole, whole_params, data, initial))
 
     return jax.vmap(residual)(own, added, moved)
+
+
+def _require_least_squares() -> Callable[..., OptimizeResult]:
+    """SciPy's search, which only those wait for whose residual is not noise."""
+    from scipy.optimize import least_squares
+
+    return least_squares
 
 
 def _parameter(whole: AbstractPlant, name: str) -> Parameter:
