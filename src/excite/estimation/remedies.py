@@ -56,6 +56,7 @@ _MOST_FITTED, _STEPS = 5, 30  # suspects that are fitted, and most steps of one 
 _STEP = 1e-6  # of a difference
 _LANES = 16  # simulated side by side; a constant, so that one program is compiled
 _HUGE = 1e30
+_BOUND = 20.0  # the search coordinate of a parameter at its bound, which is infinite
 _FREEDOMS = 2.0, 3.0, 4.0, 6.0, 10.0, 20.0  # of Student's t for outliers
 _FAR = 4.0  # standard deviations of the bulk beyond which a sample is an outlier
 
@@ -201,15 +202,18 @@ class _Search:
         initial = np.tile(np.asarray(whole.initial_state), (len(self.valid), 1))
         initial[:, self.states] = np.asarray(estimate.initial_state)
         self.data = dataclasses.replace(experiments, initial_state=jax.device_put(initial))
-        self.z = np.where(free, np.asarray(to_search(plant.definition, estimate.params)), 0.0)
+        estimated, begun = (
+            np.nan_to_num(to_search(plant.definition, params), posinf=_BOUND, neginf=-_BOUND)
+            for params in (estimate.params, start)
+        )
+        self.z = np.where(free, estimated, 0.0)
         self.neutral = np.array(
             [1e6 * p.nominal if p.name.startswith("saturation_") else 0.0 for p in d.parameters]
         )
         num_free, (count, num_states) = int(free.sum()), (len(self.valid), len(own))
         num_initial = 0 if experiments.initial_state_known else count * num_states
         self.begin, self.start = (
-            np.append(np.asarray(to_search(plant.definition, params))[free], np.zeros(num_initial))
-            for params in (estimate.params, start)
+            np.append(z[free], np.zeros(num_initial)) for z in (estimated, begun)
         )
         # What is changed together for a slope: a state in all experiments at once.
         self.kind = np.append(
@@ -390,10 +394,13 @@ def _reduction(before: Residual, after: Residual, valid: np.ndarray) -> float:
 
 
 def outliers(residual: Residual, valid: np.ndarray) -> Suspect | None:
-    """The suspect that the noise has heavy tails, as Student's t has; None where it has not."""
+    """The suspect that the noise has heavy tails, as Student's t has; None where it has not.
+
+    What a residual follows from its own past is no outlier.
+    """
     gained, count = 0.0, 0
     for parts in _parts(residual, valid):
-        r = np.concatenate(parts)
+        r = np.concatenate(innovations(parts))
         gauss = -0.5 * len(r) * (math.log(2 * math.pi * float(np.mean(r**2))) + 1)
         gained += max(0.0, max(_student(r, freedom) for freedom in _FREEDOMS) - gauss)
         bulk = 1.4826 * float(np.median(np.abs(r - np.median(r))))
