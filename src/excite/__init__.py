@@ -23,6 +23,7 @@ _PLACES = {
     "simulate": "simulation",
     "information": "information",
     "identify": "estimation.identify",
+    "compare_plants": "estimation.comparison",
     "design": "training.design",
     "train": "study.train",
     "evaluate": "study.evaluate",
@@ -99,6 +100,7 @@ if TYPE_CHECKING:
     from .description import PlantDescription as PlantDescription
     from .description import State as State
     from .estimation.catalogue import estimators as estimators
+    from .estimation.comparison import compare_plants as compare_plants
     from .estimation.identify import identify as identify
     from .estimation.result import Identification as Identification
     from .excitation.catalogue import excitations as excitations

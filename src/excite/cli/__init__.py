@@ -14,6 +14,7 @@ import click
 
 from .. import __version__
 from .benchmark import benchmark
+from .compare_plants import compare_plants
 from .completion import complete_names
 from .design import design
 from .doctor import doctor
@@ -50,6 +51,7 @@ _SECTIONS: dict[str, dict[click.Command, str]] = {
         run: "excite run --policy aero2 --fast --out experiment.csv",
     },
     "Compare": {
+        compare_plants: "excite compare-plants aero2 aero2+coulomb --record record.csv",
         study: "excite study run baselines --out runs/baselines",
         benchmark: "excite benchmark baselines --episodes 20",
         report: "excite report runs/baselines --out report.html",

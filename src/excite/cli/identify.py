@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from .options import (
     NAMES,
     NUMBERS,
     OUT_FILE,
+    Callback,
     command_line,
     computing,
     json_option,
@@ -20,6 +22,87 @@ from .options import (
     progress_bar,
     show_json,
 )
+
+
+_OF_RECORDS = (
+    click.option(
+        "--initial-state",
+        type=click.Choice(["auto", "free", "known"]),
+        default="auto",
+        show_default=True,
+        help="Estimate initial states, or use the plant's; auto: known where the "
+        "sidecar says that the record starts there.",
+    ),
+    click.option(
+        "--validate",
+        type=OUT_FILE,
+        multiple=True,
+        metavar="FILE",
+        help="Held-out record to simulate with the estimate.",
+    ),
+    click.option(
+        "--column",
+        type=NAMES,
+        multiple=True,
+        help="Columns of the file that have another name: pitch=qm; a comma in it is written \\,.",
+    ),
+    click.option(
+        "--scale",
+        type=NUMBERS,
+        multiple=True,
+        help="Factors from the file's units to the plant's: pitch=0.01745.",
+    ),
+    click.option(
+        "--unit",
+        type=NAMES,
+        multiple=True,
+        help="The file's units where they are not the plant's: time=ms,pitch=deg.",
+    ),
+    click.option(
+        "--set-input",
+        type=NUMBERS,
+        multiple=True,
+        help="Constant inputs that the file does not have: voltage=5.",
+    ),
+    click.option(
+        "--dt", type=float, metavar="SECONDS", help="Sampling time of a file without time."
+    ),
+    click.option(
+        "--rows",
+        metavar="START:STOP:STEP",
+        help="Rows to use, counted from 0 below the names: 100:1000:5.",
+    ),
+    click.option(
+        "--hold-input",
+        default="constant",
+        show_default=True,
+        metavar="constant|linear",
+        help="Inputs between samples; one of several by its name: voltage=linear.",
+    ),
+)
+
+
+def of_records(command: Callback) -> Callback:
+    """Adds the options on how records are read and fitted."""
+    for option in reversed(_OF_RECORDS):
+        command = option(command)
+    return command
+
+
+def arguments_of(options: Mapping[str, Any]) -> dict[str, Any]:
+    """The arguments of `excite.identify` that these options give."""
+    hold_input = options["hold_input"]
+    return {
+        "initial_state": options["initial_state"],
+        "hold_input": NAMES.convert(hold_input, None, None) if "=" in hold_input else hold_input,
+        "validate": options["validate"],
+        "columns": merged(options["column"]),
+        "scales": merged(options["scale"]),
+        "units": merged(options["unit"]),
+        "set_inputs": merged(options["set_input"]),
+        "dt": options["dt"],
+        "rows": options["rows"],
+    }
 
 
 @click.command()
@@ -33,14 +116,6 @@ from .options import (
     show_default=True,
     metavar="NAME",
     help=f"{', '.join(estimators())}; arx-rls is the paper's.",
-)
-@click.option(
-    "--initial-state",
-    type=click.Choice(["auto", "free", "known"]),
-    default="auto",
-    show_default=True,
-    help="Estimate initial states, or use the plant's; auto: known where the "
-    "sidecar says that the record starts there.",
 )
 @click.option(
     "--intervals",
@@ -67,50 +142,7 @@ from .options import (
     multiple=True,
     help="Standard deviation of known constants, which widens the intervals: m=5%,g=0.02.",
 )
-@click.option(
-    "--validate",
-    type=OUT_FILE,
-    multiple=True,
-    metavar="FILE",
-    help="Held-out record to simulate with the estimate.",
-)
-@click.option(
-    "--column",
-    type=NAMES,
-    multiple=True,
-    help="Columns of the file that have another name: pitch=qm; a comma in it is written \\,.",
-)
-@click.option(
-    "--scale",
-    type=NUMBERS,
-    multiple=True,
-    help="Factors from the file's units to the plant's: pitch=0.01745.",
-)
-@click.option(
-    "--unit",
-    type=NAMES,
-    multiple=True,
-    help="The file's units where they are not the plant's: time=ms,pitch=deg.",
-)
-@click.option(
-    "--set-input",
-    type=NUMBERS,
-    multiple=True,
-    help="Constant inputs that the file does not have: voltage=5.",
-)
-@click.option("--dt", type=float, metavar="SECONDS", help="Sampling time of a file without time.")
-@click.option(
-    "--rows",
-    metavar="START:STOP:STEP",
-    help="Rows to use, counted from 0 below the names: 100:1000:5.",
-)
-@click.option(
-    "--hold-input",
-    default="constant",
-    show_default=True,
-    metavar="constant|linear",
-    help="Inputs between samples; one of several by its name: voltage=linear.",
-)
+@of_records
 @click.option("--out", type=OUT_FILE, metavar="FOLDER", help="Run folder to write.")
 @click.option("--overwrite", is_flag=True, help="Replace the run folder if it exists.")
 @plot_option
@@ -130,23 +162,14 @@ def identify(
 
     if out is not None:
         require_free_run_folder(out, options["overwrite"])
-    hold_input = options["hold_input"]
     with progress_bar("identifying"):
         result = verb(
             files,
             options["plant"],
             options["estimator"],
             **{name: merged(options[name]) for name in ("start", "hold", "uncertain")},
-            initial_state=options["initial_state"],
             intervals=options["intervals"],
-            hold_input=NAMES.convert(hold_input, None, None) if "=" in hold_input else hold_input,
-            validate=options["validate"],
-            columns=merged(options["column"]),
-            scales=merged(options["scale"]),
-            units=merged(options["unit"]),
-            set_inputs=merged(options["set_input"]),
-            dt=options["dt"],
-            rows=options["rows"],
+            **arguments_of(options),
         )
     if plot is not None:
         from ..record.figure import save

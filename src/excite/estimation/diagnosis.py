@@ -109,6 +109,22 @@ def innovations(residuals: Sequence[Float[np.ndarray, " _sample"]]) -> list[np.n
     return [r - own @ memory for r, own in zip(residuals, past, strict=True)]
 
 
+def log_likelihood(
+    residuals: Sequence[Sequence[Float[np.ndarray, " _sample"]]], whiten: bool = False
+) -> float:
+    """Of residuals by output as normal noise, at the likeliest size of each output's noise.
+
+    `whiten`: they are taken as autoregressions, so that colour alone gains nothing.
+    """
+    total = 0.0
+    for parts in residuals:
+        errors = innovations(parts) if whiten else parts
+        count = sum(map(len, errors))
+        variance = max(sum(float(r @ r) for r in errors) / count, 1e-300)
+        total -= count * (math.log(2 * math.pi * variance) + 1) / 2
+    return total
+
+
 def chance_of_fit(
     measured: Float[np.ndarray, " sample"], residual: Float[np.ndarray, " sample"], unknowns: int
 ) -> float:

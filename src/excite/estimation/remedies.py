@@ -32,7 +32,7 @@ from .contract import (
     simulate_experiments,
     to_search,
 )
-from .diagnosis import chi2_tail, innovations
+from .diagnosis import chi2_tail, innovations, log_likelihood
 from .nls import NLS
 
 if TYPE_CHECKING:
@@ -373,17 +373,9 @@ def _parts(residual: Residual, valid: np.ndarray) -> list[list[np.ndarray]]:
 
 
 def _gained(before: Residual, after: Residual, valid: np.ndarray, whiten: bool) -> float:
-    """Logarithm of the likelihood that a smaller residual gains; each output has its own noise.
-
-    `whiten`: the residuals are taken as autoregressions, so that colour alone gains nothing.
-    """
-    gained = 0.0
-    for old, new in zip(_parts(before, valid), _parts(after, valid), strict=True):
-        if whiten:
-            old, new = innovations(old), innovations(new)
-        sums = [max(sum(float(r @ r) for r in part), 1e-300) for part in (old, new)]
-        gained += 0.5 * sum(map(len, old)) * math.log(sums[0] / sums[1])
-    return gained
+    """Logarithm of the likelihood that a smaller residual gains; each output has its own noise."""
+    old, new = (log_likelihood(_parts(residual, valid), whiten) for residual in (before, after))
+    return new - old
 
 
 def _reduction(before: Residual, after: Residual, valid: np.ndarray) -> float:

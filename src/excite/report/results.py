@@ -100,6 +100,56 @@ def _paragraphs(lines: list[str]) -> str:
     return html_table("", [""], [[line] for line in lines])
 
 
+# ----------------------------------------------------------------------------- comparison
+
+
+def _compared(result: Data) -> tuple[str, Table]:
+    best = min(p["bic"] for p in result["plants"])
+    found = [EstimateSummary.of(p["identification"]) for p in result["plants"]]
+    outputs, held_out = list(found[0].fit_percent), bool(found[0].validation)
+    header = ["plant", "unknowns", "log likelihood", "BIC - least", "p", *_columns(outputs, "fit")]
+    header += _columns(outputs, "held-out fit") if held_out else []
+    rows = []
+    for p, own in zip(result["plants"], found, strict=True):
+        row = [p["plant"], str(p["num_unknowns"]), number(p["log_likelihood"], 6)]
+        row += [number(p["bic"] - best, 4), "–" if p["p_value"] is None else number(p["p_value"])]
+        row += [number(own.fit_percent[name], 4) for name in outputs]
+        if held_out:
+            fits = [[v.fit_percent[name] for v in own.validation] for name in outputs]
+            row += [number(sum(values) / len(values), 4) for values in fits]
+        rows.append(row)
+    return "plants, likeliest first", (header, rows)
+
+
+def _columns(outputs: list[str], what: str) -> list[str]:
+    """Titles of a column for each output."""
+    return [f"{what} of {name} [%]" if len(outputs) > 1 else f"{what} [%]" for name in outputs]
+
+
+def _residuals(result: Data) -> list[str]:
+    """A line on each plant's residual."""
+    found = [(p["plant"], EstimateSummary.of(p["identification"])) for p in result["plants"]]
+    return [
+        "; ".join([
+            f"{plant}: {own.status}",
+            *(f"{name}: {residual_in_words(own, name)}" for name in own.fit_percent),
+        ])
+        for plant, own in found
+    ]  # fmt: skip
+
+
+def comparison_text(result: Data) -> str:
+    """Several plants, the likeliest first, as plain text."""
+    title, (header, rows) = _compared(result)
+    return "\n".join([text_table(title, header, rows), "", *_residuals(result)])
+
+
+def comparison_html(result: Data) -> str:
+    """The same for a notebook."""
+    title, (header, rows) = _compared(result)
+    return html_table(title, header, rows) + _paragraphs(_residuals(result))
+
+
 # ---------------------------------------------------------------------------- information
 
 
