@@ -59,8 +59,8 @@ def unnamed(record: Record) -> Record:
 
 def effects(plant: str) -> list[str]:
     """What can be left out of a plant; EMPS has an offset and Coulomb friction itself."""
-    # A motor of 0.5 s runs too short for drag, and for the drift of a sensor, to show.
-    own = {"emps": ("offset", "coulomb"), "dc_motor": ("drag", "drift")}.get(plant, ())
+    # Drag hides in the viscous friction of EMPS; 0.5 s are too short for drag and drift to show.
+    own = {"emps": ("offset", "coulomb", "drag"), "dc_motor": ("drag", "drift")}.get(plant, ())
     names = [e for e in extensions_of(plant_from(plant)) if not e.startswith(("bias", *own))]
     inputs = [i.name for i in plant_from(plant).definition.inputs]
     return [*names, *(f"linear_{name}" for name in inputs), "outliers"]
