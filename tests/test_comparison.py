@@ -53,7 +53,7 @@ def test_the_criterion_counts_parameters_states_and_noise(compared):
 
 def test_an_effect_that_is_not_there_gains_by_chance_only():
     record = ex.simulate("aero2", "multisine", seed=3)
-    first, second = ex.compare_plants(record, ["aero2", "aero2+coulomb"]).plants
+    first, second = ex.compare_plants(record, ["aero2", "aero2+delay"]).plants
     assert first.name == "aero2"
     assert second.p_value is not None
     assert second.p_value > 0.01

@@ -23,7 +23,6 @@ from .options import (
     show_json,
 )
 
-
 _OF_RECORDS = (
     click.option(
         "--initial-state",
