@@ -120,6 +120,20 @@ def delayed(
     )
 
 
+def acting(
+    plant: AbstractPlant,
+    params: Params,
+    inputs: Float[Array, "time input"],
+    dt: Float[Array, " time"] | None,
+    next_inputs: Float[Array, "time input"] | None,
+) -> tuple[Float[Array, "time input"], Float[Array, " time"] | None, Array | None]:
+    """Inputs, dt and next inputs as they act on the plant: after its delay, if it has one."""
+    if (delay := plant.delay(params)) is not None:
+        dt = jnp.full(len(inputs), plant.dt) if dt is None else dt
+        inputs, next_inputs = delayed(inputs, delay, dt, next_inputs)
+    return inputs, dt, next_inputs
+
+
 def _summed(values: Array) -> Array:
     """Cumulative sums, beginning with zero."""
     return jnp.concatenate([jnp.zeros(1), jnp.cumsum(values)])
@@ -141,16 +155,14 @@ def response(
         next_inputs: see `step`.
     """
     start = plant.initial_state if initial_state is None else initial_state
-    if (delay := plant.delay(params)) is not None:
-        dt = jnp.full(len(inputs), plant.dt) if dt is None else dt
-        inputs, next_inputs = delayed(inputs, delay, dt, next_inputs)
+    steps = acting(plant, params, inputs, dt, next_inputs)
 
     def advance(state: Array, now: tuple) -> tuple[Array, Array]:
         input, dt, next_input = now
         state = step(plant, state, input, params, dt, next_input)
         return state, plant.output(state, params)
 
-    _, outputs = jax.lax.scan(advance, start, (inputs, dt, next_inputs))
+    _, outputs = jax.lax.scan(advance, start, steps)
     return jnp.concatenate([plant.output(start, params)[None], outputs])
 
 

@@ -11,10 +11,9 @@ import numpy as np
 
 from ..description import names_of
 from ..plant.catalogue import PlantLike, plant_from
-from ..record import Record, unbroken
 from ..report.results import comparison_html, comparison_text, wrapped
 from .diagnosis import chi2_tail, log_likelihood
-from .identify import RecordLike, identify
+from .identify import RecordLike, identify, parts_of
 from .result import Identification
 
 
@@ -116,7 +115,7 @@ def _compared(result: Identification, first: ComparedPlant | None) -> ComparedPl
     likelihood, count = log_likelihood(residual), sum(len(r) for parts in residual for r in parts)
     unknowns = len(result.params) - len(result.held) + len(result.plant.outputs)
     if not result.initial_state_known:
-        parts = sum(_num_parts(fitted.record) for fitted in result.fitted)
+        parts = sum(len(parts_of(fitted.record)) for fitted in result.fitted)
         unknowns += parts * len(result.plant.states)
     p_value = None
     if first is not None and unknowns > first.num_unknowns:
@@ -132,8 +131,3 @@ def _residual(result: Identification) -> list[list[np.ndarray]]:
     residuals = [f.record.outputs - f.model for f in result.fitted]
     num_outputs = len(result.plant.outputs)
     return [[r[np.isfinite(r[:, i]), i] for r in residuals] for i in range(num_outputs)]
-
-
-def _num_parts(record: Record) -> int:
-    """Parts without a gap in time, each with its own initial state."""
-    return len(unbroken(record.time)) if record.inputs.shape[1] else 1

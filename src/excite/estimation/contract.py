@@ -213,6 +213,11 @@ class AbstractSearch(AbstractEstimator):
                 )
         return tuple(name in self.known for name in names)
 
+    def freed(self, plant: AbstractPlant, free: Bool[Array, " param"] | None) -> Array:
+        """Which parameters are searched: those of `free`, default all, that are not held."""
+        others = ~jnp.asarray(self.held(plant))
+        return others if free is None else free & others
+
 
 def simulate_experiments(
     plant: AbstractPlant,

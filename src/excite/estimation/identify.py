@@ -174,7 +174,7 @@ def identify(
     if not isinstance(estimator, AbstractSearch):
         _require_complete(estimator, [*records, *validation], linear)
     plant = _sampled_as([*records, *validation], plant)
-    known = known and all(len(_parts(record)) == 1 for record in records)
+    known = known and all(len(parts_of(record)) == 1 for record in records)
     experiments = _experiments(plant, records, known, linear)
     fit = _fit(plant, experiments, estimator, begin)
     residual = _residuals(plant, records, experiments, estimator, fit)
@@ -395,7 +395,7 @@ def _require_enough(
     if any(len(record.time) < 2 for record in records):
         raise ValueError(f"{where}: a record needs at least two samples")
     values = sum(int(np.isfinite(record.outputs).sum()) for record in records)
-    parts = sum(len(_parts(record)) for record in records)
+    parts = sum(len(parts_of(record)) for record in records)
     states = 0 if knows_state and parts == len(records) else parts * len(plant.definition.states)
     if values <= num_params + states:
         raise ValueError(
@@ -404,7 +404,7 @@ def _require_enough(
         )
 
 
-def _parts(record: Record) -> list[slice]:
+def parts_of(record: Record) -> list[slice]:
     """Parts without a gap in time; without inputs nothing is unknown in a gap."""
     return unbroken(record.time) if record.inputs.shape[1] else [slice(0, len(record.time))]
 
@@ -420,14 +420,14 @@ def _sampled_as(records: Sequence[Record], plant: AbstractPlant) -> AbstractPlan
     sampled = plant.changed(dt=usual)
     if _are_even(records, usual):
         return sampled
-    steps = [np.diff(r.time[part]).max() for r in records for part in _parts(r)]
+    steps = [np.diff(r.time[part]).max() for r in records for part in parts_of(r)]
     longest = plant.changed(dt=max(steps))
     return eqx.tree_at(lambda p: p.dt, longest, sampled.dt)
 
 
 def _are_even(records: Sequence[Record], dt: float) -> bool:
     """Whether all parts of the records are sampled with this time."""
-    parts = [record.time[part] for record in records for part in _parts(record)]
+    parts = [record.time[part] for record in records for part in parts_of(record)]
     own = [(time[-1] - time[0]) / (time.size - 1) for time in parts]
     return all(map(is_even, parts)) and bool(np.allclose(own, dt, rtol=1e-3, atol=0))
 
@@ -442,7 +442,7 @@ def _experiments(
 
     They have next inputs even where all are held: one program is compiled for both.
     """
-    parts = [(record, part) for record in records for part in _parts(record)]
+    parts = [(record, part) for record in records for part in parts_of(record)]
     inputs = [record.inputs[part] for record, part in parts]
     outputs = [record.outputs[part] for record, part in parts]
     evenly = _are_even(records, float(plant.dt))
@@ -465,7 +465,7 @@ def _by_record(
     experiments, joined = iter(values), []
     for record in records:
         own = np.full(record.outputs.shape, np.nan)
-        for part in _parts(record):
+        for part in parts_of(record):
             rows = part.stop - part.start
             own[part] = next(experiments)[:rows]
         joined.append(np.where(np.isfinite(record.outputs), own, np.nan))

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ..plant import AbstractPlant, Params
-from ..simulation import delayed, step
+from ..simulation import acting, step
 
 _NARROW = 1e-5  # least width of a difference, over a state's scale
 
@@ -66,18 +66,14 @@ def innovations(
         noise_sd: of the sensors [output unit].
         steps: inputs, dt and next inputs of one of the `Experiments`.
     """
-    if (delay := plant.delay(params)) is not None:
-        inputs, dt, next_inputs = steps
-        dt = jnp.full(len(inputs), plant.dt) if dt is None else dt
-        inputs, next_inputs = delayed(inputs, delay, dt, next_inputs)
-        steps = inputs, dt, next_inputs
 
     def advance(belief: tuple[Array, Array], now: tuple) -> tuple[tuple[Array, Array], Innovations]:
         inputs, measured, valid = now
         belief, found = _corrected(plant, params, noise_sd, *belief, measured, valid)
         return _predicted(plant, params, process_noise, *belief, *inputs), found
 
-    padded = jax.tree.map(lambda rows: jnp.concatenate([rows, rows[-1:]]), steps)
+    now = acting(plant, params, *steps)
+    padded = jax.tree.map(lambda rows: jnp.concatenate([rows, rows[-1:]]), now)
     begin = initial_state, jnp.zeros((len(initial_state),) * 2)
     return jax.lax.scan(advance, begin, (padded, measured, valid))[1]
 

@@ -57,7 +57,7 @@ _LIMIT = 1e3
 _ACCEPTED, _GOOD = 0.01, 0.75  # parts of the predicted reduction that a step must reach
 _GROWTH, _SHRINKING = 10.0, 0.1  # of the radius after a good and after a refused step
 _CAREFUL = 2.0  # growth after a step was refused
-_LARGEST = {True: 1.0, False: 10.0}
+LARGEST_CHANGE = {True: 1.0, False: 10.0}
 """Change in one step of the logarithm of a positive parameter, of a free one over its scale."""
 _IDLE = 1e-3  # a gain of the last step, over the noise, that ends a search without steps left
 _SHORT = 0.3  # part of a step below which the radius shrinks
@@ -242,7 +242,9 @@ class MultipleShooting:
         self.scales = jnp.asarray([s.scale for s in plant.definition.states])
         self.output_scales = jnp.asarray([o.scale for o in plant.definition.outputs])
         self.num_states = len(plant.definition.states)
-        self.largest = jnp.asarray([_LARGEST[p.positive] for p in plant.definition.parameters])
+        self.largest = jnp.asarray(
+            [LARGEST_CHANGE[p.positive] for p in plant.definition.parameters]
+        )
 
     def delayed(self, z: Array) -> Segments:
         """The segments with the inputs of a plant that delays them."""
@@ -470,7 +472,7 @@ class MultipleShooting:
             part = 0.25 * s.part
             nearer = jax.tree.map(lambda at, by: at + part * by, s.best, s.change)
             stayed = s._replace(here=nearer, part=part, steps=s.steps + 1)
-            return _where(accepted, moved, stayed)
+            return where_tree(accepted, moved, stayed)
 
         def goes_on(s: _Match) -> Array:
             is_sound = (s.part > _LEAST_PART) & ((s.steps <= _FIRST) | jnp.isfinite(s.misfits))
@@ -491,7 +493,7 @@ class MultipleShooting:
             is_closed=jnp.asarray(False),
         )
         found = jax.lax.while_loop(goes_on, match, begin)
-        return _where(found.is_closed, found.here, found.best)
+        return where_tree(found.is_closed, found.here, found.best)
 
     def weighted(self, sweep: Sweep, sd: Array) -> Float[Array, "experiment unknown unknown"]:
         """The triangle of all outputs over their standard deviations; unknowns, then value."""
@@ -575,7 +577,9 @@ class MultipleShooting:
             is_bold = (s.steps < _BOLD) & (cost < _LIMIT * s.cost)
             is_equal = jnp.abs(gained) <= 100 * _EPS * cost
             accepted = (gained >= _ACCEPTED * hoped) | is_equal | is_bold | (s.steps == 0)
-            best, sweep, cost = _where(accepted, (s.here, sweep, cost), (s.best, s.sweep, s.cost))
+            best, sweep, cost = where_tree(
+                accepted, (s.here, sweep, cost), (s.best, s.sweep, s.cost)
+            )
             triangle = self.weighted(sweep, sd)
             is_good = gained > _GOOD * hoped
             # Where the residual is large a step may be too long, and its direction right: a part
@@ -626,7 +630,7 @@ class MultipleShooting:
         )
         found = jax.lax.while_loop(goes_on, improve, search)
         # The last step is taken too; it is too small for the sweep to change.
-        point = _where(found.converged, found.here, found.best)
+        point = where_tree(found.converged, found.here, found.best)
         is_idle = found.gained <= _IDLE * found.cost / count
         return point, found.sweep, found.converged | (found.steps == max_steps) & is_idle
 
@@ -637,6 +641,6 @@ def _next_width(width: Array, mean_square: Array, is_first: Array) -> Array:
     return jnp.where(is_first, 1.0, jnp.clip(mean_square, least, width / 3))
 
 
-def _where(condition: Array, new: Tree, old: Tree) -> Tree:
+def where_tree(condition: Array, new: Tree, old: Tree) -> Tree:
     """One of two trees of arrays."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)

@@ -64,8 +64,7 @@ class NLS(AbstractSearch):
     ) -> Estimate:
         """Estimate; the initial states are estimated too unless they are known."""
         require_double_precision()
-        others = ~jnp.asarray(self.held(plant))
-        free = others if free is None else free & others
+        free = self.freed(plant, free)
         problem = Problem(plant, experiments, plant.nominal if start is None else start, free)
         return problem.estimate(self._search(problem), self.noise == "known")
 

@@ -15,7 +15,7 @@ which need first derivatives only. The search is Fisher's scoring, damped as by 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -34,9 +34,8 @@ from .contract import (
     to_search,
 )
 from .kalman import Innovations, innovations
+from .multiple_shooting import LARGEST_CHANGE, where_tree
 from .nls import NLS, Problem, status_of_search
-
-Tree = TypeVar("Tree")
 
 _LEAST, _MOST = math.log(1e-8), math.log(10.0)
 """Logarithms of noise: of an output over its scale, of a state in one sample over its scale."""
@@ -74,8 +73,7 @@ class PEM(AbstractSearch):
     ) -> Estimate:
         """Estimate; the initial states are estimated too unless they are known."""
         require_double_precision()
-        others = ~jnp.asarray(self.held(plant))
-        free = others if free is None else free & others
+        free = self.freed(plant, free)
         start = plant.nominal if start is None else start
         first = NLS()(plant, experiments, start, free)
         likelihood = _Likelihood(plant, experiments, start, free)
@@ -143,7 +141,7 @@ class _Likelihood:
         num_noises = len(self.noise_scales)
         self.is_noise = np.arange(num_noises + len(d.parameters)) < num_noises
         self.active = jnp.concatenate([jnp.full(num_noises, noise_is_free), free])
-        largest = [1.0 if p.positive else 10.0 for p in d.parameters]
+        largest = [LARGEST_CHANGE[p.positive] for p in d.parameters]
         self.largest = jnp.asarray([_LARGEST] * num_noises + largest)
 
     @property
@@ -272,7 +270,7 @@ class _Likelihood:
             curvature = self._along(triangles, moved)[0] - slope
             part = jnp.where(curvature > 0, jnp.clip(expected / curvature, 0.3, 1.0), 1.0)
             accepted = cost <= s.cost + 1e-10 * jnp.abs(cost)
-            found = _where(accepted, (s.here, triangles, cost), (s.best, s.triangles, s.cost))
+            found = where_tree(accepted, (s.here, triangles, cost), (s.best, s.triangles, s.cost))
             best, triangles, cost = found
             damping = jnp.where(accepted, jnp.maximum(s.damping / 3, 1e-12), 5 * s.damping)
             change = self._step(best, triangles, damping, part)
@@ -343,8 +341,3 @@ def _damped(rows: Array, count: int, damping: Array) -> Array:
     extra = jnp.sqrt(damping * squares + jnp.where(squares > 0, 0.0, 1.0))
     extra = jnp.eye(count, rows.shape[-1]) * extra[:, None]
     return jnp.linalg.qr(jnp.concatenate([rows, extra]), mode="r")
-
-
-def _where(condition: Array, new: Tree, old: Tree) -> Tree:
-    """One of two trees of arrays."""
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)

@@ -324,6 +324,16 @@ class EstimateSummary(Saved):
     measurement_noise: dict[str, Number] | None = None
     suspects: tuple[FoundSuspect, ...] = ()
 
+    @property
+    def is_predicted(self) -> bool:
+        """Whether the residual is that of a one-step prediction, not of a simulation."""
+        return self.prediction_fit_percent is not None
+
+    @property
+    def model_fit_percent(self) -> dict[str, Number]:
+        """Fit by output of what the residual is measured from [%]."""
+        return self.prediction_fit_percent or self.fit_percent
+
     @classmethod
     def of(cls, data: Mapping[str, object]) -> EstimateSummary:
         """From data as a file or `Identification` has them."""

@@ -39,8 +39,7 @@ def identification_figure(
 
     With `pem` the outputs of the plant are those of its one-step prediction.
     """
-    fits = result.prediction_fit_percent or result.fit_percent
-    word = "predicted one step ahead" if result.prediction_fit_percent else "simulated"
+    word = "predicted one step ahead" if result.is_predicted else "simulated"
     outputs = description.outputs
     figure, axes = new_figure(2 * len(outputs) + 1)
     for i, part in enumerate(outputs):
@@ -52,7 +51,7 @@ def identification_figure(
         )
         top.plot(time, factor * measured, color=GREY, lw=1.6, label="measured")
         top.plot(time, factor * model, color=BLUE, lw=1, ls="--", label=word)
-        fit = number(fits[part.name], 4)
+        fit = number(result.model_fit_percent[part.name], 4)
         top.set(ylabel=axis_label(part), title=f"{part.name}: fit {fit} %")
         below.plot(time, factor * residual, color=ORANGE, lw=0.8)
         below.set(ylabel=f"residual [{display_unit(part.unit)[0]}]")

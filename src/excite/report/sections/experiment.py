@@ -112,7 +112,7 @@ def read_experiment(marker: Marker) -> Experiment:
     for i in range(1, count + 1):
         ending = "" if count == 1 else f"_{i}"
         records.append(record_in(folder / f"record{ending}.csv", plant))
-        word = "predicted" if result.prediction_fit_percent else "simulated"
+        word = "predicted" if result.is_predicted else "simulated"
         names, path = names_of(plant.outputs), folder / f"{word}{ending}.csv"
         columns = read_columns(path, names, _ADVICE)
         with understood(path, _ADVICE):
@@ -143,7 +143,7 @@ def _truth(experiment: Experiment) -> str:
 def _figures(experiment: Experiment, name: str) -> str:
     """Signals and fit of the first records."""
     d, parts = experiment.plant, []
-    word = "predicted" if experiment.result.prediction_fit_percent else "simulated"
+    word = "predicted" if experiment.result.is_predicted else "simulated"
     pairs = list(zip(experiment.records, experiment.simulated, strict=True))
     for i, (record, simulated) in enumerate(pairs[:_MAX_RECORDS], 1):
         file = experiment.result.files[i - 1]
@@ -168,14 +168,13 @@ def _residual_values(experiment: Experiment) -> list[np.ndarray]:
 def _residuals(experiment: Experiment) -> tuple[list[str], list[list[str]]]:
     """Fit and tests by output, and the fit of held-out records."""
     result, rows = experiment.result, []
-    fits = result.prediction_fit_percent or result.fit_percent
     residuals = np.concatenate(_residual_values(experiment))
     for i, part in enumerate(experiment.plant.outputs):
         unit, factor = display_unit(part.unit)
         size = f"{number(factor * float(np.sqrt(np.mean(residuals[:, i] ** 2))))} {unit}"
-        fit = f"{number(fits[part.name], 4)} %"
+        fit = f"{number(result.model_fit_percent[part.name], 4)} %"
         rows.append([part.name, fit, size, *residual_cells(result, part.name)])
-    simulated = "simulated, " if result.prediction_fit_percent is not None else ""
+    simulated = "simulated, " if result.is_predicted else ""
     others = [(result.fit_percent, "simulated")] if simulated else []
     for held_out in result.validation:
         if held_out.prediction_fit_percent is not None:
