@@ -10,3 +10,4 @@ from .contract import stack_experiments as stack_experiments
 from .decrement import Decrement as Decrement
 from .nls import NLS as NLS
 from .pem import PEM as PEM
+from .prior import Prior as Prior

@@ -338,19 +338,21 @@ def robust_covariance(
     sensitivity: Float[np.ndarray, "experiment sample output unknown"],
     residual: Float[np.ndarray, "experiment sample output"],
     valid: Bool[np.ndarray, "experiment sample output"],
+    prior: Float[np.ndarray, "unknown unknown"] | None = None,
 ) -> tuple[Float[np.ndarray, "unknown unknown"], Float[np.ndarray, " unknown"]]:
     """Covariance of a least-squares estimate in coloured noise, and its degrees of freedom.
 
-    H^-1 S' G S H^-1 with H = S' S and G the covariance of an autoregression fitted to each
-    output's residual. The degrees of freedom are those of a chi-squared variable whose
+    H^-1 (S' G S + P) H^-1 with H = S' S + P, P the information of a prior, and G the covariance
+    of an autoregression fitted to each output's residual. The degrees of freedom are those of a chi-squared variable whose
     variance, relative to its mean, is that of the variance found (F. Satterthwaite, "An
     approximate distribution of estimates of variance components", Biometrics Bulletin 2,
     1946). Sensitivity and residual are over the standard deviation of the weights.
     Undetermined directions get zero.
     """
-    inverse = inverse_information(sensitivity)
+    inverse = inverse_information(sensitivity, prior)
     count = len(inverse)
-    covariance, variance, spread = np.zeros((count, count)), np.zeros(count), np.zeros(count)
+    covariance = np.zeros((count, count)) if prior is None else inverse @ prior @ inverse
+    variance, spread = np.diag(covariance).copy(), np.zeros(count)
     for o, noise in enumerate(coloured_noise(sensitivity, residual, valid)):
         weights = sensitivity[:, :, o] @ inverse
         covariance += np.einsum("etu,etv->uv", weights, noise.times(weights))
@@ -363,9 +365,11 @@ def robust_covariance(
 
 def inverse_information(
     sensitivity: Float[np.ndarray, "experiment sample output unknown"],
+    prior: Float[np.ndarray, "unknown unknown"] | None = None,
 ) -> Float[np.ndarray, "unknown unknown"]:
-    """(S' S)^-1; zero in undetermined directions."""
+    """(S' S + P)^-1 with P the information of a prior; zero in undetermined directions."""
     H = np.einsum("etou,etov->uv", sensitivity, sensitivity)
+    H = H if prior is None else H + prior
     size = np.sqrt(np.diag(H))
     size[size == 0] = 1.0
     return np.linalg.pinv(H / np.outer(size, size), hermitian=True) / np.outer(size, size)
@@ -374,10 +378,11 @@ def inverse_information(
 def effect_of_constants(
     sensitivity: Float[np.ndarray, "experiment sample output unknown"],
     to_constants: Float[np.ndarray, "experiment sample output constant"],
+    prior: Float[np.ndarray, "unknown unknown"] | None = None,
 ) -> Float[np.ndarray, "unknown constant"]:
     """Derivative of a least-squares estimate with respect to constants that it takes as known."""
     rows = np.einsum("etou,etoc->uc", sensitivity, to_constants)
-    return -inverse_information(sensitivity) @ rows
+    return -inverse_information(sensitivity, prior) @ rows
 
 
 def with_independent(

@@ -56,8 +56,9 @@ from .diagnosis import (
     widened,
     with_independent,
 )
-from .nls import NLS
+from .nls import NLS, Likelihood
 from .pem import PEM
+from .prior import PriorLike, with_prior
 from .profile import profile_intervals
 from .remedies import HOLDS, Suspect, outliers, suspects
 from .result import Fitted, Identification, Noise, Predicted
@@ -88,7 +89,9 @@ def identify(
     *,
     start: Mapping[str, float] | Params | None = None,
     hold: Mapping[str, float] | None = None,
+    prior: PriorLike | Sequence[PriorLike] | None = None,
     uncertain: Mapping[str, float | str] | None = None,
+    likelihood: Likelihood = "normal",
     initial_state: InitialState = "auto",
     intervals: Intervals = "linear",
     hold_input: str | Mapping[str, str] = "constant",
@@ -117,8 +120,12 @@ def identify(
         estimator: a name (`ex.estimators()` lists them), an estimator or its class.
         start: where the search begins, by name; default the nominal parameters.
         hold: values of parameters that are known and not estimated, by name.
+        prior: what is known of parameters beforehand: {"J_p": "normal:0.022:5%"}, "lognormal:",
+            "uniform:0.01:0.05", the run folder or result of an earlier `identify` of other
+            records, a file with mean and covariance, or several of these.
         uncertain: standard deviation of known constants, by name: {"m": 0.02} in the constant's
             unit, {"m": "5%"} of its value. It widens the intervals.
+        likelihood: of the noise, "normal" or "student", with which outliers hardly count.
         initial_state: "known" (the plant's), "free" (estimated too), or "auto": known
             where every sidecar says so.
         intervals: "linear": from standard errors; "profile": from the profile likelihood, which
@@ -143,6 +150,14 @@ def identify(
         raise ValueError("no record is given")
     plant = plant_from(_plant_of(given[0]) if plant is None else plant)
     estimator, begin = _chosen(estimator, plant, start, hold)
+    if likelihood not in get_args(Likelihood):
+        raise ValueError(f"likelihood {likelihood!r} is not one of: normal, student")
+    plant, prior = with_prior(plant, prior, begin)
+    if prior is not None or likelihood != "normal":
+        what = "a likelihood other than normal" if prior is None else "a prior"
+        if not isinstance(estimator, NLS):
+            raise ValueError(f"{what} needs the estimator nls: got {estimator.name}")
+        estimator = dataclasses.replace(estimator, prior=prior, likelihood=likelihood)
     if intervals not in get_args(Intervals):
         raise ValueError(f"intervals {intervals!r} are not one of: linear, profile")
     if intervals == "profile" and not isinstance(estimator, NLS):
@@ -684,8 +699,9 @@ def _confidence(
     elif coloured or uncertain.any():
         estimate, free = jax.device_put((fit.estimate, fit.free))
         S, residual = map(np.asarray, estimator.sensitivity(plant, experiments, estimate, free))
+        prior = np.asarray(estimator.prior_information(plant, estimate, S.shape[-1]))
         if coloured:
-            robust, its = robust_covariance(S, residual, np.asarray(experiments.valid))
+            robust, its = robust_covariance(S, residual, np.asarray(experiments.valid), prior)
             robust = np.outer(size, size) * robust[: len(names), : len(names)]
             is_wider = np.diag(robust) > np.diag(covariance)
             degrees = np.where(is_wider, its[: len(names)], degrees)
@@ -695,13 +711,17 @@ def _confidence(
             )
         if uncertain.any():
             to_constants = np.asarray(estimator.constant_sensitivity(plant, experiments, estimate))
-            effect = effect_of_constants(S, to_constants)[: len(names)] * uncertain[None]
+            effect = effect_of_constants(S, to_constants, prior)[: len(names)] * uncertain[None]
             effect = effect * size[:, None]
             covariance, degrees = with_independent(covariance, degrees, effect @ effect.T)
             remarks.append(
                 f"the intervals include the standard deviation of {_told(plant, uncertain)}"
             )
     seen = identifiability(names, covariance / np.outer(size, size), fit.free)
+    if isinstance(estimator, NLS) and estimator.prior is not None:
+        rows = [names.index(name) for name in estimator.prior.names]
+        values = dict(zip(names, map(float, fit.estimate.params), strict=True))
+        remarks += estimator.prior.verdict(values, covariance[np.ix_(rows, rows)])
     return covariance, degrees, (*fit.reasons, seen, *remarks)
 
 

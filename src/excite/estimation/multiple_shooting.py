@@ -228,6 +228,8 @@ class MultipleShooting:
     Args:
         params_at: parameters, as a vector, at search coordinates z.
         first_is_free: False where every experiment starts at its known initial state.
+        prior: further residuals of the search coordinates, in standard deviations.
+        student: scale of each output's noise, if it has Student's distribution; default normal.
     """
 
     def __init__(
@@ -236,9 +238,11 @@ class MultipleShooting:
         segments: Segments,
         params_at: Callable[[Float[Array, " param"]], Float[Array, " param"]],
         first_is_free: bool,
+        prior: Callable[[Float[Array, " param"]], Float[Array, " row"]] | None = None,
+        student: Float[Array, " output"] | None = None,
     ) -> None:
         self.plant, self.segments, self.params_at = plant, segments, params_at
-        self.first_is_free = first_is_free
+        self.first_is_free, self.prior, self.student = first_is_free, prior, student
         self.scales = jnp.asarray([s.scale for s in plant.definition.states])
         self.output_scales = jnp.asarray([o.scale for o in plant.definition.outputs])
         self.num_states = len(plant.definition.states)
@@ -302,12 +306,23 @@ class MultipleShooting:
             lambda a: a.reshape(*shape, *a.shape[1:]), jax.vmap(differentiated)(*flat)
         )
         is_followed = block.is_followed[..., None]
+        misfit = jnp.where(block.valid, outputs - block.measured, 0.0)
+        if self.student is not None:
+            root, its_slope = student_root(misfit / self.student)
+            misfit, slope = self.student * root, slope * its_slope[..., None]
         return Shots(
-            misfit=jnp.where(block.valid, outputs - block.measured, 0.0),
+            misfit=misfit,
             misfit_slope=jnp.where(block.valid[..., None], slope, 0.0),
             gap=jnp.where(is_followed, end - next_starts, 0.0),
             end_slope=jnp.where(is_followed[..., None], end_slope, 0.0),
         )
+
+    def prior_rows(self, z: Float[Array, " param"]) -> Float[Array, "row column"]:
+        """The derivative of the prior's residuals, then their values; no rows without a prior."""
+        if self.prior is None:
+            return jnp.zeros((0, len(z) + 1))
+        slope, value = jax.jacfwd(self.prior)(z), self.prior(z)
+        return jnp.concatenate([slope, value[:, None]], axis=1)
 
     def _blocks(self, point: Point) -> tuple[Array, Array, Segments]:
         """Start states, those of the next segments, and segments, by block."""
@@ -392,12 +407,14 @@ class MultipleShooting:
             triangle, rows = chain(triangle, J, r, A, c)
             return (triangle, misfits, gaps, index + 1), rows
 
-        nothing = jnp.asarray(0.0)
-        begin = jnp.zeros((num_experiments, n + p + 1, n + p + 1)), nothing, nothing, 0
+        nothing, known = jnp.asarray(0.0), self.prior_rows(point.z)
+        more = jnp.sum(known[:, -1] ** 2)
+        begin = jnp.zeros((num_experiments, n + p + 1, n + p + 1)), more, nothing, 0
         (triangle, misfits, gaps, _), rows = jax.lax.scan(
             simulate_block, begin, self._blocks(point)
         )
-        common = jnp.linalg.qr(triangle[:, n:, n:].reshape(-1, p + 1), mode="r")
+        left = triangle[:, n:, n:].reshape(-1, p + 1)
+        common = jnp.linalg.qr(jnp.concatenate([left, known]), mode="r")
         return Linear(over_segments(rows), common, misfits, gaps)
 
     def step_of(self, found: Linear, damping: Array, is_first: Array) -> tuple[Array, Point]:
@@ -495,13 +512,23 @@ class MultipleShooting:
         found = jax.lax.while_loop(goes_on, match, begin)
         return where_tree(found.is_closed, found.here, found.best)
 
-    def weighted(self, sweep: Sweep, sd: Array) -> Float[Array, "experiment unknown unknown"]:
-        """The triangle of all outputs over their standard deviations; unknowns, then value."""
+    def weighted(
+        self, sweep: Sweep, z: Array, sd: Array
+    ) -> Float[Array, "experiment unknown unknown"]:
+        """The triangle of all outputs over their standard deviations; unknowns, then value.
+
+        The prior comes last, as an experiment that tells nothing of its initial state.
+        """
         triangles = sweep.triangles / sd[None, :, None, None]
         if not self.first_is_free:
             triangles = triangles[..., self.num_states :]
         stacked = triangles.reshape(len(triangles), -1, triangles.shape[-1])
-        return jnp.linalg.qr(stacked, mode="r")
+        found = jnp.linalg.qr(stacked, mode="r")
+        if self.prior is None:
+            return found
+        rows, width = self.prior_rows(z), found.shape[-1]
+        own = jnp.zeros((width, width)).at[: len(rows), width - rows.shape[1] :].set(rows)
+        return jnp.concatenate([found, own[None]])
 
     def newton_step(
         self, moves: Array, triangle: Array, damping: Array, more: Float[Array, " param"]
@@ -530,7 +557,7 @@ class MultipleShooting:
             first = -jax.vmap(jax.scipy.linalg.solve_triangular)(R[:, :k, :k], right)
             change = change.at[:, :n].set(first)
         outputs = jnp.einsum("erq,eq->er", triangle[..., :-1], change[:, n - k : -1])
-        return Point(dz, jnp.einsum("esnq,eq->esn", moves, change)), outputs
+        return Point(dz, jnp.einsum("esnq,eq->esn", moves, change[: len(moves)])), outputs
 
     def limited_step(
         self, moves: Array, triangle: Array, damping: Array
@@ -573,6 +600,7 @@ class MultipleShooting:
         def improve(s: _Search) -> _Search:
             sweep = self.sweep(s.here)
             cost = jnp.sum((sweep.triangles[..., -1] / sd[None, :, None]) ** 2)
+            cost += jnp.sum(self.prior_rows(s.here.z)[:, -1] ** 2)
             hoped, gained = s.cost - s.predicted, s.cost - cost
             is_bold = (s.steps < _BOLD) & (cost < _LIMIT * s.cost)
             is_equal = jnp.abs(gained) <= 100 * _EPS * cost
@@ -580,7 +608,7 @@ class MultipleShooting:
             best, sweep, cost = where_tree(
                 accepted, (s.here, sweep, cost), (s.best, s.sweep, s.cost)
             )
-            triangle = self.weighted(sweep, sd)
+            triangle = self.weighted(sweep, best.z, sd)
             is_good = gained > _GOOD * hoped
             # Where the residual is large a step may be too long, and its direction right: a part
             # of it is tried before the radius shrinks.
@@ -633,6 +661,23 @@ class MultipleShooting:
         point = where_tree(found.converged, found.here, found.best)
         is_idle = found.gained <= _IDLE * found.cost / count
         return point, found.sweep, found.converged | (found.steps == max_steps) & is_idle
+
+
+FREEDOM = 4.0
+"""Degrees of freedom of Student's distribution, where noise with outliers is taken to have it."""
+
+
+def student_root(u: Array) -> tuple[Array, Array]:
+    """A function whose square is minus twice Student's log-likelihood, and its derivative.
+
+    Without the constant; least squares of these values is then maximum likelihood (K. Lange,
+    R. Little and J. Taylor, "Robust statistical modeling using the t distribution", JASA 84, 1989).
+    """
+    v = u**2 / FREEDOM
+    is_small = v < 1e-8
+    ratio = jnp.where(is_small, 1 - v / 2, jnp.log1p(v) / jnp.where(is_small, 1.0, v))
+    root = jnp.sqrt((FREEDOM + 1) / FREEDOM * ratio)
+    return u * root, (FREEDOM + 1) / ((FREEDOM + u**2) * root)
 
 
 def _next_width(width: Array, mean_square: Array, is_first: Array) -> Array:

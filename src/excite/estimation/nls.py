@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from ..description import names_of
 from ..information import relative_size
 from ..plant import AbstractPlant, Params, require_double_precision
 from .contract import (
@@ -27,10 +28,13 @@ from .contract import (
     simulate_experiments,
     to_search,
 )
-from .multiple_shooting import MultipleShooting, Point, Segments
+from .multiple_shooting import FREEDOM, MultipleShooting, Point, Segments, student_root
+from .prior import Prior
 
 _FAR = 30.0  # largest logarithm of a positive parameter over its nominal value
+_ROUNDS, _SCALE_STEPS = 3, 20  # searches with the noise found by the one before; of its scale
 Noise = Literal["declared", "known", "estimated"]
+Likelihood = Literal["normal", "student"]
 
 
 class NLS(AbstractSearch):
@@ -45,6 +49,10 @@ class NLS(AbstractSearch):
             its scale), the size of the noise from the residual; "known": that follows from
             the declaration, too; "estimated": the weights follow from the residual, too.
         known: names of parameters that are held where the search starts.
+        likelihood: "student": the noise has Student's distribution with 4 degrees of freedom, so
+            that outliers hardly count.
+        prior: of parameters. It is weighed against the noise that is found, so with it, and with
+            Student's distribution, a noise that is not known is estimated for each output.
     """
 
     tolerance: float = eqx.field(static=True, default=1e-4)
@@ -52,6 +60,8 @@ class NLS(AbstractSearch):
     segment_length: int | None = eqx.field(static=True, default=None)
     noise: Noise = eqx.field(static=True, default="declared")
     known: tuple[str, ...] = eqx.field(static=True, default=())
+    likelihood: Likelihood = eqx.field(static=True, default="normal")
+    prior: Prior | None = None
     name: str = eqx.field(static=True, default="nls", kw_only=True)
 
     @eqx.filter_jit
@@ -65,8 +75,14 @@ class NLS(AbstractSearch):
         """Estimate; the initial states are estimated too unless they are known."""
         require_double_precision()
         free = self.freed(plant, free)
-        problem = Problem(plant, experiments, plant.nominal if start is None else start, free)
-        return problem.estimate(self._search(problem), self.noise == "known")
+        begin = plant.nominal if start is None else start
+        problem = Problem(plant, experiments, begin, free, self.prior)
+        found = self._search(problem)
+        cost = self._cost(problem, found)
+        sd, residual = self._as_normal(problem, found.residual, found.sd)
+        is_known = self.noise == "known" and self.likelihood == "normal"
+        noise_sd = sd if is_known else problem.noise_sd(residual)
+        return problem.estimate(found._replace(sd=sd), cost, noise_sd, self.noise == "known")
 
     @eqx.filter_jit
     def sensitivity(
@@ -81,28 +97,90 @@ class NLS(AbstractSearch):
         """Sensitivity and residual at an estimate, over the standard deviation of the weights.
 
         The unknowns are relative changes of the parameters, then the initial states if they
-        were estimated.
+        were estimated. With Student's distribution they are those of the normal problem that has
+        the same estimate and covariance.
         """
-        problem = Problem(plant, experiments, estimate.params, free)
-        is_estimated = self.noise == "estimated"
-        sd = problem.noise_sd(estimate.residual) if is_estimated else problem.assumed_sd
+        problem = Problem(plant, experiments, estimate.params, free, self.prior)
+        sd = self.weights(plant, experiments, estimate)
+        sd, residual = self._as_normal(problem, estimate.residual, sd)
         S = problem.sensitivity(estimate.params, estimate.initial_state)
-        return S / sd[None, None, :, None], estimate.residual / sd[None, None]
+        return S / sd[None, None, :, None], residual / sd[None, None]
 
     def weights(
         self, plant: AbstractPlant, experiments: Experiments, estimate: Estimate
     ) -> Float[Array, " output"]:
         """The standard deviations over which the residual of an estimate counts."""
         problem = Problem(plant, experiments, estimate.params, None)
-        is_estimated = self.noise == "estimated"
-        return problem.noise_sd(estimate.residual) if is_estimated else problem.assumed_sd
+        return self.scale(problem, estimate.residual) if self.finds_noise else problem.assumed_sd
+
+    def sum_of_squares(
+        self, plant: AbstractPlant, experiments: Experiments, estimate: Estimate
+    ) -> Float[Array, ""]:
+        """What a search with this noise minimises, at an estimate."""
+        problem = Problem(plant, experiments, estimate.params, None, self.prior)
+        sd = self.weights(plant, experiments, estimate)
+        return self._squares(problem, problem.start, estimate.residual, sd)
+
+    def prior_information(
+        self, plant: AbstractPlant, estimate: Estimate, num_unknowns: int
+    ) -> Float[Array, "unknown unknown"]:
+        """What the prior tells of the unknowns of `sensitivity`."""
+        found = jnp.zeros((num_unknowns, num_unknowns))
+        if self.prior is None:
+            return found
+        size, names = relative_size(plant, estimate.params), names_of(plant.definition.parameters)
+        rows = jax.jacfwd(self.prior.residual, argnums=1)(names, jnp.stack(estimate.params)) * size
+        return found.at[: len(names), : len(names)].set(rows.T @ rows)
+
+    @property
+    def finds_noise(self) -> bool:
+        """Whether the weights follow from the residual."""
+        estimates = self.prior is not None or self.likelihood == "student"
+        return self.noise == "estimated" or (estimates and self.noise != "known")
+
+    def _squares(self, problem: Problem, z: Array, residual: Array, sd: Array) -> Array:
+        """Sum of squares of the residual over its scale, and of the prior."""
+        u = residual / sd[None, None]
+        u = student_root(u)[0] if self.likelihood == "student" else u
+        return jnp.sum(u**2) + jnp.sum(problem.prior_residual(z) ** 2)
+
+    def _cost(self, problem: Problem, found: _Found) -> Float[Array, ""]:
+        """That sum, or one that grows with the negative logarithm of the likelihood.
+
+        Where noise is estimated, sums over different noise cannot be compared.
+        """
+        squares = self._squares(problem, found.point.z, found.residual, found.sd)
+        if not self.finds_noise:
+            return squares
+        counts = jnp.sum(problem.experiments.valid, axis=(0, 1))
+        logarithm = jnp.sum(counts * jnp.log((found.sd / problem.assumed_sd) ** 2))
+        return jnp.sum(counts) * jnp.exp((logarithm + squares) / jnp.sum(counts) - 1)
+
+    def _as_normal(
+        self, problem: Problem, residual: Float[Array, "experiment sample output"], scale: Array
+    ) -> tuple[Float[Array, " output"], Float[Array, "experiment sample output"]]:
+        """Weights and residual of the normal problem with the same estimate and covariance.
+
+        Of an M-estimator (P. Huber, Robust Statistics, 1981, section 7.6).
+        """
+        if self.likelihood == "normal":
+            return scale, residual
+        u2 = (residual / scale[None, None]) ** 2
+        slope = (FREEDOM + 1) * (FREEDOM - u2) / (FREEDOM + u2) ** 2
+        counts = jnp.sum(problem.experiments.valid, axis=(0, 1))
+        mean = jnp.sum(jnp.where(problem.experiments.valid, slope, 0.0), axis=(0, 1)) / counts
+        mean = jnp.maximum(mean, 0.05)  # never zero: then all samples would be outliers
+        pseudo = (FREEDOM + 1) / (FREEDOM + u2) * residual / mean[None, None]
+        return scale / jnp.sqrt(mean), pseudo
 
     @eqx.filter_jit
     def constant_sensitivity(
         self, plant: AbstractPlant, experiments: Experiments, estimate: Estimate
     ) -> Float[Array, "experiment sample output constant"]:
         """Derivative of the outputs with respect to the known constants, weighted like these."""
+        problem = Problem(plant, experiments, estimate.params, None)
         sd = self.weights(plant, experiments, estimate)
+        sd, _ = self._as_normal(problem, estimate.residual, sd)
         names = plant.constants._fields
 
         def outputs(values: Array) -> Array:
@@ -120,26 +198,55 @@ class NLS(AbstractSearch):
         num_samples = experiments.valid.shape[1]
         segments = Segments.of(experiments, self.length_of_segments(plant, num_samples))
         is_free = not experiments.initial_state_known
-        shooting = MultipleShooting(plant, segments, problem.params, is_free)
+        prior = None if self.prior is None else problem.prior_residual
 
-        def search(start: Point, sd: Array) -> _Found:
-            point, sweep, converged = shooting.solve(
+        def shooting(student: Array | None = None) -> MultipleShooting:
+            return MultipleShooting(plant, segments, problem.params, is_free, prior, student)
+
+        def search(start: Point, sd: Array, student: Array | None = None) -> _Found:
+            point, sweep, converged = shooting(student).solve(
                 start,
                 sd,
                 rounding=jnp.min(problem.rounding / sd),
                 tolerance=self.tolerance,
                 max_steps=self.max_steps,
             )
+            sweep = sweep if student is None else shooting().sweep(point)
             misfit = sweep.misfit.reshape(segments.shape[0], -1, problem.num_outputs)
             return _Found(point, converged, sweep.triangles, -misfit[:, :num_samples], sd)
+
+        def again(found: _Found) -> _Found:
+            sd = found.sd if self.noise == "known" else self.scale(problem, found.residual)
+            return search(found.point, sd, sd if self.likelihood == "student" else None)
 
         first = experiments.initial_state / problem.state_scales[None]
         starts = jnp.tile(first[:, None], (1, segments.shape[1], 1))
         sd = problem.assumed_sd
-        found = search(shooting.matched(Point(problem.start, starts), sd), sd)
+        found = search(shooting().matched(Point(problem.start, starts), sd), sd)
+        if self.likelihood == "student" or (self.prior is not None and self.finds_noise):
+            return jax.lax.fori_loop(0, _ROUNDS, lambda _, found: again(found), found)
         if self.noise == "estimated" and problem.num_outputs > 1:
-            found = search(found.point, problem.noise_sd(found.residual))
+            return again(found)
         return found
+
+    def scale(
+        self, problem: Problem, residual: Float[Array, "experiment sample output"]
+    ) -> Float[Array, " output"]:
+        """Scale of each output's noise: standard deviation, or the likeliest one of Student's."""
+        usual = problem.noise_sd(residual)
+        if self.likelihood == "normal":
+            return usual
+        size = jnp.where(problem.experiments.valid, jnp.abs(residual), jnp.nan)
+        begin = jnp.nanmedian(size.reshape(-1, size.shape[2]), axis=0)
+
+        def improved(_: int, sd: Array) -> Array:
+            u2 = (residual / sd[None, None]) ** 2
+            weighted = (FREEDOM + 1) / (FREEDOM + u2) * residual**2
+            found = jnp.sqrt(jnp.sum(weighted, axis=(0, 1)) / problem.degrees)
+            return jnp.maximum(found, problem.rounding)
+
+        start = jnp.maximum(begin, problem.rounding)
+        return jax.lax.fori_loop(0, _SCALE_STEPS, improved, start)
 
     def length_of_segments(self, plant: AbstractPlant, num_samples: int) -> int:
         """Length of a segment: it is short, but determines its start state."""
@@ -165,11 +272,17 @@ class Problem(eqx.Module):
     experiments: Experiments
     start: Float[Array, " param"]
     free: Bool[Array, " param"]
+    prior: Prior | None
 
     def __init__(
-        self, plant: AbstractPlant, experiments: Experiments, start: Params, free: Array | None
+        self,
+        plant: AbstractPlant,
+        experiments: Experiments,
+        start: Params,
+        free: Array | None,
+        prior: Prior | None = None,
     ) -> None:
-        self.plant, self.experiments = plant, experiments
+        self.plant, self.experiments, self.prior = plant, experiments, prior
         self.start = to_search(plant.definition, start)
         self.free = jnp.ones(len(self.start), bool) if free is None else free
 
@@ -206,6 +319,12 @@ class Problem(eqx.Module):
         z = z - jnp.where(positive, beyond, 0.0)  # the derivative is kept beyond the limit
         return from_search(d, jnp.where(self.free, z, self.start))
 
+    def prior_residual(self, z: Float[Array, " param"]) -> Float[Array, " row"]:
+        """Distance of the parameters from their prior, in standard deviations."""
+        if self.prior is None:
+            return jnp.zeros(0)
+        return self.prior.residual(names_of(self.plant.definition.parameters), self.params(z))
+
     @property
     def degrees(self) -> Float[Array, " output"]:
         """Degrees of freedom of each output's residual: values less its share of the unknowns."""
@@ -237,14 +356,15 @@ class Problem(eqx.Module):
 
         return jax.jacfwd(response)(jnp.zeros(len(size) + states))
 
-    def estimate(self, found: _Found, noise_is_known: bool) -> Estimate:
-        """The estimate at the end of the search, with its covariance."""
+    def estimate(
+        self, found: _Found, cost: Array, sd: Float[Array, " output"], noise_is_known: bool
+    ) -> Estimate:
+        """The estimate at the end of the search, with its covariance; `sd` is of the noise."""
         z = found.point.z
         values, slope = jax.jvp(self.params, (z,), (jnp.ones_like(z),))
         params, n = self.plant.Params(*values), self.state_scales.size
         size = relative_size(self.plant, params)
         slope = jnp.where(self.free, slope / size, 1.0)  # of relative changes over z
-        sd = self.assumed_sd if noise_is_known else self.noise_sd(found.residual)
         weighted = found.triangles[..., :-1] / found.sd[None, :, None, None]
         columns = weighted[..., n:] / slope[None, None, None]
         initial_state = self.experiments.initial_state
@@ -254,8 +374,10 @@ class Problem(eqx.Module):
         # H of the weighted outputs, and V of their scores, whose sd is not the assumed one.
         ratio = (sd / found.sd)[None, :, None, None]
         by_output = jnp.einsum("eokp,eokq->opq", columns, columns)
-        H = jnp.sum(by_output, axis=0)
-        V = jnp.einsum("o,opq->pq", ratio[0, :, 0, 0] ** 2, by_output)
+        beforehand = jax.jacfwd(self.prior_residual)(z) / slope[None]
+        beforehand = beforehand.T @ beforehand
+        H = jnp.sum(by_output, axis=0) + beforehand
+        V = jnp.einsum("o,opq->pq", ratio[0, :, 0, 0] ** 2, by_output) + beforehand
         held = jnp.diag(jnp.where(self.free, 0.0, 1.0))
         active = jnp.outer(self.free, self.free)
         # Over the columns' lengths: one parameter that hardly acts leaves the others' digits.
@@ -266,8 +388,8 @@ class Problem(eqx.Module):
         # Of a sum of estimated variances (F. Satterthwaite, Biometrics Bulletin 2, 1946).
         parts = jnp.einsum("o,pq,oqr,rp->op", ratio[0, :, 0, 0] ** 2, inverse, by_output, inverse)
         spread = jnp.sum(parts**2 / self.degrees[:, None], axis=0)
-        degrees = jnp.where(spread > 0, jnp.sum(parts, axis=0) ** 2 / spread, jnp.inf)
-        information = jnp.einsum("eokp,eokq->pq", columns / ratio, columns / ratio)
+        degrees = jnp.where(spread > 0, jnp.diagonal(relative) ** 2 / spread, jnp.inf)
+        information = jnp.einsum("eokp,eokq->pq", columns / ratio, columns / ratio) + beforehand
         return Estimate(
             params=params,
             covariance=relative * jnp.outer(size, size),
@@ -275,7 +397,7 @@ class Problem(eqx.Module):
             status=status_of_search(values, found.residual, relative, found.converged),
             initial_state=initial_state,
             residual=found.residual,
-            cost=jnp.sum((found.residual / found.sd[None, None]) ** 2),
+            cost=cost,
             degrees=jnp.full_like(degrees, jnp.inf) if noise_is_known else degrees,
         )
 

@@ -45,14 +45,16 @@ def profile_intervals(
         half: of the intervals by standard errors. They set the limits, so that both kinds agree
             for a plant that is linear in its parameters.
     """
-    if estimator.noise == "estimated":  # the weights of the estimate are kept
+    if estimator.finds_noise:  # the weights of the estimate are kept
         sd = np.asarray(estimator.weights(plant, experiments, estimate))
         plant = plant.changed(sensor=Sensor(floats(sd), floats(0 * sd)))
-        estimator = dataclasses.replace(estimator, noise="declared")
-    S, residual = estimator.sensitivity(plant, experiments, estimate, jax.device_put(free))
-    unit = np.sqrt(np.diag(inverse_information(np.asarray(S))))[: len(free)]
+        estimator = dataclasses.replace(estimator, noise="known")
+    S, _ = map(np.asarray, estimator.sensitivity(plant, experiments, estimate, jax.device_put(free)))
+    prior = np.asarray(estimator.prior_information(plant, estimate, S.shape[-1]))
+    unit = np.sqrt(np.diag(inverse_information(S, prior)))[: len(free)]
     size = np.abs(np.asarray(relative_size(plant, estimate.params)))
-    least, ends = float(np.sum(np.asarray(residual) ** 2)), np.full((len(free), 2), np.nan)
+    least = float(estimator.sum_of_squares(plant, experiments, estimate))
+    ends = np.full((len(free), 2), np.nan)
 
     def excess_of(index: int) -> Callable[[float], float]:
         """Growth of the sum of squares, with the parameter at a value and the others best."""

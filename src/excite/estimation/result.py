@@ -18,12 +18,12 @@ from ..record.rows import USABLE, EstimateSummary
 from ..record.table import data_frame
 from ..report.results import identification_html, identification_text, wrapped
 from .diagnosis import correlation, fit_percent
-from .remedies import Suspect
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
+    from .remedies import Suspect
 
 @dataclass(frozen=True)
 class Predicted:
