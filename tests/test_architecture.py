@@ -311,6 +311,7 @@ READS = (
     "plant/catalogue",
     "excitation/catalogue",
     "estimation/identify",
+    "estimation/prior_knowledge",
     "estimation/result",
     "training/design",
 )

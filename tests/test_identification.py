@@ -475,8 +475,14 @@ def test_the_dictionary_says_what_the_result_says(result):
         assert entry["relative_to_nominal"] == pytest.approx(result.params[name] / float(nominal))
     assert d["params"]["D_p"]["unit"] == "N m s/rad"
     assert d["fit_percent"] == {"pitch": result.fit()["pitch"]}
-    validated = result.validation[0].fit_percent["pitch"]
-    assert d["validation"] == [{"file": "foreign.csv", "fit_percent": {"pitch": validated}}]
+    held_out = result.validation[0]
+    assert d["validation"] == [
+        {
+            "file": "foreign.csv",
+            "fit_percent": {"pitch": held_out.fit_percent["pitch"]},
+            "initial_state": held_out.initial_state,
+        }
+    ]
     correlation = np.array(d["correlation"])
     np.testing.assert_allclose(np.diag(correlation), 1)
     np.testing.assert_allclose(correlation, correlation.T)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +38,14 @@ _OF_RECORDS = (
         multiple=True,
         metavar="FILE",
         help="Held-out record to simulate with the estimate.",
+    ),
+    click.option(
+        "--validate-state",
+        default="auto",
+        show_default=True,
+        metavar="auto|known|first|SHARE",
+        help="Initial state of held-out records: the plant's, from the first measurements, or "
+        "estimated from a share that does not count (10%).",
     ),
     click.option(
         "--column",
@@ -95,6 +103,7 @@ def arguments_of(options: Mapping[str, Any]) -> dict[str, Any]:
         "initial_state": options["initial_state"],
         "hold_input": NAMES.convert(hold_input, None, None) if "=" in hold_input else hold_input,
         "validate": options["validate"],
+        "validate_state": options["validate_state"],
         "columns": merged(options["column"]),
         "scales": merged(options["scale"]),
         "units": merged(options["unit"]),
@@ -102,6 +111,15 @@ def arguments_of(options: Mapping[str, Any]) -> dict[str, Any]:
         "dt": options["dt"],
         "rows": options["rows"],
     }
+
+
+def _priors(words: Sequence[str]) -> list[dict[str, str] | Path] | None:
+    """Priors by parameter, and paths of others."""
+    found = [
+        NAMES.convert(w, None, None) if "=" in w and not Path(w).exists() else Path(w)
+        for w in words
+    ]
+    return found or None
 
 
 @click.command()
@@ -136,6 +154,20 @@ def arguments_of(options: Mapping[str, Any]) -> dict[str, Any]:
     help="Known values, not to be estimated: tau=0.162.",
 )
 @click.option(
+    "--prior",
+    multiple=True,
+    metavar="NAME=DISTRIBUTION|PATH",
+    help="What is known beforehand: J_p=normal:0.022:5%, lognormal:0.022:0.1, uniform:0.01:0.05; "
+    "the run folder of other records; or a JSON file with mean and covariance.",
+)
+@click.option(
+    "--likelihood",
+    type=click.Choice(["normal", "student"]),
+    default="normal",
+    show_default=True,
+    help="Distribution of the noise; with student, outliers hardly count.",
+)
+@click.option(
     "--uncertain",
     type=NAMES,
     multiple=True,
@@ -161,13 +193,16 @@ def identify(
 
     if out is not None:
         require_free_run_folder(out, options["overwrite"])
-    with progress_bar("identifying"):
+    with progress_bar("identifying") as progress:
         result = verb(
             files,
             options["plant"],
             options["estimator"],
             **{name: merged(options[name]) for name in ("start", "hold", "uncertain")},
+            prior=_priors(options["prior"]),
+            likelihood=options["likelihood"],
             intervals=options["intervals"],
+            progress=progress,
             **arguments_of(options),
         )
     if plot is not None:

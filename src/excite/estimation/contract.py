@@ -144,6 +144,7 @@ class Estimate(eqx.Module):
         residual: measured minus simulated outputs, or minus predicted ones where there is a
             prediction; zero where padded.
         cost: weighted sum of squares at the end of a search; infinite where there is none.
+        steps: of the search.
         degrees: degrees of freedom of Student's t for each parameter's interval, infinite where
             the noise is known; None counts as infinite.
         prediction: of estimators that take the plant as disturbed.
@@ -156,6 +157,7 @@ class Estimate(eqx.Module):
     initial_state: Float[Array, "experiment state"]
     residual: Float[Array, "experiment sample output"]
     cost: Float[Array, ""] | float = math.inf
+    steps: Int[Array, ""] | int = 0
     degrees: Float[Array, " param"] | None = None
     prediction: Prediction | None = None
 

@@ -343,10 +343,10 @@ def robust_covariance(
     """Covariance of a least-squares estimate in coloured noise, and its degrees of freedom.
 
     H^-1 (S' G S + P) H^-1 with H = S' S + P, P the information of a prior, and G the covariance
-    of an autoregression fitted to each output's residual. The degrees of freedom are those of a chi-squared variable whose
-    variance, relative to its mean, is that of the variance found (F. Satterthwaite, "An
-    approximate distribution of estimates of variance components", Biometrics Bulletin 2,
-    1946). Sensitivity and residual are over the standard deviation of the weights.
+    of an autoregression fitted to each output's residual. The degrees of freedom are those of a
+    chi-squared variable whose variance, relative to its mean, is that of the variance found (F.
+    Satterthwaite, "An approximate distribution of estimates of variance components", Biometrics
+    Bulletin 2, 1946). Sensitivity and residual are over the standard deviation of the weights.
     Undetermined directions get zero.
     """
     inverse = inverse_information(sensitivity, prior)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -58,7 +59,7 @@ from .diagnosis import (
 )
 from .nls import NLS, Likelihood
 from .pem import PEM
-from .prior import PriorLike, with_prior
+from .prior_knowledge import PriorLike, with_prior
 from .profile import profile_intervals
 from .remedies import HOLDS, Suspect, outliers, suspects
 from .result import Fitted, Identification, Noise, Predicted
@@ -75,9 +76,12 @@ _SIZE_OF_SUSPECTS = 10_000  # measured values up to which suspects are tried
 _TELLING = 50  # measured values from which the residual tells whether the search missed something
 _FREE = 100.0  # scales of a parameter of free sign that are small for its standard error
 _SAME = 0.01  # difference of sums of squares at one minimum, over the noise
+_FAR_ABOVE = 10.0  # times the declared noise; a larger residual is remarked
+_SHARE = 0.1  # of a held-out record, from which its initial state is estimated
 _BY_CHANCE = 1e-3  # a fit with a larger p-value explains nothing
 
 
+Progress = Callable[[str, float, float], None]
 RecordLike: TypeAlias = Record | str | Path
 """A record, or the path of an experiment file."""
 
@@ -96,12 +100,14 @@ def identify(
     intervals: Intervals = "linear",
     hold_input: str | Mapping[str, str] = "constant",
     validate: RecordLike | Sequence[RecordLike] = (),
+    validate_state: str | float = "auto",
     columns: Mapping[str, str] | None = None,
     scales: Mapping[str, float] | None = None,
     units: Mapping[str, str] | None = None,
     set_inputs: Mapping[str, float] | None = None,
     dt: float | None = None,
     rows: slice | str | None = None,
+    progress: Progress = lambda *_: None,
 ) -> Identification:
     """Parameters of one plant from one or several records.
 
@@ -132,7 +138,13 @@ def identify(
             follows a curved likelihood and may stay open to one side, and takes longer.
         hold_input: "constant": an input keeps its value until the next sample; "linear": it runs
             straight to the next value; or one of them by the input's name.
-        validate: records for which only the initial state is fitted.
+        validate: held-out records, of which at most the initial state is estimated.
+        validate_state: where that comes from. "known": it is the plant's; "first": from the first
+            measurements, where the outputs at one time determine it; 0.1 (or "10%"): estimated
+            from this share of the record, which does not count in the fit; 1.0: from all of it,
+            which counts. "auto": known where the sidecar says so, otherwise from the first
+            measurements, otherwise from a share of 10 %.
+        progress: called with a text, how much is done, and the total.
         columns: names in the files where they are not the plant's: {"pitch": "qm"}.
         scales: factors from the files' units to the plant's: {"pitch": 0.01745}.
         units: the files' units where they are not the plant's: {"time": "ms", "pitch": "deg"}.
@@ -165,6 +177,7 @@ def identify(
     uncertain_sd = _uncertain(plant, estimator, uncertain)
     if initial_state not in get_args(InitialState):
         raise ValueError(f"initial state {initial_state!r} is not one of: known, free, auto")
+    progress("reading", 0.0, 1.0)
     read = partial(
         read_record,
         description=plant.description,
@@ -183,6 +196,7 @@ def identify(
         initial_state == "auto" and all(_starts_at(record, plant) for record in records)
     )
     _require_enough(plant, records, int(np.sum(~_known(plant, estimator))), known)
+    shares = [_state_from(record, plant, validate_state) for record in validation]
     for record in validation:
         _require_enough(plant, [record], 0, False)
     linear = _linear_inputs(plant, hold_input)
@@ -191,7 +205,8 @@ def identify(
     plant = _sampled_as([*records, *validation], plant)
     known = known and all(len(parts_of(record)) == 1 for record in records)
     experiments = _experiments(plant, records, known, linear)
-    fit = _fit(plant, experiments, estimator, begin)
+    progress("first search", 0.05, 1.0)
+    fit = _fit(plant, experiments, estimator, begin, progress)
     residual = _residuals(plant, records, experiments, estimator, fit)
     fitted = _fitted_all(plant, records, experiments, fit.estimate, residual)
     if isinstance(estimator, NLS) and not fit.has_ended_in(Status.NOT_FINITE):
@@ -209,8 +224,9 @@ def identify(
     )
     wrong = _wrong_structure(structure, estimator) if fit.is_successful else ()
     others = tuple(s for record in [*records, *validation] for s in _other_plant(record, plant))
-    found = _suspects(plant, records, experiments, estimator, begin, fit, linear)
-    verdict = (*others, *wrong, *_remedies(found), *_agreement(fit), *verdict)
+    found = _suspects(plant, records, experiments, estimator, begin, fit, linear, progress)
+    large = _above_declared(plant, fit) if fit.is_successful else ()
+    verdict = (*others, *wrong, *large, *_remedies(found), *_agreement(fit), *verdict)
     names, d = names_of(plant.definition.parameters), plant.description
     values = np.array([float(value) for value in fit.estimate.params])
     sd = np.where(fit.free, np.sqrt(np.maximum(np.diag(covariance), 0.0)), np.nan)
@@ -218,7 +234,15 @@ def identify(
     ends = np.stack([values - half, values + half], axis=1)
     if intervals == "profile" and isinstance(estimator, NLS) and fit.is_successful:
         estimate = jax.device_put(fit.estimate)
-        ends = profile_intervals(plant, experiments, estimator, estimate, fit.free, half)
+        ends = profile_intervals(
+            plant,
+            experiments,
+            estimator,
+            estimate,
+            fit.free,
+            half,
+            lambda text, done, total: progress(text, 0.8 + 0.2 * done / total, 1.0),
+        )
         verdict = (*verdict, *_open_sides(plant.definition, ends))
     return Identification(
         plant=d,
@@ -236,7 +260,8 @@ def identify(
         suspects=found,
         fitted=fitted,
         validation=tuple(
-            _validated(plant, record, linear, estimator, fit.estimate) for record in validation
+            _validated(plant, record, linear, estimator, fit.estimate, share)
+            for record, share in zip(validation, shares, strict=True)
         ),
         initial_state_known=known,
         noise=_noise(plant.definition, fit.estimate),
@@ -532,16 +557,17 @@ def _fit(
     experiments: Experiments,
     estimator: AbstractEstimator,
     start: Params,
+    progress: Progress,
 ) -> _Fit:
     """Fits; parameters that were held are tested once more, from the estimate.
 
     Far from the true values a search can end at an estimate where the outputs hardly depend
     on a parameter, although the data determine it.
     """
-    fit = _fit_seen(plant, experiments, estimator, start)
+    fit = _fit_seen(plant, experiments, estimator, start, progress)
     if not (fit.reasons and fit.is_successful):
         return fit
-    again = _fit_seen(plant, experiments, estimator, fit.estimate.params)
+    again = _fit_seen(plant, experiments, estimator, fit.estimate.params, progress)
     return again if again.is_successful and again.free.sum() > fit.free.sum() else fit
 
 
@@ -550,12 +576,13 @@ def _fit_seen(
     experiments: Experiments,
     estimator: AbstractEstimator,
     start: Params,
+    progress: Progress,
 ) -> _Fit:
     """Fits; holds a parameter that ends at a bound or is not identifiable, and fits again."""
     names = names_of(plant.definition.parameters)
     known = _known(plant, estimator)
     free, reasons = ~known, ()
-    found = _estimate(plant, experiments, estimator, start, free)
+    found = _estimate(plant, experiments, estimator, start, free, progress)
     while True:
         fit = _Fit(found[0], free, known, reasons, found[1:])
         # ARX estimates all parameters or none.
@@ -572,7 +599,7 @@ def _fit_seen(
         reasons = (*reasons, why)
         if not free.any():
             raise ValueError(_NOTHING_SEEN)
-        found = _estimate(plant, experiments, estimator, start, free, [last])
+        found = _estimate(plant, experiments, estimator, start, free, progress, [last])
 
 
 def _estimate(
@@ -581,6 +608,7 @@ def _estimate(
     estimator: AbstractEstimator,
     start: Params,
     free: np.ndarray,
+    progress: Progress,
     others: Sequence[Params] | None = None,
 ) -> list[Estimate]:
     """Estimates, the best first; the search is repeated where it may have missed the best one.
@@ -593,8 +621,10 @@ def _estimate(
         return jax.device_get(estimator(plant, experiments, *jax.device_put((start, free))))
 
     if isinstance(estimator, PEM):  # it begins where least squares ends
-        first = _estimate(plant, experiments, NLS(known=estimator.known), start, free, others)
+        least_squares = NLS(known=estimator.known)
+        first = _estimate(plant, experiments, least_squares, start, free, progress, others)
         start = first[0].params
+        progress("prediction error", 0.4, 1.0)
     found = [search(estimator, start)]
     if not isinstance(estimator, NLS):
         return found
@@ -602,7 +632,15 @@ def _estimate(
     is_in_doubt = size < _TELLING or not _is_noise(plant, experiments, found[0])
     if size <= _SIZE_OF_MANY_STARTS and is_in_doubt:
         others = _starts_around(plant, start, free) if others is None else others
-        found += [search(estimator, other) for other in others]
+        for i, other in enumerate(others):
+            best = min(found, key=quality)
+            progress(
+                f"search from start {i + 2} of {len(others) + 1} (best sum of squares "
+                f"{float(best.cost):.6g}, found in {int(best.steps)} steps)",
+                0.1 + 0.4 * i / len(others),
+                1.0,
+            )
+            found.append(search(estimator, other))
         found.sort(key=quality)
     length = estimator.length_of_segments(plant, num_samples)
     while int(found[0].status) == Status.ITERATIONS_EXHAUSTED and length < num_samples:
@@ -721,7 +759,8 @@ def _confidence(
     if isinstance(estimator, NLS) and estimator.prior is not None:
         rows = [names.index(name) for name in estimator.prior.names]
         values = dict(zip(names, map(float, fit.estimate.params), strict=True))
-        remarks += estimator.prior.verdict(values, covariance[np.ix_(rows, rows)])
+        white = np.asarray(fit.estimate.covariance)
+        remarks += estimator.prior.verdict(values, white[np.ix_(rows, rows)])
     return covariance, degrees, (*fit.reasons, seen, *remarks)
 
 
@@ -842,7 +881,7 @@ def _wrong_structure(
     structure: Mapping[str, float], estimator: AbstractEstimator
 ) -> tuple[str, ...]:
     """A sentence where a residual follows the input."""
-    wrong = [name for name, p in structure.items() if p < RARE]
+    wrong = [name for name, p in structure.items() if p < RARE / len(structure)]
     if not wrong:
         return ()
     or_biased = (
@@ -855,6 +894,18 @@ def _wrong_structure(
     )
 
 
+def _above_declared(plant: AbstractPlant, fit: _Fit) -> tuple[str, ...]:
+    """A sentence on each output whose residual is far larger than its declared noise."""
+    residual, declared = np.asarray(fit.estimate.residual), np.asarray(plant.sensor.sd)
+    size = np.sqrt(np.sum(residual**2, axis=(0, 1)) / np.sum(residual != 0, axis=(0, 1)).clip(1))
+    return tuple(
+        f"the residual of {part.name} is {own / sd:.3g} times its declared noise ({own:.3g} for "
+        f"{sd:.3g} {part.unit}): the plant leaves something out, or the declaration is wrong"
+        for part, own, sd in zip(plant.definition.outputs, size, declared, strict=True)
+        if sd > 0 and own > _FAR_ABOVE * sd
+    )
+
+
 def _suspects(
     plant: AbstractPlant,
     records: Sequence[Record],
@@ -863,9 +914,12 @@ def _suspects(
     start: Params,
     fit: _Fit,
     linear: np.ndarray,
+    progress: Progress,
 ) -> tuple[Suspect, ...]:
     """What the plant may leave out, where more than noise is left; not for long records."""
     if not isinstance(estimator, NLS) or not fit.is_successful:
+        return ()
+    if estimator.likelihood != "normal":  # outliers would hide them
         return ()
     if experiments.valid.size > _SIZE_OF_SUSPECTS:
         return ()
@@ -879,7 +933,16 @@ def _suspects(
     )
     stacked = partial(_experiments, plant, records, experiments.initial_state_known)
     return suspects(
-        plant, experiments, stacked, linear, estimator, start, fit.estimate, ~fit.known, word
+        plant,
+        experiments,
+        stacked,
+        linear,
+        estimator,
+        start,
+        fit.estimate,
+        ~fit.known,
+        word,
+        lambda text, done, total: progress(text, 0.5 + 0.3 * done / total, 1.0),
     )
 
 
@@ -915,17 +978,80 @@ def _require_explanation(
         raise ValueError(_NOTHING_SEEN)
 
 
+def _state_from(record: Record, plant: AbstractPlant, word: str | float) -> float | None:
+    """Share of a held-out record that gives its initial state, 0 its first sample; None: known."""
+    where, parts = record.source or "the record", parts_of(record)
+    if word == "known" and len(parts) > 1:
+        raise ValueError(f"{where} has gaps in time; the state after a gap is not known")
+    if word == "known" or (word == "auto" and len(parts) == 1 and _starts_at(record, plant)):
+        return None
+    is_measured = all(np.isfinite(record.outputs[part.start]).all() for part in parts)
+    if word in ("first", "auto") and is_measured and _outputs_give_state(plant):
+        return 0.0
+    if word == "first":
+        raise ValueError(
+            f"the first outputs of {where} do not determine the state of plant "
+            f"{plant.definition.name!r}; give the share of the record from which it is estimated, "
+            "such as 10%"
+        )
+    if word == "auto":
+        return _SHARE
+    try:
+        is_part = isinstance(word, str) and word.endswith("%")
+        share = float(str(word).removesuffix("%")) * (0.01 if is_part else 1.0)
+    except ValueError:
+        share = math.nan
+    if not 0 < share <= 1:
+        raise ValueError(
+            f"validate_state must be auto, known, first or a share such as 10%: got {word!r}"
+        )
+    return share
+
+
+def _outputs_give_state(plant: AbstractPlant) -> bool:
+    """Whether the outputs at one time determine the state, at the initial state."""
+    scales = np.array([s.scale for s in plant.definition.states])
+    slope = np.asarray(jax.jacfwd(plant.output)(plant.initial_state, plant.nominal)) * scales
+    slope = slope / np.array([o.scale for o in plant.definition.outputs])[:, None]
+    return bool(np.linalg.matrix_rank(slope, 1e-6) == len(scales))
+
+
 def _validated(
     plant: AbstractPlant,
     record: Record,
     linear: np.ndarray,
     estimator: AbstractEstimator,
     estimate: Estimate,
+    share: float | None,
 ) -> Fitted:
-    """A record with its simulation and prediction; only its initial state is fitted."""
+    """A held-out record with its simulation and prediction; `share`: see `_state_from`."""
     experiments, prediction = _experiments(plant, [record], False, linear), None
     if isinstance(estimator, PEM) and estimate.prediction is not None:
         found = jax.device_put((estimate.params, estimate.prediction))
         prediction = jax.device_get(estimator.predict(plant, experiments, *found))
-    (residual,) = _by_record([record], _simulation_error(plant, experiments, estimate.params))
-    return _fitted(plant.definition, record, residual, *_predicted(plant, [record], prediction))
+    begun, valid = experiments, np.asarray(experiments.valid)
+    used = np.zeros(valid.shape, bool)
+    if share is not None:
+        counts = valid.any(2).cumsum(1)
+        used = valid & (counts <= np.ceil(counts[:, -1:] * share).clip(1))[..., None]
+        begun = dataclasses.replace(experiments, valid=jax.device_put(used))
+        initial = _with_initial_state(plant, begun, estimate.params).initial_state
+        begun = dataclasses.replace(experiments, initial_state=jax.device_put(initial))
+    begun = dataclasses.replace(begun, initial_state_known=True)
+    (residual,) = _by_record([record], _simulation_error(plant, begun, estimate.params))
+    (spent,) = _by_record([record], (used if share != 1 else ~valid).astype(float))
+    fitted = _fitted(plant.definition, record, residual, *_predicted(plant, [record], prediction))
+    scored = dataclasses.replace(record, outputs=np.where(spent == 0, record.outputs, np.nan))
+    fits = _fits(plant.definition, scored, fitted.simulated)
+    return dataclasses.replace(fitted, fit_percent=fits, initial_state=_in_words(share))
+
+
+def _in_words(share: float | None) -> str:
+    """Where the initial state of a held-out record comes from."""
+    if share is None:
+        return "known initial state"
+    if share == 0:
+        return "initial state from the first measurements"
+    if share == 1:
+        return "initial state estimated from the whole record"
+    return f"initial state estimated from the first {100 * share:.3g} %, which do not count"

@@ -308,8 +308,9 @@ class MultipleShooting:
         is_followed = block.is_followed[..., None]
         misfit = jnp.where(block.valid, outputs - block.measured, 0.0)
         if self.student is not None:
-            root, its_slope = student_root(misfit / self.student)
-            misfit, slope = self.student * root, slope * its_slope[..., None]
+            scale = self.student[None, None, None]
+            root, its_slope = student_root(misfit / scale)
+            misfit, slope = scale * root, slope * its_slope[..., None]
         return Shots(
             misfit=misfit,
             misfit_slope=jnp.where(block.valid[..., None], slope, 0.0),
@@ -584,8 +585,8 @@ class MultipleShooting:
         rounding: Float[Array, ""],
         tolerance: float,
         max_steps: int,
-    ) -> tuple[Point, Sweep, Bool[Array, ""]]:
-        """The minimum, its sweep, and whether the search converged.
+    ) -> tuple[Point, Sweep, Bool[Array, ""], Int[Array, ""]]:
+        """The minimum, its sweep, whether the search converged, and its steps.
 
         Args:
             start: near the minimum, or `matched`.
@@ -660,7 +661,8 @@ class MultipleShooting:
         # The last step is taken too; it is too small for the sweep to change.
         point = where_tree(found.converged, found.here, found.best)
         is_idle = found.gained <= _IDLE * found.cost / count
-        return point, found.sweep, found.converged | (found.steps == max_steps) & is_idle
+        converged = found.converged | (found.steps == max_steps) & is_idle
+        return point, found.sweep, converged, found.steps
 
 
 FREEDOM = 4.0

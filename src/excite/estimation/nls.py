@@ -13,7 +13,7 @@ from typing import Literal, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ..description import names_of
 from ..information import relative_size
@@ -129,7 +129,8 @@ class NLS(AbstractSearch):
         if self.prior is None:
             return found
         size, names = relative_size(plant, estimate.params), names_of(plant.definition.parameters)
-        rows = jax.jacfwd(self.prior.residual, argnums=1)(names, jnp.stack(estimate.params)) * size
+        rows = jax.jacfwd(self.prior.residual, argnums=1)(names, jnp.stack(estimate.params))
+        rows = rows * size[None]
         return found.at[: len(names), : len(names)].set(rows.T @ rows)
 
     @property
@@ -204,7 +205,7 @@ class NLS(AbstractSearch):
             return MultipleShooting(plant, segments, problem.params, is_free, prior, student)
 
         def search(start: Point, sd: Array, student: Array | None = None) -> _Found:
-            point, sweep, converged = shooting(student).solve(
+            point, sweep, converged, steps = shooting(student).solve(
                 start,
                 sd,
                 rounding=jnp.min(problem.rounding / sd),
@@ -213,7 +214,7 @@ class NLS(AbstractSearch):
             )
             sweep = sweep if student is None else shooting().sweep(point)
             misfit = sweep.misfit.reshape(segments.shape[0], -1, problem.num_outputs)
-            return _Found(point, converged, sweep.triangles, -misfit[:, :num_samples], sd)
+            return _Found(point, converged, sweep.triangles, -misfit[:, :num_samples], sd, steps)
 
         def again(found: _Found) -> _Found:
             sd = found.sd if self.noise == "known" else self.scale(problem, found.residual)
@@ -239,7 +240,7 @@ class NLS(AbstractSearch):
         size = jnp.where(problem.experiments.valid, jnp.abs(residual), jnp.nan)
         begin = jnp.nanmedian(size.reshape(-1, size.shape[2]), axis=0)
 
-        def improved(_: int, sd: Array) -> Array:
+        def improved(_: Array, sd: Array) -> Array:
             u2 = (residual / sd[None, None]) ** 2
             weighted = (FREEDOM + 1) / (FREEDOM + u2) * residual**2
             found = jnp.sqrt(jnp.sum(weighted, axis=(0, 1)) / problem.degrees)
@@ -256,13 +257,14 @@ class NLS(AbstractSearch):
 
 
 class _Found(NamedTuple):
-    """The end of a search: point, triangle of each output, residual, and the assumed noise."""
+    """The end of a search: point, triangle of each output, residual, assumed noise, steps."""
 
     point: Point
     converged: Bool[Array, ""]
     triangles: Float[Array, "experiment output column column"]
     residual: Float[Array, "experiment sample output"]
     sd: Float[Array, " output"]
+    steps: Int[Array, ""]
 
 
 class Problem(eqx.Module):
@@ -398,6 +400,7 @@ class Problem(eqx.Module):
             initial_state=initial_state,
             residual=found.residual,
             cost=cost,
+            steps=found.steps,
             degrees=jnp.full_like(degrees, jnp.inf) if noise_is_known else degrees,
         )
 

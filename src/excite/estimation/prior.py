@@ -11,8 +11,6 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from functools import cache
-from pathlib import Path
-from typing import TypeAlias
 
 import equinox as eqx
 import jax
@@ -20,19 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..description import RARE, Parameter, names_of, unknown, wrong_type
-from ..files import read_json
+from ..description import RARE, Parameter
 from ..plant import AbstractPlant, Params
 from .diagnosis import chi2_tail
-from .result import Identification
 
-_FORMS = "normal:MEAN:SD, lognormal:MEDIAN:SD or uniform:LOWEST:HIGHEST"
-_ALLOWED = f"a dict by parameter ({_FORMS}), a run folder, a result of identify, or several"
-_ADVICE = "give a run folder of `excite identify`, or a file with `mean` and `covariance`"
 _LITTLE = 0.9  # of a prior's standard deviation; data that leave more of it tell little
-
-PriorLike: TypeAlias = "Mapping[str, str] | str | Path | Identification | Prior"
-"""Distributions by parameter ("normal:0.022:5%"), an earlier run, or a joint distribution."""
 
 
 class Prior(eqx.Module):
@@ -71,10 +61,13 @@ class Prior(eqx.Module):
                 f"{spread.shape}"
             )
         size = np.sqrt(np.maximum(np.diag(spread), 0.0))
-        correlation = spread / np.outer(size, size) if np.all(size > 0) else np.full_like(spread, 2)
-        is_symmetric = np.allclose(spread, spread.T, rtol=1e-6, atol=0)
-        if not (np.isfinite(center).all() and np.isfinite(correlation).all() and is_symmetric):
-            raise ValueError(f"the prior of {', '.join(names)} must be finite and symmetric")
+        is_sound = np.isfinite(center).all() and np.isfinite(spread).all() and np.all(size > 0)
+        if not (is_sound and np.allclose(spread, spread.T, rtol=1e-6, atol=0)):
+            raise ValueError(
+                f"the prior of {', '.join(names)} must be finite, its covariance symmetric with "
+                "variances above 0"
+            )
+        correlation = spread / np.outer(size, size)
         if np.linalg.eigvalsh(correlation)[0] < 1e-12:
             raise ValueError(
                 f"the covariance of the prior of {', '.join(names)} is not positive definite"
@@ -118,7 +111,7 @@ class Prior(eqx.Module):
 
         Args:
             values: estimated parameters.
-            covariance: of the estimates of this prior's parameters.
+            covariance: of the estimates of this prior's parameters, for white noise.
         """
         own = np.array([values[name] for name in self.names])
         is_log = np.array(self.logarithmic)
@@ -131,139 +124,26 @@ class Prior(eqx.Module):
         gained = np.diag(before) - np.diag(after)
         for i, name in enumerate(self.names):
             ratio = math.sqrt(max(after[i, i], 0.0) / before[i, i])
-            if 0 < gained[i] and chi2_tail(1, float(moved[i] ** 2 / gained[i])) < RARE:
+            if gained[i] > 0 and chi2_tail(1, float(moved[i] ** 2 / gained[i])) < RARE:
                 told.append(f"the data contradict the prior of {name}")
             elif ratio > _LITTLE:
                 told.append(f"{name} rests on its prior; the data tell little of it")
         return tuple(told)
 
 
-def with_prior(
-    plant: AbstractPlant,
-    given: PriorLike | Sequence[PriorLike] | None,
-    start: Params,
-) -> tuple[AbstractPlant, Prior | None]:
-    """The plant, bounded by uniform priors, and all other priors as one.
-
-    Raises:
-        ValueError: for a prior that is none, or excludes the start.
-        TypeError: for something else.
-    """
-    if given is None:
-        return plant, None
-    is_one = isinstance(given, Mapping | str | Path | Identification | Prior)
-    if not is_one and not isinstance(given, Sequence):
-        raise wrong_type("prior", given, _ALLOWED)
-    normal: list[Prior] = []
-    bounds: dict[str, tuple[float, float]] = {}
-    for one in [given] if is_one else given:
-        if isinstance(one, Mapping):
-            for name, text in one.items():
-                kind, a, b = _parsed(name, text, plant)
-                if kind == "uniform":
-                    bounds[name] = a, b
-                else:
-                    is_log = kind == "lognormal"
-                    mean = math.log(a) if is_log else a
-                    normal.append(Prior.normal([name], [mean], [[b**2]], [is_log]))
-        elif isinstance(one, Identification):
-            normal.append(_from_run(plant, one.to_dict(), "the result"))
-        elif isinstance(one, str | Path):
-            normal.append(_read(plant, Path(one)))
-        elif isinstance(one, Prior):
-            _require_names(plant, one.names)
-            normal.append(one)
-        else:
-            raise wrong_type("prior", one, _ALLOWED)
-    joint = Prior.joined(normal) if normal else None
-    for name in joint.names if joint else ():
-        if name in bounds:
-            raise ValueError(f"parameter {name!r} has two priors; give one")
-    return _bounded(plant, bounds, start), joint
-
-
-def _require_names(plant: AbstractPlant, names: Sequence[str]) -> None:
-    own = names_of(plant.definition.parameters)
-    for name in names:
-        if name not in own:
-            raise unknown(f"{plant.definition.name} parameter", name, own)
-
-
-def _parsed(name: str, text: object, plant: AbstractPlant) -> tuple[str, float, float]:
-    """Kind of a prior, and its two numbers."""
-    _require_names(plant, [name])
-    kind, *words = str(text).strip().split(":")
-    wrong = ValueError(f"prior of {name!r} must be {_FORMS}: got {text!r}")
-    if kind not in ("normal", "lognormal", "uniform") or len(words) != 2:
-        raise wrong
-    try:
-        first, is_part = float(words[0]), words[1].endswith("%")
-        second = float(words[1].removesuffix("%"))
-    except ValueError:
-        raise wrong from None
-    if is_part:
-        second *= 0.01 if kind == "lognormal" else 0.01 * abs(first)
-    is_ordered = first < second if kind == "uniform" else second > 0
-    is_allowed = first > 0 if kind == "lognormal" else not (is_part and kind == "uniform")
-    if not (math.isfinite(first) and math.isfinite(second) and is_ordered and is_allowed):
-        raise wrong
-    if kind == "lognormal" and not _parameter(plant, name).positive:
-        raise ValueError(f"{name!r} may be negative and has no lognormal prior; give a normal one")
-    return kind, first, second
-
-
-def _parameter(plant: AbstractPlant, name: str) -> Parameter:
+def parameter_of(plant: AbstractPlant, name: str) -> Parameter:
+    """A plant's parameter by name."""
     return next(p for p in plant.definition.parameters if p.name == name)
 
 
-def _read(plant: AbstractPlant, path: Path) -> Prior:
-    """A prior from a run folder, or from a file with mean and covariance."""
-    if path.is_dir():
-        return _from_run(plant, read_json(path / "estimate.json", advice=_ADVICE), str(path))
-    data = read_json(path, "mean", "covariance", advice=_ADVICE)
-    if not isinstance(data["mean"], dict):
-        raise ValueError(f"{path}: mean must be an object by parameter: got {data['mean']!r}")
-    _require_names(plant, list(data["mean"]))
-    try:
-        return Prior.normal(list(data["mean"]), list(data["mean"].values()), data["covariance"])
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: {error}") from None
-
-
-def _from_run(plant: AbstractPlant, result: Mapping[str, object], where: str) -> Prior:
-    """The estimates of an earlier run that this plant has; positive ones by their logarithm."""
-    try:
-        params, correlation = dict(result["params"]), result["correlation"]  # pyright: ignore
-        names = [
-            name
-            for name, p in params.items()
-            if name in names_of(plant.definition.parameters) and not p["held"]
-        ]
-        index = [list(params).index(name) for name in names]
-        values = np.array([params[name]["estimate"] for name in names], float)
-        sd = np.array([params[name]["std_error"] for name in names], float)
-        correlated = np.array(correlation, float)[np.ix_(index, index)]
-    except (KeyError, TypeError, ValueError, IndexError):
-        raise ValueError(f"{where} is no result of identify; {_ADVICE}") from None
-    if not names:
-        raise ValueError(f"{where} has no estimated parameter of plant {plant.definition.name!r}")
-    is_log = [_parameter(plant, name).positive for name in names]
-    relative = sd / np.where(is_log, values, 1.0)
-    mean = np.where(is_log, np.log(np.where(is_log, values, 1.0)), values)
-    try:
-        return Prior.normal(names, mean, correlated * np.outer(relative, relative), is_log)
-    except ValueError as error:
-        raise ValueError(f"{where} is no prior: {error}") from None
-
-
-def _bounded(
+def bounded(
     plant: AbstractPlant, bounds: Mapping[str, tuple[float, float]], start: Params
 ) -> AbstractPlant:
-    """The plant with bounds of parameters."""
+    """The plant with bounds of parameters; ValueError where they exclude the start."""
     if not bounds:
         return plant
     for name, (lower, upper) in bounds.items():
-        part, value = _parameter(plant, name), float(getattr(start, name))
+        part, value = parameter_of(plant, name), float(getattr(start, name))
         if not lower < value < upper:
             raise ValueError(
                 f"the search begins at {name} = {value:g} {part.unit}, outside its uniform prior "

@@ -36,6 +36,7 @@ def profile_intervals(
     estimate: Estimate,
     free: Bool[np.ndarray, " param"],
     half: Float[np.ndarray, " param"],
+    progress: Callable[[str, float, float], None] = lambda *_: None,
 ) -> Float[np.ndarray, "param end"]:
     """Both ends of each free parameter's interval, infinite where it stays open; NaN if held.
 
@@ -44,12 +45,15 @@ def profile_intervals(
     Args:
         half: of the intervals by standard errors. They set the limits, so that both kinds agree
             for a plant that is linear in its parameters.
+        progress: called with a text, how many parameters are done, and their number.
     """
     if estimator.finds_noise:  # the weights of the estimate are kept
         sd = np.asarray(estimator.weights(plant, experiments, estimate))
         plant = plant.changed(sensor=Sensor(floats(sd), floats(0 * sd)))
         estimator = dataclasses.replace(estimator, noise="known")
-    S, _ = map(np.asarray, estimator.sensitivity(plant, experiments, estimate, jax.device_put(free)))
+    S, _ = map(
+        np.asarray, estimator.sensitivity(plant, experiments, estimate, jax.device_put(free))
+    )
     prior = np.asarray(estimator.prior_information(plant, estimate, S.shape[-1]))
     unit = np.sqrt(np.diag(inverse_information(S, prior)))[: len(free)]
     size = np.abs(np.asarray(relative_size(plant, estimate.params)))
@@ -74,6 +78,7 @@ def profile_intervals(
 
     for index in np.flatnonzero(free):
         part, value = plant.definition.parameters[index], float(estimate.params[index])
+        progress(f"profile of {part.name}", int(index), len(free))
         limit = (half[index] / (unit[index] * size[index])) ** 2
         for side, sign in enumerate((-1, 1)):
             ends[index, side] = _end(part, value, sign, half[index], limit, excess_of(int(index)))

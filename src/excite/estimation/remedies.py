@@ -117,6 +117,7 @@ def suspects(
     estimate: Estimate,
     free: Bool[np.ndarray, " param"],
     plant_word: str,
+    progress: Callable[[str, float, float], None] = lambda *_: None,
 ) -> tuple[Suspect, ...]:
     """The suspects that explain more than chance, the likeliest first.
 
@@ -129,6 +130,7 @@ def suspects(
         estimate: without suspects.
         free: which parameters were estimated.
         plant_word: the plant on the command line.
+        progress: called with a text, how many suspects are fitted, and their number.
     """
     names = [name for name in extensions_of(plant) if not name.startswith("bias_")]
     whole, valid = extended(plant, names), np.asarray(experiments.valid)
@@ -148,7 +150,9 @@ def suspects(
         )
 
     found = [] if (tails := outliers(before, valid)) is None else [tails]
+    total = len(linear) + _MOST_FITTED
     for i, channel in enumerate(names_of(plant.definition.inputs)):
+        progress(f"likely causes: {channel} between samples", i, total)
         other = linear ^ (np.arange(len(linear)) == i)
         data, word = stacked(other), HOLDS[int(other[i])]
         ended = [
@@ -160,7 +164,8 @@ def suspects(
     sd = np.asarray(estimator.weights(plant, experiments, jax.device_put(estimate)))
     search = _Search(plant, whole, experiments, start, estimate, free, sd)
     trials = [_Trial(n, v) for n in names for v in _tried(whole, n, experiments.inputs)]
-    for trial in search.promising(trials):
+    for i, trial in enumerate(search.promising(trials), len(linear)):
+        progress(f"likely causes: {trial.name}", i, total)
         value, std_error, after = search.best(trial)
         remedy, freedoms = f"--plant {plant_word}+{trial.name}", 1 + trial.name.startswith("drift_")
         named = suspect(trial.name, after, remedy, freedoms)
@@ -400,7 +405,7 @@ def outliers(residual: Residual, valid: np.ndarray) -> Suspect | None:
     p = chi2_tail(residual.shape[2], 2 * gained)
     if p > RARE or not count:
         return None
-    remedy = f"{count} samples are more than {_FAR:g} standard deviations off: leave them empty"
+    remedy = f"{count} samples are more than {_FAR:g} standard deviations off: --likelihood student"
     return Suspect("outliers", None, None, "", math.nan, gained, p, remedy)
 
 

@@ -18,12 +18,12 @@ from ..record.rows import USABLE, EstimateSummary
 from ..record.table import data_frame
 from ..report.results import identification_html, identification_text, wrapped
 from .diagnosis import correlation, fit_percent
+from .remedies import Suspect
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
-    from .remedies import Suspect
 
 @dataclass(frozen=True)
 class Predicted:
@@ -64,12 +64,14 @@ class Fitted:
         simulated: noise-free outputs of the estimated plant.
         fit_percent: by output, 100 (1 - |y - y_s| / |y - mean y|).
         predicted: one step ahead, with `pem`; otherwise None.
+        initial_state: where that of a held-out record comes from.
     """
 
     record: Record
     simulated: Float[np.ndarray, "sample output"]
     fit_percent: Mapping[str, float]
     predicted: Predicted | None = None
+    initial_state: str = ""
 
     @property
     def model(self) -> Float[np.ndarray, "sample output"]:
@@ -213,7 +215,12 @@ class Identification:
             },
             "fit_percent": self.fit(),
             "validation": [
-                {"file": f.record.source, "fit_percent": dict(f.fit_percent), **_prediction(f)}
+                {
+                    "file": f.record.source,
+                    "fit_percent": dict(f.fit_percent),
+                    "initial_state": f.initial_state,
+                    **_prediction(f),
+                }
                 for f in self.validation
             ],
             "files": [f.record.source for f in self.fitted],

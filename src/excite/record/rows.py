@@ -279,6 +279,7 @@ class HeldOut(Saved):
 
     file: str
     fit_percent: dict[str, Number]
+    initial_state: str = ""
     prediction_fit_percent: dict[str, Number] | None = None
     inside_band_percent: dict[str, Number] | None = None
 

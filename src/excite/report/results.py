@@ -52,9 +52,9 @@ def _judgement(result: EstimateSummary) -> list[str]:
         for name in result.fit_percent
     ]
     lines += [
-        f"{v.file}: held-out {name} {_fits(v, name)}"
+        f"{v.file}: held-out {name} {_fits(v, name)}" + (f", {v.initial_state}" if i == 0 else "")
         for v in result.validation
-        for name in v.fit_percent
+        for i, name in enumerate(v.fit_percent)
     ]
     if result.process_noise is not None and result.measurement_noise is not None:
         lines.append(

@@ -1,0 +1,133 @@
+"""Priors as a user gives them: distributions in words, runs of other records, files."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+
+from ..description import names_of, unknown, wrong_type
+from ..files import read_json
+from ..plant import AbstractPlant, Params
+from ..record.rows import EstimateSummary
+from .prior import Prior, bounded, parameter_of
+from .result import Identification
+
+_FORMS = "normal:MEAN:SD, lognormal:MEDIAN:SD or uniform:LOWEST:HIGHEST"
+_ALLOWED = f"a dict by parameter ({_FORMS}), a run folder, a result of identify, or several"
+_ADVICE = "give a run folder of `excite identify`, or a file with `mean` and `covariance`"
+
+PriorLike: TypeAlias = Mapping[str, str] | str | Path | Identification | Prior
+"""Distributions by parameter ("normal:0.022:5%"), an earlier run, or a joint distribution."""
+
+
+def with_prior(
+    plant: AbstractPlant,
+    given: PriorLike | Sequence[PriorLike] | None,
+    start: Params,
+) -> tuple[AbstractPlant, Prior | None]:
+    """The plant, bounded by uniform priors, and all other priors as one.
+
+    Raises:
+        ValueError: for a prior that is none, or excludes the start.
+        TypeError: for something else.
+    """
+    if given is None:
+        return plant, None
+    is_one = isinstance(given, Mapping | str | Path | Identification | Prior)
+    if not is_one and not isinstance(given, Sequence):
+        raise wrong_type("prior", given, _ALLOWED)
+    normal: list[Prior] = []
+    bounds: dict[str, tuple[float, float]] = {}
+    for one in [given] if is_one else given:
+        if isinstance(one, Mapping):
+            for name, text in one.items():
+                kind, a, b = _parsed(name, text, plant)
+                if kind == "uniform":
+                    bounds[name] = a, b
+                else:
+                    is_log = kind == "lognormal"
+                    mean = math.log(a) if is_log else a
+                    normal.append(Prior.normal([name], [mean], [[b**2]], [is_log]))
+        elif isinstance(one, Identification):
+            normal.append(_from_run(plant, one.summary(), "the result"))
+        elif isinstance(one, str | Path):
+            normal.append(_read(plant, Path(one)))
+        elif isinstance(one, Prior):
+            _require_names(plant, one.names)
+            normal.append(one)
+        else:
+            raise wrong_type("prior", one, _ALLOWED)
+    joint = Prior.joined(normal) if normal else None
+    for name in joint.names if joint else ():
+        if name in bounds:
+            raise ValueError(f"parameter {name!r} has two priors; give one")
+    return bounded(plant, bounds, start), joint
+
+
+def _require_names(plant: AbstractPlant, names: Sequence[str]) -> None:
+    own = names_of(plant.definition.parameters)
+    for name in names:
+        if name not in own:
+            raise unknown(f"{plant.definition.name} parameter", name, own)
+
+
+def _parsed(name: str, text: object, plant: AbstractPlant) -> tuple[str, float, float]:
+    """Kind of a prior, and its two numbers."""
+    _require_names(plant, [name])
+    kind, *words = str(text).strip().split(":")
+    wrong = ValueError(f"prior of {name!r} must be {_FORMS}: got {text!r}")
+    if kind not in ("normal", "lognormal", "uniform") or len(words) != 2:
+        raise wrong
+    try:
+        first, is_part = float(words[0]), words[1].endswith("%")
+        second = float(words[1].removesuffix("%"))
+    except ValueError:
+        raise wrong from None
+    if is_part:
+        second *= 0.01 if kind == "lognormal" else 0.01 * abs(first)
+    is_ordered = first < second if kind == "uniform" else second > 0
+    is_allowed = first > 0 if kind == "lognormal" else not (is_part and kind == "uniform")
+    if not (math.isfinite(first) and math.isfinite(second) and is_ordered and is_allowed):
+        raise wrong
+    if kind == "lognormal" and not parameter_of(plant, name).positive:
+        raise ValueError(f"{name!r} may be negative and has no lognormal prior; give a normal one")
+    return kind, first, second
+
+
+def _read(plant: AbstractPlant, path: Path) -> Prior:
+    """A prior from a run folder, or from a file with mean and covariance."""
+    if path.is_dir():
+        return _from_run(plant, EstimateSummary.read(path / "estimate.json", _ADVICE), str(path))
+    data = read_json(path, "mean", "covariance", advice=_ADVICE)
+    if not isinstance(data["mean"], dict):
+        raise ValueError(f"{path}: mean must be an object by parameter: got {data['mean']!r}")
+    _require_names(plant, list(data["mean"]))
+    try:
+        return Prior.normal(list(data["mean"]), list(data["mean"].values()), data["covariance"])
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def _from_run(plant: AbstractPlant, result: EstimateSummary, where: str) -> Prior:
+    """The estimates of an earlier run that this plant has; positive ones by their logarithm."""
+    own = names_of(plant.definition.parameters)
+    index = [i for i, (n, p) in enumerate(result.params.items()) if n in own and not p.held]
+    if not (index and result.is_usable):
+        raise ValueError(f"{where} has no estimated parameter of plant {plant.definition.name!r}")
+    names = [list(result.params)[i] for i in index]
+    values = np.array([result.params[name].estimate for name in names])
+    is_log = [parameter_of(plant, name).positive for name in names]
+    if np.any(values[is_log] <= 0):
+        raise ValueError(f"{where} has a parameter below 0 that is positive in this plant")
+    size = np.where(is_log, values, 1.0)
+    relative = np.array([result.params[name].std_error for name in names]) / size
+    mean = np.where(is_log, np.log(np.where(is_log, values, 1.0)), values)
+    correlation = np.array(result.correlation, float)[np.ix_(index, index)]
+    try:
+        return Prior.normal(names, mean, correlation * np.outer(relative, relative), is_log)
+    except ValueError as error:
+        raise ValueError(f"{where} is no prior: {error}") from None
