@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 
 from ..description import HALF_95, RARE, Named, PlantDescription, names_of, unknown, wrong_type
 from ..files import json_ready
-from ..information import identifiability, worst_seen
+from ..identifiability import STRUCTURALLY_NOT, identifiability, worst_seen
 from ..plant import AbstractPlant, Params, floats, params_from
 from ..plant.catalogue import PLANTS, PlantLike, plant_from
 from ..plant.extension import plain_kind
@@ -56,6 +56,7 @@ from .diagnosis import (
     widened,
     with_independent,
 )
+from .held import structure_of, told_of_held
 from .nls import NLS
 from .pem import PEM
 from .profile import profile_intervals
@@ -556,7 +557,10 @@ def _fit_seen(
         free = free & (np.arange(len(names)) != chosen)
         reasons = (*reasons, why)
         if not free.any():
-            raise ValueError(_NOTHING_SEEN)
+            found = structure_of(plant, experiments, start)
+            groups = found.not_identifiable if found else ()
+            why = [f"{STRUCTURALLY_NOT}: {group.sentence}" for group in groups]
+            raise ValueError("; ".join([*why, _NOTHING_SEEN]))
         found = _estimate(plant, experiments, estimator, start, free, [last])
 
 
@@ -702,7 +706,8 @@ def _confidence(
                 f"the intervals include the standard deviation of {_told(plant, uncertain)}"
             )
     seen = identifiability(names, covariance / np.outer(size, size), fit.free)
-    return covariance, degrees, (*fit.reasons, seen, *remarks)
+    held = told_of_held(plant, experiments, fit.estimate, fit.free, fit.known)
+    return covariance, degrees, (*fit.reasons, *held, seen, *remarks)
 
 
 def _told(plant: AbstractPlant, uncertain: np.ndarray) -> str:
