@@ -26,6 +26,7 @@ from excite.identifiability import (
 )
 from excite.information import experiment_information
 from excite.plant import AbstractPlant
+from excite.plant.extension import extended
 from excite.simulation import response
 
 Equation = Callable[[Any, Any, Any], list]
@@ -185,6 +186,20 @@ def test_every_shipped_plant_is_identifiable(name, known):
     assert result is not None
     assert (result.rank, result.not_identifiable) == (result.num_unknowns, ())
     assert result.singular_values[-1] > 1e-4
+
+
+@pytest.mark.parametrize(("extension", "known", "sentence"), [
+    ("offset_force", True,
+     "offset and offset_force cannot be told apart, only the difference offset - offset_force"),
+    ("bias_position", False,
+     "bias_position and the initial value of position cannot be told apart, only 1 combination "
+     "of them"),
+])  # fmt: skip
+def test_an_extension_that_does_what_the_plant_does_is_named(extension, known, sentence):
+    plant = extended(PLANTS["emps"], [extension])
+    result = structure(plant, plant.nominal, initial_state_known=known)
+    assert result is not None
+    assert [g.sentence for g in result.not_identifiable] == [sentence]
 
 
 def weak(size: float) -> AbstractPlant:

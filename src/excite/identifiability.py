@@ -355,12 +355,15 @@ def _product(names: Sequence[str], powers: np.ndarray) -> str:
 
 
 def _sum(names: Sequence[str], weights: np.ndarray) -> str:
-    """A weighted sum: the sum a + b, a - 2 b."""
+    """A weighted sum: the sum a + b, the difference a - b, a - 2 b."""
     terms = [
         f"{'-' if w < 0 else '+'} {'' if abs(abs(w) - 1) < 1e-4 else f'{abs(w):.3g} '}{name}"
         for name, w in zip(names, weights, strict=True)
     ]
-    return f"{'the sum ' if np.allclose(weights, 1) else ''}{' '.join(terms).removeprefix('+ ')}"
+    word = ""
+    if np.allclose(np.abs(weights), 1):
+        word = "the sum " if np.all(weights > 0) else "the difference " if len(names) == 2 else ""
+    return f"{word}{' '.join(terms).removeprefix('+ ')}"
 
 
 def practically(
