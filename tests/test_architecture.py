@@ -30,6 +30,7 @@ ORDER = (
     "safety",
     "excitation",
     "simulation",
+    "identifiability",
     "information",
     "estimation",
     "environment",

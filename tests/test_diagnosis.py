@@ -13,7 +13,7 @@ from excite.estimation.diagnosis import (
     robust_covariance,
     widened,
 )
-from excite.information import UNSEEN_SD, identifiability, worst_seen
+from excite.identifiability import UNSEEN_SD, identifiability, worst_seen
 
 # Fit
 

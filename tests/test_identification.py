@@ -244,7 +244,8 @@ def test_a_free_decay_holds_the_input_gain_and_fits_the_rest(decay):
 
 def test_a_sentence_names_the_held_parameter_and_where_it_was_held(decay):
     assert decay.verdict[0] == "K_pu is not identifiable from the data; K_pu was held at 0.03"
-    assert decay.verdict[1].startswith("J_p, D_p identifiable; least certain ")
+    assert decay.verdict[1].startswith("K_pu is structurally identifiable, but practically not ")
+    assert decay.verdict[2].startswith("J_p, D_p identifiable; least certain ")
 
 
 def test_a_held_parameter_is_null_in_json_but_for_its_value(decay):

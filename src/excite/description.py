@@ -17,7 +17,7 @@ import math
 import os
 import reprlib
 import textwrap
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, TypeVar
@@ -341,6 +341,11 @@ class PlantDescription:
 def names_of(parts: Iterable[_Named]) -> tuple[str, ...]:
     """Names of states, inputs, outputs, parameters or constants, in order."""
     return tuple(part.name for part in parts)
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names in a sentence: a, b and c."""
+    return " and ".join([*[", ".join(names[:-1])] * (len(names) > 1), *names[-1:]])
 
 
 def first_line(kind: type) -> str:

@@ -21,6 +21,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from .description import Named, PlantDescription, names_of
 from .excitation.catalogue import ExcitationLike
+from .identifiability import Structure, practically, structure
 from .plant import AbstractPlant, Params, require_double_precision
 from .plant.catalogue import PlantLike
 from .record import Record
@@ -33,10 +34,6 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 Information = Float[Array, "param param"]
-
-UNSEEN_SD = 0.5
-"""A direction of relative changes with a larger standard deviation is not identifiable: its
-95 % interval reaches from zero to twice the value."""
 
 
 def require_noise(plant: AbstractPlant) -> None:
@@ -201,6 +198,9 @@ class InformationResult:
         log_det_information, a_optimality, e_optimality: criteria of the relative information:
             log det M, trace M^-1, smallest eigenvalue of M.
         information: relative Fisher information, see `experiment_information`.
+        identifiability: "structurally not identifiable", "practically not identifiable with this
+            excitation" or "identifiable": the worst that holds for any parameter.
+        structure: result of the structural test; None where it was not made.
         verdict: sentences: what cannot be identified, and how certain the rest is.
         inputs: of the experiment [input units].
         excitation: its name.
@@ -214,6 +214,8 @@ class InformationResult:
     a_optimality: float
     e_optimality: float
     information: Float[np.ndarray, "param param"]
+    identifiability: str
+    structure: Structure | None
     verdict: tuple[str, ...]
     inputs: Float[np.ndarray, "time input"]
     excitation: str = ""
@@ -256,6 +258,8 @@ class InformationResult:
             "a_optimality": self.a_optimality,
             "e_optimality": self.e_optimality,
             "information": self.information,
+            "identifiability": self.identifiability,
+            "structure": None if self.structure is None else asdict(self.structure),
             "verdict": self.verdict,
             "excitation": self.excitation,
             "num_steps": len(self.inputs),
@@ -302,7 +306,10 @@ def information(
     known = initial_state == "known" or (initial_state == "auto" and not elsewhere)
     e = experiment
     inputs = run_episode(e.plant, e.params, e.excitation, e.num_steps, e.key).inputs
-    result = best_possible(e.plant, e.params, inputs, initial_state_known=known)
+    result = best_possible(
+        e.plant, e.params, inputs, initial_state_known=known,
+        structure=structure(e.plant, e.params, initial_state_known=known),
+    )  # fmt: skip
     return replace(result, excitation=e.name, warnings=e.warnings)
 
 
@@ -312,8 +319,12 @@ def best_possible(
     inputs: Float[Array, "time input"],
     *,
     initial_state_known: bool,
+    structure: Structure | None = None,
 ) -> InformationResult:
     """Smallest possible standard deviation of each parameter for these inputs.
+
+    Args:
+        structure: of the plant; what it cannot tell apart has no bound.
 
     Raises:
         ValueError: for a sensor without noise, which sets no bound, and for a response
@@ -331,7 +342,11 @@ def best_possible(
             "trusted; a smaller amplitude or other parameters may help"
         )
     parameters = plant.definition.parameters
+    names = names_of(parameters)
     sd = np.asarray(cramer_rao_bound(information)) * np.asarray(relative_size(plant, params))
+    if structure is not None:  # rounding may leave a bound
+        sd = np.where([structure.of(name) is not None for name in names], np.inf, sd)
+    identifiability, verdict = practically(names, np.asarray(information), structure)
 
     def bound(value: float, least: float, unit: str) -> Bound:
         is_finite = bool(np.isfinite(least))
@@ -349,68 +364,8 @@ def best_possible(
         a_optimality=float(a_optimality(information)),
         e_optimality=float(e_optimality(information)),
         information=np.asarray(information),
-        verdict=_verdict(names_of(parameters), np.asarray(information)),
+        identifiability=identifiability,
+        structure=structure,
+        verdict=verdict,
         inputs=np.asarray(inputs),
     )
-
-
-def _verdict(names: tuple[str, ...], information: np.ndarray) -> tuple[str, ...]:
-    """Sentences: each parameter that cannot be identified, and how certain the rest is."""
-    free, sentences = np.ones(len(names), bool), []
-    while (unseen := worst_seen(names, information, free)) is not None:
-        free[unseen[0]] = False
-        sentences.append(unseen[1])
-    if free.any():
-        block = np.where(np.outer(free, free), information, np.eye(len(names)))
-        sentences.append(identifiability(names, np.linalg.inv(block), free))
-    return tuple(sentences)
-
-
-def worst_seen(
-    names: tuple[str, ...], information: Float[np.ndarray, "param param"], free: np.ndarray
-) -> tuple[int, str] | None:
-    """The free parameter to hold because the data do not determine it, and the reason.
-
-    None when every direction of the free parameters is known better than `UNSEEN_SD`.
-    The direction is the eigenvector of the information with the smallest eigenvalue.
-    """
-    index = np.flatnonzero(free)
-    if index.size == 0:
-        return None
-    block = information[np.ix_(index, index)]
-    if np.all(np.isfinite(block)):
-        values, vectors = np.linalg.eigh(block)
-        value, direction = max(values[0], 0.0), vectors[:, 0]
-    else:
-        value, direction = 0.0, np.ones(index.size)
-    if value * UNSEEN_SD**2 >= 1:
-        return None
-    chosen = int(index[np.argmax(np.abs(direction))])
-    involved = [names[i] for i, v in zip(index, direction, strict=True) if abs(v) > 0.3]
-    if len(involved) == 1:
-        return chosen, f"{names[chosen]} is not identifiable from the data"
-    combination = " ".join(
-        f"{names[i]}^{v:+.2g}"
-        for i, v in zip(index, direction / direction[np.argmax(np.abs(direction))], strict=True)
-        if names[i] in involved
-    )
-    return chosen, (
-        f"{' and '.join(involved)} are not identifiable separately: {combination} is undetermined"
-    )
-
-
-def identifiability(
-    names: tuple[str, ...], covariance: Float[np.ndarray, "param param"], free: np.ndarray
-) -> str:
-    """A sentence on the standard deviation of the least certain direction of free parameters.
-
-    Args:
-        covariance: of relative changes.
-    """
-    index = np.flatnonzero(free)
-    values, vectors = np.linalg.eigh(covariance[np.ix_(index, index)])
-    sd, direction = np.sqrt(max(values[-1], 0.0)), vectors[:, -1]
-    involved = [names[i] for i, v in zip(index, direction, strict=True) if abs(v) > 0.3]
-    seen = "all parameters" if len(index) == len(names) else ", ".join(names[i] for i in index)
-    what = involved[0] if len(involved) == 1 else f"a combination of {' and '.join(involved)}"
-    return f"{seen} identifiable; least certain direction: {what}, {100 * sd:.2g} % (1 SD)"

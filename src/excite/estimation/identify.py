@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 
 from ..description import HALF_95, RARE, Named, PlantDescription, names_of, unknown, wrong_type
 from ..files import json_ready
-from ..information import identifiability, worst_seen
+from ..identifiability import STRUCTURALLY_NOT, identifiability, worst_seen
 from ..plant import AbstractPlant, Params, floats, params_from
 from ..plant.catalogue import PLANTS, PlantLike, plant_from
 from ..plant.extension import plain_kind
@@ -57,6 +57,7 @@ from .diagnosis import (
     widened,
     with_independent,
 )
+from .held import structure_of, told_of_held
 from .nls import NLS, Likelihood
 from .pem import PEM
 from .prior_knowledge import PriorLike, with_prior
@@ -598,7 +599,10 @@ def _fit_seen(
         free = free & (np.arange(len(names)) != chosen)
         reasons = (*reasons, why)
         if not free.any():
-            raise ValueError(_NOTHING_SEEN)
+            found = structure_of(plant, experiments, start)
+            groups = found.not_identifiable if found else ()
+            why = [f"{STRUCTURALLY_NOT}: {group.sentence}" for group in groups]
+            raise ValueError("; ".join([*why, _NOTHING_SEEN]))
         found = _estimate(plant, experiments, estimator, start, free, progress, [last])
 
 
@@ -761,7 +765,8 @@ def _confidence(
         values = dict(zip(names, map(float, fit.estimate.params), strict=True))
         white = np.asarray(fit.estimate.covariance)
         remarks += estimator.prior.verdict(values, white[np.ix_(rows, rows)])
-    return covariance, degrees, (*fit.reasons, seen, *remarks)
+    held = told_of_held(plant, experiments, fit.estimate, fit.free, fit.known)
+    return covariance, degrees, (*fit.reasons, *held, seen, *remarks)
 
 
 def _told(plant: AbstractPlant, uncertain: np.ndarray) -> str:

@@ -176,8 +176,17 @@ def _criteria(result: Data) -> list[str]:
         f"relative information: log det {number(result['log_det_information'], 4)}, "
         f"trace of the inverse {number(result['a_optimality'])}, "
         f"smallest eigenvalue {number(result['e_optimality'])}",
+        f"{result['identifiability']}{_tested(result['structure'])}",
         *result["verdict"],
     ]
+
+
+def _tested(structure: Data | None) -> str:
+    """What the structural test was made with."""
+    if structure is None:
+        return " (structural test not made: the response to random inputs is not finite)"
+    rank = f"{structure['rank']} of {structure['num_unknowns']}"
+    return f" (structural test: rank {rank}; {structure['tried']})"
 
 
 def information_text(result: Data) -> str:
