@@ -18,27 +18,11 @@ import pyarrow
 import pyarrow.parquet
 import pytest
 import scipy.io
+from experiments import described as plant
 from experiments import recording
 
-from excite.description import Input, Output, Parameter, PlantDescription, State
 from excite.record import Record, columns_in, read_record, write_record
 from excite.record.units import unit_factor
-
-
-def plant(
-    inputs: str = "u", outputs: str = "y", dt: float = 0.1, unit: str = "", size: float = 1e3
-) -> PlantDescription:
-    """A description with these columns; units and sizes are the same for all of them."""
-    return PlantDescription(
-        name="log",
-        states=(State("x", ""),),
-        inputs=tuple(Input(name, unit, -size, size) for name in inputs.split()),
-        outputs=tuple(Output(name, unit, scale=size) for name in outputs.split()),
-        parameters=(Parameter("k", "", 1.0),),
-        dt=dt,
-        band=(0.01 / dt, 0.5 / dt),
-    )
-
 
 TIME, U, Y = [0.0, 0.1, 0.2], [1.5, -2.0, 0.25], [-0.25, 1.0, 3.0]
 

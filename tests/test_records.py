@@ -364,8 +364,8 @@ BAD_FILES: dict[str, tuple[str, str | bytes | Callable[[Path], None], tuple[str,
         "r.mat", mat_of(pitch=np.zeros(7)), ("'pitch' has 7 samples", "'time' 30"),
     ),
     "MAT with NaN": ("r.mat", mat_of(pitch=np.full(30, np.nan)), ("no measurement",)),
-    "wrong ending": ("r.toml", text_of(table()), (".csv, .txt", "or .parquet")),
-    "no ending": ("record", text_of(table()), (".csv, .txt", "or .parquet")),
+    "wrong ending": ("r.toml", text_of(table()), (".csv, .txt", "or .db3")),
+    "no ending": ("record", text_of(table()), (".csv, .txt", "or .db3")),
 }  # fmt: skip
 
 

@@ -82,12 +82,14 @@ def unbroken(time: np.ndarray) -> list[slice]:
     """Parts of a record without a gap in time, of two samples or more.
 
     In an even record a gap is a missing sample, because the input in between is unknown; in an
-    uneven one it is a step of more than ten times the usual one.
+    uneven one it is a step of more than ten times a usual one. Of two topics at almost the same
+    instants every other step is very short, so that a usual step is not the median one.
     """
     steps = np.diff(time)
     usual = np.median(steps)
     most_are_usual = np.mean(np.abs(steps - usual) <= _UNEVEN * usual) >= _MOST
-    gaps = np.flatnonzero(steps > (_MISSING if most_are_usual else _GAP) * usual) + 1
+    longest = _MISSING * usual if most_are_usual else _GAP * np.quantile(steps, _MOST)
+    gaps = np.flatnonzero(steps > longest) + 1
     ends = [0, *gaps.tolist(), time.size]
     return [slice(a, b) for a, b in pairwise(ends) if b - a > 1]
 

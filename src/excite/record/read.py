@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from ..description import Input, Output, PlantDescription, names_of, path_from
+from .bags import is_bag
 from .dates import seconds_of
 from .formats import columns_in
 from .prepare import TIMES_DT, check_finite, check_size, check_time, require_playable, unit_hint
@@ -55,7 +56,7 @@ def read_record(
 
     Args:
         path: the file; its ending tells its kind: .csv, .txt, .dat, .tsv, .mat, .h5, .hdf5,
-            .parquet.
+            .parquet, .mcap, .db3; a ROS 2 bag may be a folder.
         description: the plant; default that of the sidecar.
         columns: names in the file where they are not the plant's: {"pitch": "qm"}. Columns of a
             file without names are "1", "2", ...
@@ -197,7 +198,11 @@ def _cells(
     given = [options.column(name) for name in needed]
     if twice := [n for n, column in zip(needed, given, strict=True) if given.count(column) > 1]:
         raise ValueError(f"{path}: {' and '.join(map(repr, twice))} cannot be the same column")
-    table = columns_in(path)
+    if options.dt is not None and is_bag(path):
+        raise ValueError(f"{path}: its messages have their times; --dt is for a file without time")
+    inputs = names_of(options.description.inputs)
+    held = [column for name, column in zip(needed, given, strict=True) if name in inputs]
+    table = columns_in(path, given, held)
     if in_file := [name for name in options.set_inputs if name in table]:
         raise ValueError(
             f"{path}: the file has a column {in_file[0]!r}; --set-input is for inputs that it does "
