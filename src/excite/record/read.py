@@ -24,7 +24,15 @@ from ..description import Input, Output, PlantDescription, names_of, path_from
 from .bags import is_bag
 from .dates import seconds_of
 from .formats import columns_in
-from .prepare import TIMES_DT, check_finite, check_size, check_time, require_playable, unit_hint
+from .prepare import (
+    LEAVE_OUT,
+    TIMES_DT,
+    check_finite,
+    check_size,
+    check_time,
+    require_playable,
+    unit_hint,
+)
 from .record import Record, described_in, read_sidecar
 from .units import unit_factor
 
@@ -328,7 +336,7 @@ def _values(cells: np.ndarray, part: Input | Output, options: _Options, where: P
         raise ValueError(f"{where}: {part.name!r} has no measurement in {len(values)} samples")
     check_finite(np.where(measured, values, 0.0), part.name, where)
     if not options.confirms(part.name):
-        check_size(values[measured], part, where)
+        check_size(values, part, where)
     return values
 
 
@@ -349,7 +357,9 @@ def _bad_cell(cells: np.ndarray, k: int, name: str, what: str, where: Path) -> V
     found = f"is {_short(text)!r}, {what}" if _is_there(cells[k]) else "is missing"
     if _THOUSANDS.fullmatch(text):
         found += "; save the file without thousands separators"
-    elif k == 0:
+    elif k:
+        found += f"; {LEAVE_OUT}"
+    else:
         found += "; every row below the names must hold numbers (--rows 1: leaves out the first)"
     return ValueError(f"{where}: sample {k + 1} of {name!r} {found}")
 
