@@ -7,6 +7,7 @@ import jax
 import numpy as np
 import scipy.signal
 
+from excite.description import Input, Output, Parameter, PlantDescription, State
 from excite.excitation import AbstractExcitation, Chirp
 from excite.files import json_ready
 from excite.plant import AbstractPlant, Params
@@ -22,6 +23,21 @@ def recording(name: str) -> Path | None:
     """A real recording, which is not shipped, where this computer has it."""
     folder = Path(os.environ.get("EXCITE_DATA") or ROOT.parent / "shared" / "data")
     return next(folder.rglob(name), None)
+
+
+def described(
+    inputs: str = "u", outputs: str = "y", dt: float = 0.1, unit: str = "", size: float = 1e3
+) -> PlantDescription:
+    """A description with these columns; units and sizes are the same for all of them."""
+    return PlantDescription(
+        name="log",
+        states=(State("x", ""),),
+        inputs=tuple(Input(name, unit, -size, size) for name in inputs.split()),
+        outputs=tuple(Output(name, unit, scale=size) for name in outputs.split()),
+        parameters=(Parameter("k", "", 1.0),),
+        dt=dt,
+        band=(0.01 / dt, 0.5 / dt),
+    )
 
 
 def record_of(

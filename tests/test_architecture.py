@@ -55,6 +55,10 @@ DOORS = {
     "pandas": ["record/table"],
     "h5py": ["record/formats"],
     "pyarrow": ["record/formats"],
+    "mcap": ["record/bags"],
+    "rosbags": ["record/bags"],
+    "zstandard": ["record/bags"],
+    "lz4": ["record/bags"],
     "pydantic": ["study", "record/rows", "report/study_table"],
     "tomlkit": ["study"],
     "dask": ["study/cluster"],
@@ -123,6 +127,7 @@ SHOWING = (
     "require_matlab",
     "_require_hdf5",
     "_require_parquet",
+    "_require_libraries",
     "_require_least_squares",
 )
 """Functions that import Matplotlib's figures, a package that not every computer has, or one that

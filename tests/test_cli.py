@@ -731,7 +731,9 @@ BAD: dict[str, tuple[str, tuple[str, ...]]] = {
     "samples left out for ARX": (
         IDENTIFY.format("gap.csv") + " --estimator arx-rls", ("gap.csv", "gaps in time"),
     ),
-    "wrong unit": (IDENTIFY.format("unit.csv"), ("unit.csv", "-24 to 24", "voltage=FACTOR")),
+    "wrong unit": (
+        IDENTIFY.format("unit.csv"), ("unit.csv", "-24 to 24", "--scale voltage=", "the first is"),
+    ),
     "too short": (IDENTIFY.format("short.csv"), ("short.csv", "5 measured values for 5 unknowns")),
     "nothing to see": (IDENTIFY.format("rest.csv"), ("no parameter is identifiable",)),
     "no response": (IDENTIFY.format("silent.csv"), ("no parameter is identifiable",)),
@@ -740,7 +742,9 @@ BAD: dict[str, tuple[str, tuple[str, ...]]] = {
     "header only": (IDENTIFY.format("header.csv"), ("header.csv", "0 samples")),
     "binary": (IDENTIFY.format("binary.csv"), ("binary.csv", "cannot be read")),
     "endless line": (IDENTIFY.format("long.csv"), ("long.csv", "cannot be read")),
-    "time backwards": (IDENTIFY.format("backwards.csv"), ("backwards.csv", "'time'")),
+    "time backwards": (
+        IDENTIFY.format("backwards.csv"), ("backwards.csv", "'time'", "--rows", "--dt"),
+    ),
     "deep sidecar": (IDENTIFY.format("deep.csv"), ("deep.json", "nested too deeply")),
     "digits in a cell": (IDENTIFY.format("digits.csv"), ("digits.csv", "sample 5", "is inf")),
     "digits in rows": (
@@ -749,12 +753,23 @@ BAD: dict[str, tuple[str, tuple[str, ...]]] = {
     "surrogate in a unit": (
         IDENTIFY.format("good.csv") + " --unit pitch=\udcff", ("unit '\\udcff' of 'pitch'",),
     ),
+    "delay beyond the record": (
+        "identify good.csv --plant aero2+delay_voltage --start delay_voltage=50",
+        ("delay of input 'voltage' is 50 s", "the longest record has", "(--start, --hold)"),
+    ),
+    "known delay beyond the record": (
+        "identify good.csv --plant aero2+delay_voltage --hold delay_voltage=-50",
+        ("delay of input 'voltage' is -50 s", "(--start, --hold)"),
+    ),
+    "nested option": (
+        "simulate aero2 --set amplitude=" + "[" * 100_000, ("--set", "is not a number, true"),
+    ),
     "time step NaN": (IDENTIFY.format("good.csv") + " --dt nan", ("time nan s is not allowed",)),
     "folder as record": (IDENTIFY.format("mine.csv"), ("mine.csv", "is a folder")),
     "truncated MAT": (IDENTIFY.format("truncated.mat"), ("truncated.mat", "not a readable MAT")),
     "pickle as MAT": (IDENTIFY.format("pickle.mat"), ("pickle.mat", "not a readable MAT")),
     "HDF5 MAT": (IDENTIFY.format("hdf5.mat"), ("hdf5.mat", "-v7")),
-    "wrong ending": (IDENTIFY.format("study.toml"), ("study.toml", ".csv, .txt", "or .parquet")),
+    "wrong ending": (IDENTIFY.format("study.toml"), ("study.toml", ".csv, .txt", "or .db3")),
     "no such file": (IDENTIFY.format("nowhere.csv"), ("nowhere.csv", "no such file")),
     "broken sidecar": (IDENTIFY.format("sidecar.csv"), ("sidecar.json", "JSON")),
     "sidecar by hand": (IDENTIFY.format("hand.csv"), ("hand.json", "plant")),
@@ -880,8 +895,37 @@ def test_a_mistake_is_one_sentence_and_leaves_nothing(words, fragments, run, her
     assert answer.err.count("\n") == 1
     assert answer.err.endswith("\n")
     assert "Traceback" not in answer.err
+    assert len(answer.err) < 1500
     assert [f for f in fragments if f not in answer.err] == []
     assert contents(here) == before
+
+
+DIGITS = "7" * 5000
+
+
+@pytest.mark.parametrize("words", [
+    ("identify", f"{DIGITS}.csv", "--plant", "aero2"), ("identify", "good.csv", "--plant", DIGITS),
+    ("identify", "good.csv", "--plant", "aero2", "--uncertain", f"m={DIGITS}"),
+    ("identify", "good.csv", "--plant", "aero2", "--estimator", DIGITS),
+    ("identify", "good.csv", "--plant", "aero2", "--out", DIGITS),
+    ("identify", "good.csv", "--plant", "aero2", "--hold-input", DIGITS),
+    ("simulate", "aero2", "--seed", DIGITS), ("simulate", "aero2", "--set", f"amplitude={DIGITS}"),
+])  # fmt: skip
+def test_very_long_words_are_shortened_in_a_message(words, run, here):
+    answer = run(*words)
+    assert answer.code == 2
+    assert len(answer.err) < 1500
+    assert answer.err.count("\n") == 1
+
+
+def test_a_run_folder_may_be_of_files_whose_names_are_not_utf8(run, here):
+    """Linux allows any bytes in names; Python has them as halves of surrogate pairs."""
+    name, out = "a\udcff\udced.csv", "b\udcff"
+    (here / "good.csv").rename(here / name)
+    answer = run("identify", name, "--plant", "aero2", "--out", out)
+    assert answer.code == 0, answer
+    told = json.loads((here / out / "estimate.json").read_text(encoding="utf-8"))
+    assert told["files"] == [name]
 
 
 @pytest.mark.parametrize("place", [0, 2])

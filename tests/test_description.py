@@ -10,7 +10,16 @@ import sys
 import pytest
 from catalogue import PLANTS
 
-from excite.description import Constant, Input, Output, Parameter, PlantDescription, State, names_of
+from excite.description import (
+    Constant,
+    Input,
+    Output,
+    Parameter,
+    PlantDescription,
+    State,
+    names_of,
+    told,
+)
 
 PARTS = ("states", "inputs", "outputs", "parameters", "constants")
 
@@ -149,6 +158,7 @@ def test_defaults_that_follow_from_other_fields():
     (lambda: Parameter("k", "", -1.0), "parameter 'k' is positive, its nominal value -1.0 is not"),
     (lambda: Parameter("k", "", 1.0, lower=1.0), "inside its bounds: got 1.0 for 1.0 to inf"),
     (lambda: Parameter("k", "", 3.0, upper=2.0), "inside its bounds: got 3.0 for -inf to 2.0"),
+    (lambda: Input("u", "V", -1.0, 1.0, 10**400), "amplitude of 'u' is inf; a finite number"),
     (lambda: Parameter("k", "", 1.0, lower=-1.0), "lower bound of the positive parameter 'k'"),
 ])  # fmt: skip
 def test_a_part_that_makes_no_sense_is_refused_in_a_sentence(build, sentence):
@@ -156,10 +166,28 @@ def test_a_part_that_makes_no_sense_is_refused_in_a_sentence(build, sentence):
         build()
 
 
+class SilentError(Exception):
+    def __str__(self) -> str:
+        raise KeyboardInterrupt
+
+
+def test_what_an_error_says_is_one_short_line():
+    assert told(ValueError("a\n  b")) == "ValueError: a b"
+    assert told(SystemExit()) == "SystemExit"
+    assert told(SilentError()) == "SilentError"
+    assert len(told(ValueError("x " * 10**5))) < 600
+    assert len(told(ValueError("x" * 10**5))) < 600
+
+
 @pytest.mark.parametrize(("changes", "sentence"), [
     ({"dt": 0.0}, "dt must be positive: got 0.0"),
     ({"dt": math.inf}, "dt must be positive: got inf"),
-    ({"substeps": 0}, "substeps must be at least 1: got 0"),
+    ({"dt": 10**400}, "dt must be positive: got 1000"),
+    ({"dt": 1e-320}, "dt must be positive: got 1e-320"),
+    ({"substeps": 0}, "substeps must be a whole number from 1 to 10000: got 0"),
+    ({"substeps": True}, "substeps must be a whole number .*: got True"),
+    ({"substeps": 10**9}, "substeps must be a whole number .*: got 1000000000"),
+    ({"band": (math.nan, 1.0)}, "band must be two frequencies in Hz, .*: got"),
     ({"band": (0.0, 1.0)}, "band must increase and end at or below 5 Hz"),
     ({"band": (1.0, 0.5)}, "got 1 to 0.5 Hz"),
     ({"band": (0.1, 5.1)}, "got 0.1 to 5.1 Hz"),

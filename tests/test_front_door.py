@@ -110,7 +110,7 @@ MISTAKES = {
     "ex.identify([])": "no record is given",
     "ex.identify('missing.csv', 'aero2')": "missing.csv: no such file",
     "ex.identify('missing.csv')": "missing.csv: no such file",
-    "ex.identify('.')": ".: experiment files end in .csv, .txt, .dat, .tsv, .mat, .h5, .hdf5 or",
+    "ex.identify('.')": ".: is a folder; only files can be read, and ROS 2 bags",
     "ex.identify(record, 'emps')": "is of plant 'aero2' and has voltage, pitch; plant 'emps' has",
     "ex.read_record(3)": "record must be a path: got int 3",
     "ex.read_study({'a': 1})": "study must be a name or a path: got dict {'a': 1}",
@@ -123,6 +123,22 @@ MISTAKES = {
     "ex.train('aero2', objective=3)": "objective must be a name, several names, or a dict",
     "ex.report(3)": "runs must be a run folder, a record's file, or several: got int 3",
     "ex.Parameter('a', 'kg', 'x')": "nominal of 'a' must be a number: got str 'x'",
+    "ex.Parameter('a', 5, 1.0)": "unit of 'a' must be a text: got int 5",
+    "ex.Input('u', 'V', -1.0, 1.0, None)": "amplitude of 'u' must be a number: got NoneType",
+    "ex.Input('u', 'V', -1.0, 1.0, (1, 2))": "amplitude of 'u' must be a number: got tuple (1, 2)",
+    "changed(states=('x',))": "states of 'aero2' must be a tuple of ex.State: got tuple ('x',)",
+    "changed(outputs=None)": "outputs of 'aero2' must be a tuple of ex.Output: got NoneType",
+    "changed(dt='0.1')": "dt must be positive: got '0.1'",
+    "changed(substeps=1.5)": "substeps must be a whole number from 1 to 10000: got 1.5",
+    "changed(substeps=np.inf)": "substeps must be a whole number from 1 to 10000: got inf",
+    "changed(substeps='2')": "substeps must be a whole number from 1 to 10000: got '2'",
+    "changed(band=(1, 2, 3))": "band must be two frequencies in Hz, the lowest and the highest: "
+    "got (1, 2, 3)",
+    "changed(band=(1.0,))": "got (1.0,)",
+    "changed(band=1.0)": "band must be two frequencies in Hz",
+    "changed(band=None)": "band must be two frequencies in Hz",
+    "changed(band=('a', 1.0))": "band must be two frequencies in Hz",
+    "changed(band=jnp.ones(3))": "band must be two frequencies in Hz",
     "ex.simulate('aero2', np.full((9, 1), np.nan))": "inputs must be finite: got [nan] at sample 0",
     "ex.simulate('aero2', np.ones(9))": "inputs need a row for each sample: got shape (9,)",
     "ex.identify(record, 'cart_pole')": "has 1 inputs and 1 outputs; plant 'cart_pole'",
@@ -139,6 +155,8 @@ MISTAKES = {
 }
 
 WORKS = [
+    "changed(substeps=2.0).hash == changed(substeps=2).hash or 1 / 0",
+    "changed(band=[0.1, 1]).band == (0.1, 1.0) or 1 / 0",
     "ex.simulate(Aero2, ex.simulate('aero2', steps=20))",
     "ex.simulate(Aero2(), Chirp, steps=20)",
     "ex.simulate(Aero2(), Chirp(amplitude=2.0), steps=20, seed=jax.random.key(0))",
@@ -149,6 +167,7 @@ WORKS = [
 ]
 
 SCRIPT = """
+import dataclasses, functools
 import json, sys, warnings
 import excite as ex
 import jax, jax.numpy as jnp, numpy as np
@@ -169,6 +188,7 @@ jax.config.update("jax_enable_x64", False)
 single = Aero2()
 jax.config.update("jax_enable_x64", True)
 record = ex.simulate("aero2", steps=60)
+changed = functools.partial(dataclasses.replace, Aero2.definition)
 said = {}
 for line in json.load(sys.stdin):
     try:

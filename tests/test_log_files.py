@@ -18,27 +18,11 @@ import pyarrow
 import pyarrow.parquet
 import pytest
 import scipy.io
+from experiments import described as plant
 from experiments import recording
 
-from excite.description import Input, Output, Parameter, PlantDescription, State
 from excite.record import Record, columns_in, read_record, write_record
 from excite.record.units import unit_factor
-
-
-def plant(
-    inputs: str = "u", outputs: str = "y", dt: float = 0.1, unit: str = "", size: float = 1e3
-) -> PlantDescription:
-    """A description with these columns; units and sizes are the same for all of them."""
-    return PlantDescription(
-        name="log",
-        states=(State("x", ""),),
-        inputs=tuple(Input(name, unit, -size, size) for name in inputs.split()),
-        outputs=tuple(Output(name, unit, scale=size) for name in outputs.split()),
-        parameters=(Parameter("k", "", 1.0),),
-        dt=dt,
-        band=(0.01 / dt, 0.5 / dt),
-    )
-
 
 TIME, U, Y = [0.0, 0.1, 0.2], [1.5, -2.0, 0.25], [-0.25, 1.0, 3.0]
 
@@ -195,7 +179,11 @@ def test_numbers_of_other_programs_are_read_to_twelve_digits(tmp_path: Path):
     ("time;y;u\n0;1.5;-0.25\n\n0.1;-2\n0.2;1;1\n", ("sample 2 of 'u' is missing",)),
     ("Time [s]  Input [V]\n0 1\n0.1 2\n", ("2 values", "has 4", "blanks in quotes")),
     ("time,u,y\n[s],[V],[m]\n0,1,1\n0.1,2,1\n", ("sample 1 of 'time' is '[s]'", "--rows 1:")),
-    ("time,u,y\n0,1,1\n0.1,on,1\n", ("sample 2 of 'u' is 'on', not a number",)),
+    ("time,u,y\n0,1,1\n0.1,on,1\n", ("sample 2 of 'u' is 'on', not a number", "--rows START:STOP")),
+    ("time,u,y\n0,1,1\n1,1,inf\n", ("sample 2 of 'y' is inf; 1 of 2 samples", "--rows START:STOP")),
+    ("time,u,y\n0,1,1\n1,1,1\n2,1,-1e7\n", ("'y' reaches -1e+07", "a usual size is 1000",
+        "--unit y=", "--scale y=FACTOR", "1 of 3 samples are that large, the first is 3")),
+    ("time,u,y\n0,1,1\n1,1,1\n.5,1,1\n", ("'time' goes backwards: sample 2", "--rows", "--dt")),
     ("time,u,y\n0,1,1\n0.1,\"1,5\",1\n", ("sample 2 of 'u' is '1,5', not a number",)),
     ("time,u,y,u\n0,1,1,2\n0.1,1,1,3\n", ("'u' is there twice", "u (column 2) or u (column 4)")),
     ("Time,U,speed\n0,1,1\n0.1,1,1\n", ("no column 'time' (did you mean 'Time'?)", "--dt")),

@@ -335,11 +335,11 @@ BAD_FILES: dict[str, tuple[str, str | bytes | Callable[[Path], None], tuple[str,
     ),
     "input in millivolts": (
         "r.csv", spoiled(voltage={3: "7200.0"}),
-        ("'voltage'", "7200 V", "-24 to 24 V", "a scale, voltage=FACTOR"),
+        ("'voltage'", "7200 V", "-24 to 24 V", "a scale, --scale voltage=FACTOR"),
     ),
     "output in degrees": (
         "r.csv", spoiled(pitch={3: "-25.0"}),
-        ("'pitch'", "-25 rad", "0.785", "a scale, pitch=FACTOR"),
+        ("'pitch'", "-25 rad", "0.785", "a scale, --scale pitch=FACTOR"),
     ),
     "truncated line": ("r.csv", truncated_line(), ("line 31", "2 values", "3", "truncated")),
     "empty file": ("r.csv", "", ("empty",)),
@@ -364,8 +364,8 @@ BAD_FILES: dict[str, tuple[str, str | bytes | Callable[[Path], None], tuple[str,
         "r.mat", mat_of(pitch=np.zeros(7)), ("'pitch' has 7 samples", "'time' 30"),
     ),
     "MAT with NaN": ("r.mat", mat_of(pitch=np.full(30, np.nan)), ("no measurement",)),
-    "wrong ending": ("r.toml", text_of(table()), (".csv, .txt", "or .parquet")),
-    "no ending": ("record", text_of(table()), (".csv, .txt", "or .parquet")),
+    "wrong ending": ("r.toml", text_of(table()), (".csv, .txt", "or .db3")),
+    "no ending": ("record", text_of(table()), (".csv, .txt", "or .db3")),
 }  # fmt: skip
 
 
@@ -663,7 +663,7 @@ def test_json_has_no_number_that_is_not_finite():
 def test_time_in_another_unit_is_refused_unless_said_to_be_right(tmp_path):
     path = tmp_path / "r.csv"
     path.write_text(text_of(table()))
-    with pytest.raises(ValueError, match=r"Give a scale, time=FACTOR"):
+    with pytest.raises(ValueError, match="Give a scale, --scale time=FACTOR"):
         read_record(path, AERO2, scales={"time": 1000.0})
     slow = dataclasses.replace(AERO2, dt=1e-3, band=(1.0, 100.0))
     assert read_record(path, slow, scales={"time": 1.0}).dt == pytest.approx(0.1)

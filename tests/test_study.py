@@ -600,6 +600,21 @@ class Typo(Tank):
         return params.aera * state
 
 
+class Leaving(Tank):
+    def derivative(self, state, input, params):
+        raise SystemExit(3)
+
+
+class Refusing(Tank):
+    def __init__(self):
+        raise RuntimeError("no")
+
+
+class Complex(Tank):
+    def output(self, state, params):
+        return 1j * state
+
+
 number = 3
 """
 
@@ -651,6 +666,9 @@ def test_a_users_plant_is_found_beside_its_study(plant_file, tmp_path, monkeypat
         ("Wide", r"output of Wide in .* returns shape \(2,\); \(1,\) is needed"),
         ("Typo", "derivative of Typo in .* fails: AttributeError: .*aera"),
         ("Nameless", "Nameless in .* is not a complete plant: .*definition"),
+        ("Leaving", "derivative of Leaving in .* fails: SystemExit: 3"),
+        ("Refusing", "Refusing in .* cannot be made: RuntimeError: no"),
+        ("Complex", "output of Complex in .* returns complex numbers; real ones are needed"),
     ],
 )
 def test_what_is_no_plant_class_is_said(class_name, words, plant_file):
@@ -667,6 +685,10 @@ def test_what_is_no_plant_class_is_said(class_name, words, plant_file):
         ("1 / 0", "ZeroDivisionError"),
         (PLANT_FILE.replace("dt=0.5", "dt=-0.5"), "dt must be positive: got -0.5"),
         ("import sys\nsys.exit(3)", "SystemExit"),
+        ("raise GeneratorExit", "GeneratorExit$"),
+        ("class B(BaseException):\n    pass\nraise B('x')", "B: x$"),
+        ("class E(Exception):\n    def __str__(self):\n        1 / 0\nraise E", "imported: E$"),
+        ("raise ValueError('x' * 10**5)", "ValueError: .{,500}$"),
     ],
 )
 def test_a_plant_file_that_cannot_be_imported_is_said(content, words, plant_file):

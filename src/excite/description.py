@@ -16,6 +16,7 @@ import json
 import math
 import os
 import reprlib
+import sys
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
@@ -33,12 +34,26 @@ RARE = 0.01
 below which intervals are widened."""
 
 
+_LONGEST = 500  # characters of another program's message
+
 _T = TypeVar("_T")
 
 
 def _require(condition: bool, sentence: str) -> None:
     if not condition:
         raise ValueError(sentence)
+
+
+def _number(value: object) -> float:
+    """As a float, infinite where it is too large for one; NaN for what is no number."""
+    if isinstance(value, bool) or not hasattr(value, "__float__"):
+        return math.nan
+    try:
+        return float(value)  # pyright: ignore[reportArgumentType]
+    except OverflowError:
+        return math.inf
+    except (TypeError, ValueError):
+        return math.nan
 
 
 class _Named:
@@ -56,15 +71,19 @@ class _Named:
         )
         for field in fields(self):  # pyright: ignore[reportArgumentType]
             value = getattr(self, field.name)
-            if isinstance(value, int | float) and not isinstance(value, bool):
+            if field.type == "str":
+                if not isinstance(value, str):
+                    raise wrong_type(f"{field.name} of {self.name!r}", value, "a text")
+            elif isinstance(value, int | float) and not isinstance(value, bool):
                 # 1 and 1.0, 0 and -0 are the same number and must give the same hash.
-                object.__setattr__(self, field.name, float(value) + 0.0)
+                number = _number(value)
                 _require(
-                    math.isfinite(value),
-                    f"{field.name} of {self.name!r} is {value}; a finite number is needed "
+                    math.isfinite(number),
+                    f"{field.name} of {self.name!r} is {number}; a finite number is needed "
                     "(leave a bound out for none)",
                 )
-            elif str(field.type).startswith("float") and value is not None:
+                object.__setattr__(self, field.name, number + 0.0)
+            elif field.type == "float" or (field.type == "float | None" and value is not None):
                 raise wrong_type(f"{field.name} of {self.name!r}", value, "a number")
 
 
@@ -218,6 +237,16 @@ class Constant(_Named):
     value: float
 
 
+_PARTS = {
+    "states": State,
+    "inputs": Input,
+    "outputs": Output,
+    "parameters": Parameter,
+    "constants": Constant,
+}
+_MOST_SUBSTEPS = 10_000
+
+
 @dataclass(frozen=True, repr=False)
 class PlantDescription:
     """A plant as plain data.
@@ -262,18 +291,30 @@ class PlantDescription:
     def __post_init__(self) -> None:
         if not isinstance(self.name, str):
             raise wrong_type("name of a plant", self.name, "a text")
-        object.__setattr__(self, "dt", float(self.dt))
-        _require(math.isfinite(self.dt) and self.dt > 0, f"dt must be positive: got {self.dt}")
-        low, high = self.band if any(self.band) else (0.005 / self.dt, 0.25 / self.dt)
-        object.__setattr__(self, "band", (float(low), float(high)))
-        _require(self.substeps >= 1, f"substeps must be at least 1: got {self.substeps}")
+        dt = _number(self.dt)
+        _require(
+            dt >= sys.float_info.min and math.isfinite(dt),
+            f"dt must be positive: got {reprlib.repr(self.dt)}",
+        )
+        object.__setattr__(self, "dt", dt)
+        object.__setattr__(self, "band", self._own_band())
+        substeps = self.substeps
+        _require(
+            _number(substeps).is_integer() and 1 <= substeps <= _MOST_SUBSTEPS,
+            f"substeps must be a whole number from 1 to {_MOST_SUBSTEPS}: got "
+            f"{reprlib.repr(substeps)}",
+        )
+        object.__setattr__(self, "substeps", int(substeps))
         _require(
             0 < self.band[0] < self.band[1] <= 0.5 / self.dt,
             f"band must increase and end at or below {0.5 / self.dt:g} Hz, half the sampling "
             f"rate: got {self.band[0]:g} to {self.band[1]:g} Hz",
         )
-        for kind in ("states", "inputs", "outputs", "parameters", "constants"):
+        for kind, part_type in _PARTS.items():
             parts = getattr(self, kind)
+            if not isinstance(parts, Iterable) or not all(isinstance(p, part_type) for p in parts):
+                allowed = f"a tuple of ex.{part_type.__name__}"
+                raise wrong_type(f"{kind} of {self.name!r}", parts, allowed)
             names = [part.name for part in parts]
             may_lack = kind in ("inputs", "constants")
             _require(bool(parts) or may_lack, f"plant {self.name!r} has no {kind}")
@@ -284,6 +325,20 @@ class PlantDescription:
             f"inputs and outputs of {self.name!r} are file columns beside 'time': "
             "all their names must differ",
         )
+
+    def _own_band(self) -> tuple[float, float]:
+        """The band as two numbers, by default from the sampling time."""
+        try:
+            numbers = [_number(frequency) for frequency in self.band]
+        except TypeError:
+            numbers = []
+        if len(numbers) != 2 or any(map(math.isnan, numbers)):
+            raise ValueError(
+                "band must be two frequencies in Hz, the lowest and the highest: got "
+                f"{reprlib.repr(self.band)}"
+            )
+        low, high = numbers if any(numbers) else (0.005 / self.dt, 0.25 / self.dt)
+        return low, high
 
     def __repr__(self) -> str:
         lines = [f"plant {self.name}, sampled every {self.dt:g} s"]
@@ -317,16 +372,9 @@ class PlantDescription:
             raise ValueError(
                 f"plant description has format {data.get('format')!r}; this version reads {FORMAT}"
             )
-        kinds = {
-            "states": State,
-            "inputs": Input,
-            "outputs": Output,
-            "parameters": Parameter,
-            "constants": Constant,
-        }
         try:
-            parts = {k: tuple(kind(**entry) for entry in data[k]) for k, kind in kinds.items()}
-            rest = {k: v for k, v in data.items() if k != "format" and k not in kinds}
+            parts = {k: tuple(kind(**entry) for entry in data[k]) for k, kind in _PARTS.items()}
+            rest = {k: v for k, v in data.items() if k != "format" and k not in _PARTS}
             return cls(**{**rest, **parts, "band": tuple(data["band"])})
         except (KeyError, TypeError, OverflowError) as error:
             raise ValueError(f"plant description is incomplete or malformed: {error}") from None
@@ -399,6 +447,16 @@ def wrong_type(what: str, value: object, allowed: str) -> TypeError:
     shown = "" if text.startswith("<") or "\n" in text else f" {text}"
     kind = f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
     return TypeError(f"{what} must be {allowed}: got {kind}{shown * (not isinstance(value, type))}")
+
+
+def told(error: BaseException) -> str:
+    """The type of an error of a user's code and what it says, in one short line."""
+    try:
+        text = " ".join(str(error).split())
+    except BaseException:  # its own `__str__` fails
+        text = ""
+    text = textwrap.shorten(text, _LONGEST) if len(text) > _LONGEST else text
+    return f"{type(error).__name__}: {text}".removesuffix(": ")
 
 
 def path_from(what: str, value: object, allowed: str = "a path") -> Path:

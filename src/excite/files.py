@@ -24,6 +24,8 @@ from typing import IO, Any
 import numpy as np
 import safetensors.numpy
 
+from .description import told
+
 try:
     import fcntl
 except ImportError:  # Windows
@@ -69,7 +71,8 @@ def folder_word(name: str) -> str:
 
 def write_json(path: Path, value: Any) -> None:
     """Writes `value` as JSON, completely or not at all."""
-    write_bytes(path, (json_text(value) + "\n").encode())
+    # Half a surrogate pair, as in a file name that is not UTF-8, is written as JSON escapes it.
+    write_bytes(path, (json_text(value) + "\n").encode(errors="backslashreplace"))
 
 
 def read_json(path: Path, *keys: str, advice: str = "") -> dict[str, Any]:
@@ -234,8 +237,10 @@ def _module_at(path: Path) -> Any:
     sys.modules[name] = module  # Equinox looks up a class's module by name
     try:
         spec.loader.exec_module(module)
-    except (Exception, SystemExit) as error:
-        raise ValueError(f"{path} cannot be imported: {type(error).__name__}: {error}") from error
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # also sys.exit
+        raise ValueError(f"{path} cannot be imported: {told(error)}") from error
     return module
 
 

@@ -273,7 +273,7 @@ def test_a_file_is_dropped_mapped_and_identified(address: str, page: Page, tmp_p
     ("name", "content", "sentence"),
     [
         ("bad.mat", b"\x80\x04\x95", "not a readable MAT file"),
-        ("notes.doc", b"hello", ".hdf5 or .parquet"),
+        ("notes.doc", b"hello", ".mcap or .db3"),
         ("cut.csv", b"time,pitch\n0,", "truncated"),
     ],
 )

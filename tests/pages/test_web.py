@@ -25,6 +25,7 @@ import numpy as np
 import pandas
 import pytest
 import scipy.io
+from bags import write
 from commands import PATIENCE, excite
 from served import EXPERIMENT, MAX_GAP, Told, browser, served, streamed
 from starlette.requests import Request
@@ -32,6 +33,7 @@ from starlette.testclient import TestClient
 
 from excite.files import write_json
 from excite.record import READ_ENDINGS
+from excite.record.bags import BAG_ENDINGS
 from excite.report.html import report_html
 from excite.study.objectives import OBJECTIVES
 from excite.web import application
@@ -234,11 +236,15 @@ def test_the_page_takes_every_file_that_is_read(ending: str, client, told: Told,
             file.update(table)
     elif ending == ".parquet":
         pandas.DataFrame(table).to_parquet(path)
+    elif ending in BAG_ENDINGS:
+        rows = [(t, None, {"data": value}) for t, value in zip(*table.values(), strict=True)]
+        path = write("json" if ending == ".mcap" else "db3", tmp_path, {"/force": rows})
     else:
         path.write_text("# t;a b\n0,0;1,0\n0,5;2,0\n")
     content = path.read_bytes()
     answer = client.post(f"/api/uploads?name={path.name}", content=content).json()
-    assert answer["columns"] == {"t": 2, "a" if ending == ".mat" else "a b": 2}
+    names = ("time", "/force.data") if ending in BAG_ENDINGS else ("t", "a b")
+    assert answer["columns"] == dict.fromkeys(names if ending != ".mat" else ("t", "a"), 2)
     assert ending in client.get("/").text.partition('accept="')[2].partition('"')[0].split(",")
 
 
@@ -474,9 +480,9 @@ BAD_FILES = {
     "binary.csv": (b"\x00\xff\xfe" * 30, "cannot be read as CSV text"),
     "cut.csv": (b"time,pitch\n0,1\n1,", "does not end with a line break"),
     "ragged.csv": (b"time,pitch\n0,1\n1,2,3\n", "is the file truncated?"),
-    "program.py": (b"raise SystemExit\n", ".hdf5 or .parquet"),
-    "policy.safetensors": (b"{}", ".hdf5 or .parquet"),
-    "archive.csv.gz": (b"\x1f\x8b", ".hdf5 or .parquet"),
+    "program.py": (b"raise SystemExit\n", ".mcap or .db3"),
+    "policy.safetensors": (b"{}", ".mcap or .db3"),
+    "archive.csv.gz": (b"\x1f\x8b", ".mcap or .db3"),
 }
 
 

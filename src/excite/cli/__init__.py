@@ -7,12 +7,14 @@ exits with 1; a traceback is printed only with `--debug`.
 
 from __future__ import annotations
 
+import io
 import sys
 import traceback
 
 import click
 
 from .. import __version__
+from ..description import told
 from .benchmark import benchmark
 from .compare_plants import compare_plants
 from .completion import complete_names
@@ -32,6 +34,7 @@ from .study import study
 from .train import train
 
 _DEBUG = "--debug"
+_LONGEST = 1000  # characters of a word in a message, such as a path
 
 _SECTIONS: dict[str, dict[click.Command, str]] = {
     "Try a plant, identify it": {
@@ -109,6 +112,9 @@ def main() -> None:
     debug = _DEBUG in sys.argv
     if debug:
         sys.argv.remove(_DEBUG)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # names of files may not be UTF-8
+            stream.reconfigure(errors="backslashreplace")
     code: object = 0
     try:
         code = cli(standalone_mode=False)
@@ -125,12 +131,13 @@ def main() -> None:
         # Messages for the user are plain ValueErrors; its subclasses come from libraries.
         if type(error) is ValueError or isinstance(error, OSError):
             _fail(str(error), 2, debug)
-        _fail(f"failed: {type(error).__name__}: {error} (--debug shows where)", 1, debug)
+        _fail(f"failed: {told(error)} (--debug shows where)", 1, debug)
     sys.exit(code if isinstance(code, int) else 0)
 
 
 def _fail(sentence: str, code: int, debug: bool) -> None:
     if debug:
         traceback.print_exc()
-    click.echo(f"excite: {' '.join(sentence.split())}", err=True)
+    words = (word if len(word) <= _LONGEST else f"{word[:99]}..." for word in sentence.split())
+    click.echo(f"excite: {' '.join(words)}", err=True)
     sys.exit(code)

@@ -51,7 +51,8 @@ _OF_RECORDS = (
         "--column",
         type=NAMES,
         multiple=True,
-        help="Columns of the file that have another name: pitch=qm; a comma in it is written \\,.",
+        help="Columns of the file that have another name: pitch=qm; of a bag by topic and field: "
+        "pitch=/joint_states.position[0]; a comma in it is written \\,.",
     ),
     click.option(
         "--scale",
@@ -184,8 +185,9 @@ def identify(
 ) -> int:
     """Estimate PLANT's parameters from one or several records.
 
-    A record is a file .csv, .txt, .dat, .tsv, .mat, .h5, .hdf5 or .parquet. Several records are
-    fitted together: they share the parameters, each has its initial state.
+    A record is a file .csv, .txt, .dat, .tsv, .mat, .h5, .hdf5, .parquet, .mcap or .db3, or the
+    folder of a ROS 2 bag. Several records are fitted together: they share the parameters, each
+    has its initial state.
     """
     from ..estimation.identify import identify as verb
     from ..estimation.result import write_run

@@ -86,7 +86,10 @@ class WholeNumber(click.IntRange):
 
 def _option_value(text: str) -> bool | float | list[object]:
     """A number, true, false or a list of numbers, as TOML and JSON write them."""
-    value = json.loads(text)
+    try:
+        value = json.loads(text)
+    except RecursionError:
+        raise ValueError(text) from None
     if not isinstance(value, bool | int | float | list):
         raise ValueError(text)
     return value

@@ -200,6 +200,7 @@ def identify(
     shares = [_state_from(record, plant, validate_state) for record in validation]
     for record in validation:
         _require_enough(plant, [record], 0, False)
+    _require_short_delays(plant, begin, records)
     linear = _linear_inputs(plant, hold_input)
     if not isinstance(estimator, AbstractSearch):
         _require_complete(estimator, [*records, *validation], linear)
@@ -443,6 +444,18 @@ def _require_enough(
             f"{where}: {values} measured values for {num_params + states} unknowns ({num_params} "
             f"parameters, {states} initial states); more values than unknowns are needed"
         )
+
+
+def _require_short_delays(plant: AbstractPlant, begin: Params, records: Sequence[Record]) -> None:
+    """Raises ValueError where the search begins with a delay that moves all inputs out."""
+    delay, span = plant.delay(begin), max(float(np.ptp(record.time)) for record in records)
+    names = names_of(plant.definition.inputs)
+    for name, value in zip(names, () if delay is None else delay, strict=False):
+        if abs(value) >= span:
+            raise ValueError(
+                f"the delay of input {name!r} is {float(value):g} s, and the longest record has "
+                f"{span:g} s; begin with a shorter one (--start, --hold)"
+            )
 
 
 def parts_of(record: Record) -> list[slice]:

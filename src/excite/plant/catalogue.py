@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..description import Listing, first_line, names_of, unknown, wrong_type
+from ..description import Listing, first_line, names_of, told, unknown, wrong_type
 from ..files import class_at
 from .aero2 import Aero2, Aero2Detailed, Aero2Lag
 from .cart_pole import CartPole
@@ -98,6 +98,10 @@ def _complete(plant_class: type[AbstractPlant], where: str) -> AbstractPlant:
         return plant_class()
     except (TypeError, AttributeError) as error:  # a method or the definition is missing
         raise ValueError(f"{where} is not a complete plant: {error}") from None
+    except (ValueError, KeyboardInterrupt):
+        raise
+    except BaseException as error:  # also sys.exit
+        raise ValueError(f"{where} cannot be made: {told(error)}") from error
 
 
 def _check_plant(plant: AbstractPlant, where: str) -> None:
@@ -109,7 +113,8 @@ def _check_plant(plant: AbstractPlant, where: str) -> None:
         ("output", (state, plant.nominal), len(d.outputs)),
     ):
         try:
-            shape = jnp.shape(jax.eval_shape(getattr(plant, name), *arguments))
+            found = jax.eval_shape(getattr(plant, name), *arguments)
+            shape, kind = jnp.shape(found), getattr(found, "dtype", float)
         except jax.errors.ConcretizationTypeError as error:
             raise ValueError(
                 f"{name} of {where} branches on the value of a state, an input or a parameter "
@@ -119,10 +124,14 @@ def _check_plant(plant: AbstractPlant, where: str) -> None:
             raise ValueError(
                 f"{name} of {where} uses NumPy: use jax.numpy (import jax.numpy as jnp)"
             ) from error
-        except Exception as error:
-            raise ValueError(f"{name} of {where} fails: {type(error).__name__}: {error}") from error
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:  # also sys.exit
+            raise ValueError(f"{name} of {where} fails: {told(error)}") from error
         if shape != (count,):
             raise ValueError(f"{name} of {where} returns shape {shape}; ({count},) is needed")
+        if jnp.issubdtype(kind, jnp.complexfloating):
+            raise ValueError(f"{name} of {where} returns complex numbers; real ones are needed")
 
 
 def require_inputs(plant: AbstractPlant) -> None:

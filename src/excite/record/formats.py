@@ -1,28 +1,35 @@
-"""Columns of experiment files of every kind, by name: text, MAT, HDF5 and Parquet."""
+"""Columns of experiment files of every kind, by name: text, MAT, HDF5, Parquet and bags."""
 
 from __future__ import annotations
 
-import contextlib
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Collection
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 
+from .bags import is_bag, read_bag
+from .damage import MAX_UNPACKED, damage_reported, require_size
 from .record import TEXT_ENDINGS, read_sidecar, require_matlab, require_readable
 from .text import read_text
 
-_MAX_UNPACKED = 256 * 2**20  # bytes of all columns of a file, which may be compressed
 _MAT_NUMBERS = re.compile(r"double|single|u?int(8|16|32|64)|logical")
 
 
-def columns_in(path: Path) -> dict[str, np.ndarray]:
+def columns_in(
+    path: Path, wanted: Collection[str] | None = None, held: Collection[str] = ()
+) -> dict[str, np.ndarray]:
     """Columns of a file by name: numbers, dates, or where a cell is no number texts.
 
     A single number, such as a sampling time, is a column of one sample.
+
+    Args:
+        path: the file, or the folder of a ROS 2 bag.
+        wanted: of a bag, where each topic has its own instants, the columns to join; default all.
+        held: those of them that keep their value until the next message.
 
     Raises:
         ValueError: one sentence for a file that cannot be read.
@@ -30,6 +37,8 @@ def columns_in(path: Path) -> dict[str, np.ndarray]:
     require_readable(path)
     ending = path.suffix.lower()
     try:
+        if is_bag(path):
+            return read_bag(path, wanted, held)
         if ending in TEXT_ENDINGS:
             return _by_observable(path, read_text(path, is_own=bool(read_sidecar(path))))
         if ending == ".parquet":
@@ -70,23 +79,6 @@ def _by_observable(path: Path, table: dict[str, np.ndarray]) -> dict[str, np.nda
     return columns
 
 
-@contextlib.contextmanager
-def _damage_reported(path: Path, kind: str, advice: str = "") -> Iterator[None]:
-    """One sentence for what a library raises, of any type, where a file is damaged."""
-    try:
-        yield
-    except NotImplementedError:
-        raise
-    except Exception as error:
-        raise ValueError(f"{path}: not a readable {kind} file ({error}){advice}") from None
-
-
-def _require_size(path: Path, size: int) -> None:
-    if size > _MAX_UNPACKED:
-        sizes = f"{size / 2**20:.0f} MiB unpacked, more than {_MAX_UNPACKED >> 20}"
-        raise ValueError(f"{path}: its columns take {sizes}; save it with fewer of them")
-
-
 def _no_column(path: Path, kind: str, found: list[str]) -> ValueError:
     return ValueError(
         f"{path}: each column must be a {kind} that is a vector of numbers; the file holds "
@@ -103,7 +95,7 @@ def _read_mat(path: Path) -> dict[str, np.ndarray]:
     """Vectors of numbers in a MAT file; nothing else of it is loaded."""
     reader = require_matlab(path)
     try:
-        with _damage_reported(path, "MAT"):
+        with damage_reported(path, "MAT"):
             listed = reader.whosmat(path)
     except NotImplementedError:  # MAT files of version 7.3 are HDF5
         return _read_hdf5(path)
@@ -115,8 +107,8 @@ def _read_mat(path: Path) -> dict[str, np.ndarray]:
     if not shapes:
         found = [f"{name} ({'x'.join(map(str, shape))} {kind})" for name, shape, kind in listed]
         raise _no_column(path, "variable", found)
-    _require_size(path, 8 * sum(map(math.prod, shapes.values())))
-    with _damage_reported(path, "MAT"):
+    require_size(path, 8 * sum(map(math.prod, shapes.values())))
+    with damage_reported(path, "MAT"):
         content = reader.loadmat(path, variable_names=list(shapes))
     vectors = {name: content[name] for name in shapes if name in content}
     return {n: np.asarray(v, float).ravel() for n, v in vectors.items() if v.dtype.kind in "fiub"}
@@ -143,14 +135,14 @@ def _read_hdf5(path: Path) -> dict[str, np.ndarray]:
 
     is_mat = path.suffix.lower() == ".mat"
     kind = ("MAT 7.3", "; save it again with -v7 or as CSV") if is_mat else ("HDF5",)
-    with _damage_reported(path, *kind), h5py.File(path, "r") as file:
+    with damage_reported(path, *kind), h5py.File(path, "r") as file:
         file.visititems(collect)
         vectors = {name: part for name, part in found.items() if _is_vector_of_numbers(part)}
         listed = [f"{name} ({part.dtype})" for name, part in found.items()]
         size = 8 * sum(part.size for part in vectors.values())
-        is_small = size <= _MAX_UNPACKED
+        is_small = size <= MAX_UNPACKED
         columns = {n: part[()].astype(float).ravel() for n, part in vectors.items() if is_small}
-    _require_size(path, size)
+    require_size(path, size)
     if not columns:
         raise _no_column(path, "dataset", listed)
     return columns
@@ -177,14 +169,14 @@ def _require_parquet(path: Path) -> ModuleType:
 def _read_parquet(path: Path) -> dict[str, np.ndarray]:
     """Columns of numbers and dates in a Parquet file; texts, which may unpack to much, are not."""
     arrow = _require_parquet(path)
-    with _damage_reported(path, "Parquet"), arrow.parquet.ParquetFile(path) as file:
+    with damage_reported(path, "Parquet"), arrow.parquet.ParquetFile(path) as file:
         kinds = {part.name: part.type for part in file.schema_arrow}
         is_kind = arrow.types.is_primitive, arrow.types.is_decimal
         names = [name for name, kind in kinds.items() if any(test(kind) for test in is_kind)]
         size = 8 * file.metadata.num_rows * len(names)
-        table = file.read(names if size <= _MAX_UNPACKED else [])
+        table = file.read(names if size <= MAX_UNPACKED else [])
         frame = table.to_pandas(ignore_metadata=True)  # an index is a column, too
-    _require_size(path, size)
+    require_size(path, size)
     if not names:
         raise _no_column(path, "column", [f"{name} ({kind})" for name, kind in kinds.items()])
     return {str(name): _of_frame(column) for name, column in frame.items()}

@@ -18,6 +18,9 @@ TIMES_DT = 50.0  # likewise sampling times this many times the plant's
 _TIMES_SCALE = 10.0  # likewise outputs beyond this many times their typical size
 
 
+LEAVE_OUT = "--rows START:STOP takes a part of the file"
+
+
 def require_columns(
     record: Record, description: PlantDescription, inputs_only: bool = False
 ) -> None:
@@ -53,7 +56,7 @@ def check_finite(values: np.ndarray, name: str, path: Path) -> None:
     if bad.size:
         raise ValueError(
             f"{path}: sample {bad[0] + 1} of {name!r} is {values[bad[0]]}; "
-            f"{bad.size} of {values.size} samples are not finite numbers"
+            f"{bad.size} of {values.size} samples are not finite numbers ({LEAVE_OUT})"
         )
 
 
@@ -68,7 +71,8 @@ def check_time(time: np.ndarray, path: Path) -> None:
         what = "is there twice" if time[k + 1] == time[k] else "goes backwards"
         raise ValueError(
             f"{path}: 'time' {what}: sample {k + 1} is at {time[k]:.6g} s, sample {k + 2} at "
-            f"{time[k + 1]:.6g} s; {bad.size} of {time.size - 1} steps do not increase"
+            f"{time[k + 1]:.6g} s; {bad.size} of {time.size - 1} steps do not increase "
+            f"({LEAVE_OUT}; --dt gives a sampling time instead)"
         )
 
 
@@ -82,12 +86,14 @@ def unbroken(time: np.ndarray) -> list[slice]:
     """Parts of a record without a gap in time, of two samples or more.
 
     In an even record a gap is a missing sample, because the input in between is unknown; in an
-    uneven one it is a step of more than ten times the usual one.
+    uneven one it is a step of more than ten times a usual one. Of two topics at almost the same
+    instants every other step is very short, so that a usual step is not the median one.
     """
     steps = np.diff(time)
     usual = np.median(steps)
     most_are_usual = np.mean(np.abs(steps - usual) <= _UNEVEN * usual) >= _MOST
-    gaps = np.flatnonzero(steps > (_MISSING if most_are_usual else _GAP) * usual) + 1
+    longest = _MISSING * usual if most_are_usual else _GAP * np.quantile(steps, _MOST)
+    gaps = np.flatnonzero(steps > longest) + 1
     ends = [0, *gaps.tolist(), time.size]
     return [slice(a, b) for a, b in pairwise(ends) if b - a > 1]
 
@@ -104,23 +110,23 @@ def check_size(values: np.ndarray, part: Input | Output, path: Path) -> None:
     """Raises ValueError for values so large that their unit must be wrong."""
     if isinstance(part, Input):
         middle, half = (part.upper + part.lower) / 2, (part.upper - part.lower) / 2
-        worst = values[np.argmax(np.abs(values - middle))]
-        excess, allowed = abs(worst - middle) / half, _TIMES_LIMIT
+        excess, allowed = np.abs(values - middle) / half, _TIMES_LIMIT
         expected = f"the plant's limits are {part.lower:g} to {part.upper:g} {part.unit}"
     else:
-        worst = values[np.argmax(np.abs(values))]
-        excess, allowed = abs(worst) / part.scale, _TIMES_SCALE
+        excess, allowed = np.abs(values) / part.scale, _TIMES_SCALE
         expected = f"a usual size is {part.scale:g} {part.unit}"
-    if excess > allowed:
+    beyond, worst = np.flatnonzero(excess > allowed), values[np.nanargmax(excess)]
+    if beyond.size:
         raise ValueError(
             f"{path}: {part.name!r} reaches {worst:g} {part.unit}, {expected}; "
-            f"is it in another unit? {unit_hint(part.name)}"
+            f"is it in another unit? {unit_hint(part.name)}. {beyond.size} of {values.size} "
+            f"samples are that large, the first is {beyond[0] + 1} ({LEAVE_OUT})"
         )
 
 
 def unit_hint(name: str) -> str:
     """What to do about a column in another unit."""
     return (
-        f"Give a scale, {name}=FACTOR (1 confirms that the unit is right), or the unit, "
+        f"Give a scale, --scale {name}=FACTOR (1 confirms that the unit is right), or the unit, "
         f"--unit {name}=UNIT"
     )

@@ -21,9 +21,18 @@ from typing import Any
 import numpy as np
 
 from ..description import Input, Output, PlantDescription, names_of, path_from
+from .bags import is_bag
 from .dates import seconds_of
 from .formats import columns_in
-from .prepare import TIMES_DT, check_finite, check_size, check_time, require_playable, unit_hint
+from .prepare import (
+    LEAVE_OUT,
+    TIMES_DT,
+    check_finite,
+    check_size,
+    check_time,
+    require_playable,
+    unit_hint,
+)
 from .record import Record, described_in, read_sidecar
 from .units import unit_factor
 
@@ -55,7 +64,7 @@ def read_record(
 
     Args:
         path: the file; its ending tells its kind: .csv, .txt, .dat, .tsv, .mat, .h5, .hdf5,
-            .parquet.
+            .parquet, .mcap, .db3; a ROS 2 bag may be a folder.
         description: the plant; default that of the sidecar.
         columns: names in the file where they are not the plant's: {"pitch": "qm"}. Columns of a
             file without names are "1", "2", ...
@@ -197,7 +206,11 @@ def _cells(
     given = [options.column(name) for name in needed]
     if twice := [n for n, column in zip(needed, given, strict=True) if given.count(column) > 1]:
         raise ValueError(f"{path}: {' and '.join(map(repr, twice))} cannot be the same column")
-    table = columns_in(path)
+    if options.dt is not None and is_bag(path):
+        raise ValueError(f"{path}: its messages have their times; --dt is for a file without time")
+    inputs = names_of(options.description.inputs)
+    held = [column for name, column in zip(needed, given, strict=True) if name in inputs]
+    table = columns_in(path, given, held)
     if in_file := [name for name in options.set_inputs if name in table]:
         raise ValueError(
             f"{path}: the file has a column {in_file[0]!r}; --set-input is for inputs that it does "
@@ -323,7 +336,7 @@ def _values(cells: np.ndarray, part: Input | Output, options: _Options, where: P
         raise ValueError(f"{where}: {part.name!r} has no measurement in {len(values)} samples")
     check_finite(np.where(measured, values, 0.0), part.name, where)
     if not options.confirms(part.name):
-        check_size(values[measured], part, where)
+        check_size(values, part, where)
     return values
 
 
@@ -344,7 +357,9 @@ def _bad_cell(cells: np.ndarray, k: int, name: str, what: str, where: Path) -> V
     found = f"is {_short(text)!r}, {what}" if _is_there(cells[k]) else "is missing"
     if _THOUSANDS.fullmatch(text):
         found += "; save the file without thousands separators"
-    elif k == 0:
+    elif k:
+        found += f"; {LEAVE_OUT}"
+    else:
         found += "; every row below the names must hold numbers (--rows 1: leaves out the first)"
     return ValueError(f"{where}: sample {k + 1} of {name!r} {found}")
 

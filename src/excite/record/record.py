@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 RECORD_KIND = "excite record"
 
 TEXT_ENDINGS = (".csv", ".txt", ".dat", ".tsv")
-READ_ENDINGS = (*TEXT_ENDINGS, ".mat", ".h5", ".hdf5", ".parquet")
+READ_ENDINGS = (*TEXT_ENDINGS, ".mat", ".h5", ".hdf5", ".parquet", ".mcap", ".db3")
 WRONG_ENDING = f"experiment files end in {', '.join(READ_ENDINGS[:-1])} or {READ_ENDINGS[-1]}"
 _MAX_FILE, _MAX_SIDECAR = 2**29, 2**24  # bytes
 
@@ -150,10 +150,21 @@ def require_record_ending(path: Path) -> None:
 
 def require_readable(path: Path) -> None:
     """Raises ValueError, before anything is read, for what is no experiment file."""
+    if path.is_dir():
+        if not (path / "metadata.yaml").is_file():
+            raise ValueError(
+                f"{path}: is a folder; only files can be read, and ROS 2 bags, folders with a "
+                "metadata.yaml"
+            )
+        for part in path.iterdir():
+            _require_readable_file(part)
+        return
     if path.suffix.lower() not in READ_ENDINGS:
         raise ValueError(f"{path}: {WRONG_ENDING}")
-    if path.is_dir():
-        raise ValueError(f"{path}: is a folder; only files can be read")
+    _require_readable_file(path)
+
+
+def _require_readable_file(path: Path) -> None:
     if not path.exists():
         raise ValueError(f"{path}: no such file")
     if not os.access(path, os.R_OK):
