@@ -23,6 +23,7 @@ from experiments import NUM_STEPS
 
 from excite.cli import cli, completion, main
 from excite.cli.options import Lines, progress_bar
+from excite.cli.study import running
 from excite.estimation.catalogue import ESTIMATORS
 from excite.excitation.catalogue import EXCITATIONS
 from excite.plant import Aero2
@@ -961,9 +962,23 @@ def test_an_interrupted_benchmark_ends_with_130_and_leaves_nothing(here, tmp_pat
         program.kill()
     assert program.returncode == 130
     assert out == ""
-    assert err.strip() == "excite: interrupted; nothing was written"
+    assert err.strip() == "excite: interrupted; no file was left incomplete"
     assert contents(here) == before
     assert not (here / "run").exists()
+
+
+@pytest.mark.parametrize("keeps", [None, "missing", "there"])
+def test_an_interrupted_study_says_what_is_kept(keeps, tmp_path, capsys):
+    (tmp_path / "there").mkdir()
+    folder = None if keeps is None else tmp_path / keeps
+    is_kept = keeps == "there"
+    with (
+        click.Context(cli),
+        pytest.raises(SystemExit if is_kept else KeyboardInterrupt),
+        running("tiny", folder),
+    ):
+        raise KeyboardInterrupt
+    assert ("kept in" in capsys.readouterr().err) == is_kept
 
 
 WITHOUT_JAX = "import sys; sys.modules['jax'] = None; from excite.cli import main; main()"

@@ -535,8 +535,8 @@ def test_a_folder_in_use_is_refused(run):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--engine", "dask"], ["--address"]),
-        (["--address", "tcp://127.0.0.1:1"], ["--engine dask"]),
+        (["--engine", "dask"], ["'dask'", "address"]),
+        (["--address", "tcp://127.0.0.1:1"], ["engine 'dask'"]),
         (["--engine", "dask", "--address", "nowhere"], ["'nowhere'", "tcp://"]),
         (["--engine", "dask", "--address", "tcp://127.0.0.1:9"], ["no Dask scheduler"]),
         (["--workers", "0"], ["--workers"]),

@@ -59,7 +59,9 @@ def changes(command: Callable[..., Any]) -> Callable[..., Any]:
 )
 @click.option("--address", metavar="tcp://HOST:PORT", help="Scheduler of the Dask cluster.")
 @click.option(
-    "--workers", type=WholeNumber(1), help="Processes of the local engine; default one a core."
+    "--workers",
+    type=WholeNumber(1),
+    help="Processes of the local engine, for agents and designed signals; default one a core.",
 )
 @plot_option
 @json_option
@@ -84,7 +86,8 @@ def run_study_here(
         text = f"waiting for workers of the scheduler at {options['address']}"
         click.echo(text, err=True)
 
-    keeps = out if chosen.agents or chosen.clairvoyant else None
+    is_resumed = not options["overwrite"] or options.get("engine") == "dask"
+    keeps = out if chosen.agents or chosen.clairvoyant or is_resumed else None
     with running(chosen.name, keeps) as told:
         found = run_study(chosen, out, on_wait=waiting, **told, **options)
     if plot is not None:
@@ -99,7 +102,7 @@ def running(name: str, keeps: Path | None) -> Iterator[dict[str, Any]]:
     """Messages of a running study, as arguments of a verb; shared with `train`.
 
     Args:
-        keeps: folder that keeps finished tasks after an interruption.
+        keeps: folder that keeps finished tasks after an interruption, if it exists by then.
     """
     from ..study.run import StudyFailedError
 
@@ -112,7 +115,7 @@ def running(name: str, keeps: Path | None) -> Iterator[dict[str, Any]]:
     except StudyFailedError as error:
         raise RunFailedError(str(error)) from None
     except KeyboardInterrupt:
-        if keeps is None:
+        if keeps is None or not keeps.exists():
             raise
         kept = f"what is finished is kept in {keeps}; rerun the same command to resume"
         click.echo(f"excite: interrupted; {kept}", err=True)
