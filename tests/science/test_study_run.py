@@ -19,7 +19,7 @@ from cluster import Cluster, wait_for
 from commands import PATIENCE, excite
 
 from excite.policy import read_policy
-from excite.record.rows import SeedMetrics
+from excite.report.rows import SeedMetrics
 from excite.study import table
 from excite.study.engine import local_engine
 from excite.study.folder import seed_folder, study_of

@@ -91,7 +91,7 @@ def run_study_here(
     with running(chosen.name, keeps) as told:
         found = run_study(chosen, out, on_wait=waiting, **told, **options)
     if plot is not None:
-        from ..record.figure import save
+        from ..figure import save
 
         save(found.plot(), plot)
     show_comparison(found, out, as_json)

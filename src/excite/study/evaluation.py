@@ -21,7 +21,7 @@ from ..estimation import AbstractEstimator, stack_experiments
 from ..excitation import AbstractExcitation
 from ..information import d_optimality, require_noise
 from ..plant import AbstractPlant
-from ..record.rows import BoundByLength, Row, StudyFacts
+from ..report.rows import BoundByLength, Row, StudyFacts
 from ..report.study_table import StudyTable
 from ..rig.filter import SafetyFilter
 from ..rig.simulated import bodies, evaluate_on_rig, readings_per_sample

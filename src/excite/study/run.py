@@ -21,6 +21,7 @@ from typing import Any, Literal
 import jax
 
 from .. import __version__
+from ..figure import image
 from ..files import (
     csv_text,
     json_ready,
@@ -32,10 +33,9 @@ from ..files import (
 )
 from ..plant import AbstractPlant
 from ..policy import POLICY_ENDING, read_policy
-from ..record.figure import image
 from ..record.read import SIGNAL_ENDINGS
-from ..record.rows import Rows
 from ..report.frontier import frontier_figure, lengths_figure
+from ..report.rows import Rows
 from ..report.study_figures import agents_figure, curves_figure
 from ..report.study_table import StudyTable, differences_csv
 from ..training.checkpoint import Progress

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.stats
 
 from ..description import PlantDescription, names_of
-from ..record.rows import (
+from ..report.rows import (
     BoundByLength,
     Difference,
     ErrorStatistics,

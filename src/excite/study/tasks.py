@@ -27,7 +27,7 @@ from ..excitation import PolicyExcitation, Replay
 from ..files import write_bytes
 from ..plant import AbstractPlant
 from ..policy import Policy
-from ..record.rows import Rows, SeedMetrics
+from ..report.rows import Rows, SeedMetrics
 from ..training.checkpoint import Checkpoint, Trained
 from ..training.signals import clairvoyant_signals, signal_env
 from .agent import Agent
