@@ -16,7 +16,7 @@ from excite.excitation import PRBS, Chirp, Random
 from excite.files import json_ready
 from excite.information import best_possible
 from excite.plant import EMPS, Aero2, draw_params
-from excite.study import evaluation as benchmark
+from excite.study import methods as benchmark
 from excite.study.run import _locked, opened, run_study
 from excite.study.spec import Study, study_from
 from excite.study.statistics import wilson

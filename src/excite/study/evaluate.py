@@ -13,7 +13,7 @@ from ..plant.catalogue import PlantLike
 from ..policy import POLICY_ENDING, Policy, mismatch, read_policy
 from ..report.study_table import StudyTable
 from ..training.checkpoint import Progress
-from .evaluation import compared
+from .methods import compared
 from .spec import plant_tables, study_from
 
 

@@ -42,15 +42,15 @@ from ..training.checkpoint import Progress
 from .catalogue import study_path
 from .cluster import dask_engine
 from .engine import Engine, local_engine, run
-from .episodes import episodes_data, example_episodes
-from .evaluation import compared, method_rows
+from .example_episodes import episodes_data, example_episodes
 from .folder import agent_settings, fingerprint, read_json, seed_folder, study_of
+from .methods import compared, method_rows
+from .pool import num_cores
 from .progress import read_progress, remove_progress
 from .spec import Study, read_study
 from .table import best_seeds, learning_curves, study_table
 from .tasks import clairvoyant_task, methods_task, seed_task
 from .worker import OF_PPO
-from .workers import num_cores
 
 KIND = "excite study"
 FREE = {"name", "title", "inferred", "ours", "reference", "source"}

@@ -24,8 +24,8 @@ from ..report.rows import (
 )
 from ..report.study_table import StudyTable
 from ..training.gradient import GradientSettings, rank
-from .evaluation import facts
 from .folder import advice, damaged, read_columns, read_json, seed_folder, study_of
+from .methods import facts
 from .spec import Study
 from .statistics import mean_sd, violation_rate
 

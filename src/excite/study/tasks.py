@@ -31,8 +31,8 @@ from ..report.rows import Rows, SeedMetrics
 from ..training.checkpoint import Checkpoint, Trained
 from ..training.signals import clairvoyant_signals, signal_env
 from .agent import Agent
-from .evaluation import episode_keys, evaluate_method, method_rows, scores
 from .folder import agent_settings, fingerprint
+from .methods import episode_keys, evaluate_method, method_rows, scores
 from .progress import write_progress
 from .spec import Study, study_from
 from .statistics import table_row
