@@ -49,6 +49,21 @@ def test_a_verb_with_the_name_of_a_module_is_a_verb_whatever_was_imported(record
         ex.report([], "page.txt")
 
 
+def test_a_report_replaces_a_file_only_if_it_may(tmp_path):
+    ex.simulate("aero2", steps=20).save(tmp_path / "record.csv")
+    told = []
+    page = ex.report(
+        tmp_path / "record.csv", tmp_path / "r.html", progress=lambda *n: told.append(n)
+    )
+    assert told == [("record.csv", 0, 1), ("done", 1, 1)]
+    (tmp_path / "r.html").write_text("mine")
+    with pytest.raises(ValueError, match=r"r\.html exists"):
+        ex.report(tmp_path / "record.csv", tmp_path / "r.html")
+    assert (tmp_path / "r.html").read_text() == "mine"
+    ex.report(tmp_path / "record.csv", tmp_path / "r.html", overwrite=True)
+    assert (tmp_path / "r.html").read_text() == page
+
+
 @pytest.fixture(scope="module")
 def record():
     return ex.simulate("aero2", "chirp", steps=200)
