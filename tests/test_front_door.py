@@ -3,6 +3,7 @@
 import doctest
 import inspect
 import json
+import re
 import subprocess
 import sys
 import textwrap
@@ -91,6 +92,12 @@ def test_a_result_shows_itself(result):
     assert result.plot().axes
     with pytest.raises(AttributeError, match="did you mean 'D_p'"):
         result.params.Dp  # noqa: B018
+
+
+def test_a_record_shows_the_same_as_text_and_as_html(record):
+    text = re.sub(r"<[^>]*>", " ", record._repr_html_()).split()
+    for word in repr(record).replace(" to ", " ").split():
+        assert word.strip(":,") in [t.strip(":,") for t in text]
 
 
 def test_a_record_is_replayed_and_its_inputs_are_a_signal(record):
