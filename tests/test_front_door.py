@@ -7,12 +7,15 @@ import re
 import subprocess
 import sys
 import textwrap
+from pathlib import Path
 
+import click
 import numpy as np
 import pytest
 from catalogue import LONG
 
 import excite as ex
+from excite.cli import cli
 
 NAMES = [name for name in ex.__all__ if name != "__version__"]
 
@@ -48,6 +51,21 @@ def test_a_verb_with_the_name_of_a_module_is_a_verb_whatever_was_imported(record
     assert ex.information("aero2", steps=100).plant.name == "aero2"
     with pytest.raises(ValueError, match="html"):
         ex.report([], "page.txt")
+
+
+@pytest.mark.parametrize("name", [n for n in ex.__all__ if n.replace("_", "-") in cli.commands])
+def test_an_option_is_an_argument_or_listed_as_an_exception(name):
+    page = Path(__file__).parent.parent / "docs" / "reference" / "python" / "index.md"
+    _, _, section = page.read_text(encoding="utf-8").partition("## Where the command line differs")
+    listed = set(re.findall(r"--([a-z-]+)", section.partition("\n## ")[0]))
+    parameters = inspect.signature(getattr(ex, name)).parameters
+    if "options" in parameters and parameters["options"].kind is inspect.Parameter.VAR_KEYWORD:
+        parameters = {**parameters, **inspect.signature(ex.identify).parameters}
+    options = [
+        p for p in cli.commands[name.replace("_", "-")].params if isinstance(p, click.Option)
+    ]
+    words = {word.removeprefix("--") for p in options for word in p.opts if word.startswith("--")}
+    assert {w for w in words if w.replace("-", "_") not in parameters} <= listed
 
 
 def test_a_report_replaces_a_file_only_if_it_may(tmp_path):

@@ -198,7 +198,7 @@ def test_numbers_of_other_programs_are_read_to_twelve_digits(tmp_path: Path):
     ("time,u,y\n0,1,1\n0.1,on,1\n", ("sample 2 of 'u' is 'on', not a number",)),
     ("time,u,y\n0,1,1\n0.1,\"1,5\",1\n", ("sample 2 of 'u' is '1,5', not a number",)),
     ("time,u,y,u\n0,1,1,2\n0.1,1,1,3\n", ("'u' is there twice", "u (column 2) or u (column 4)")),
-    ("Time,U,speed\n0,1,1\n0.1,1,1\n", ("no column 'time' (did you mean 'Time'?)", "sampling time, dt")),
+    ("Time,U,speed\n0,1,1\n0.1,1,1\n", ("no column 'time' (did you mean 'Time'?)", ", dt")),
     ("time,u,Y1\n0,1,1\n0.1,1,1\n", ("no column 'y'", "time, u, Y1", "column y=NAME")),
     (b"time,u,y\n0,1,1\n0.1,\x81\x8d,1\n", ("cannot be read as CSV text", "UTF-8")),
     ("# nothing\n\n", ("is empty",)),
