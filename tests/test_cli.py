@@ -390,15 +390,22 @@ def test_a_progress_bar_goes_to_stderr_of_a_terminal_alone(run, here, monkeypatc
 
 
 def test_where_stderr_is_no_terminal_lines_tell_how_far_it_is(monkeypatch, capsys):
+    def told(step: str) -> str:
+        """The first line about this step."""
+        deadline = time.monotonic() + PATIENCE
+        while time.monotonic() < deadline:
+            for line in capsys.readouterr().err.splitlines():
+                if step in line:
+                    return line
+            time.sleep(0.02)
+        raise TimeoutError(step)
+
     monkeypatch.setenv("EXCITE_PROGRESS", "0.05")
     with Lines("designing") as lines:
         lines.update("trial 1 of 4", 1, 4)
-        time.sleep(0.2)
+        assert re.fullmatch(r"designing: trial 1 of 4, \d+ s so far", told("trial 1"))
         lines.update("trial 2 of 4", 2, 4)
-        time.sleep(0.2)
-    told = capsys.readouterr().err.splitlines()
-    assert re.fullmatch(r"designing: trial 1 of 4, \d+ s so far", told[0])
-    assert re.fullmatch(r"designing: trial 2 of 4, 50 %, \d+ s left", told[-1])
+        assert re.fullmatch(r"designing: trial 2 of 4, 50 %, \d+ s left", told("trial 2"))
 
 
 # Plants, doctor
