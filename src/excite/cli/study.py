@@ -86,9 +86,11 @@ def run_study_here(
         text = f"waiting for workers of the scheduler at {options['address']}"
         click.echo(text, err=True)
 
+    has_tasks = bool(chosen.agents or chosen.clairvoyant)
     is_resumed = not options["overwrite"] or options.get("engine") == "dask"
-    keeps = out if chosen.agents or chosen.clairvoyant or is_resumed else None
-    with running(chosen.name, keeps) as told:
+    with running(chosen.name, out if has_tasks or is_resumed else None) as told:
+        if not has_tasks:  # the table shows that the methods are done
+            del told["on_done"]
         found = run_study(chosen, out, on_wait=waiting, **told, **options)
     if plot is not None:
         from ..figure import save
