@@ -597,7 +597,7 @@ def test_a_run_folder_and_a_figure_are_left(run, here):
     assert "pitch [deg]" in (here / "fit.svg").read_text()
     again = run(*words.split())
     assert again.code == 2
-    assert "--overwrite" in again.err
+    assert "overwrite it" in again.err
     assert run(*words.split(), "--overwrite").code == 0
     assert [f.name for f in (here / "runs").iterdir()] == ["one"]
 
@@ -728,7 +728,7 @@ def test_a_defect_is_a_failed_run_in_one_line(run, here, monkeypatch):
 IDENTIFY = "identify {} --plant aero2 --out run --plot fit.png"
 BAD: dict[str, tuple[str, tuple[str, ...]]] = {
     "unknown column": (
-        IDENTIFY.format("column.csv"), ("column.csv", "'pitch'", "theta", "--column pitch=NAME"),
+        IDENTIFY.format("column.csv"), ("column.csv", "'pitch'", "theta", "column pitch=NAME"),
     ),
     "missing sample": (IDENTIFY.format("missing.csv"), ("missing.csv", "sample 5", "'voltage'")),
     "NaN": (IDENTIFY.format("nan.csv"), ("nan.csv", "sample 5", "'voltage'", "finite")),
@@ -826,13 +826,13 @@ BAD: dict[str, tuple[str, tuple[str, ...]]] = {
     ),
     "input beyond the limits": ("simulate aero2 loud.csv", ("loud.csv", "-24 to 24 V")),
     "start for what does not search": (
-        "identify good.csv --plant aero2 --estimator arx-rls --start J_p=0.02", ("--start",),
+        "identify good.csv --plant aero2 --estimator arx-rls --start J_p=0.02", ("takes no start",),
     ),
     "held in what estimates all": (
-        "identify good.csv --plant aero2 --estimator arx-rls --hold J_p=0.02", ("--hold",),
+        "identify good.csv --plant aero2 --estimator arx-rls --hold J_p=0.02", ("takes no hold",),
     ),
-    "a filter without a rig": ("evaluate aero2 --filter", ("--rig",)),
-    "record that exists": ("simulate aero2 --out good.csv", ("good.csv", "--overwrite")),
+    "a filter without a rig": ("evaluate aero2 --filter", ("filter needs rig",)),
+    "record that exists": ("simulate aero2 --out good.csv", ("good.csv", "overwrite it")),
     "record beside a foreign file": (
         "simulate aero2 --out notes.csv --overwrite", ("notes.json", "lost"),
     ),
