@@ -184,9 +184,9 @@ def test_a_design_is_saved_shown_and_played(tmp_path):
     ("arguments", "sentence"),
     [
         ({"kind": "chrip"}, "unknown kind of design 'chrip'; did you mean 'chirp'"),
-        ({"kind": "chirp", "updates": 3}, "a tuning has trials"),
-        ({"kind": "chirp", "starts": 3}, "a tuning has trials"),
-        ({"trials": 3}, "a robust design has updates"),
+        ({"kind": "chirp", "updates": 3}, "a tuning has trials (--trials)"),
+        ({"kind": "chirp", "starts": 3}, "a tuning has trials (--trials)"),
+        ({"trials": 3}, "a robust design has updates (--updates)"),
         ({"steps": 1}, "steps must be a whole number, at least 2: got 1"),
         ({"spread": 1.0}, "spread must lie in [0, 1): got 1.0"),
         ({"criterion": "F"}, "criterion must be D, A or E: got 'F'"),

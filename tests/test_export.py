@@ -164,7 +164,7 @@ def test_refusals_are_sentences_and_change_nothing(
     kept.write_text("mine")
     broken.write_bytes(SHIPPED["aero2"].read_bytes()[:-5])
     cases: list[tuple[Any, Path, str]] = [
-        ("aero2", kept, "exists; choose another name or overwrite it"),
+        ("aero2", kept, "exists; choose another name or add --overwrite"),
         ("aero2", tmp_path / "a.safetensors", "an ONNX file ends in .onnx"),
         ("aero2", tmp_path / "nowhere" / "a.onnx", "does not exist"),
         ("aero", tmp_path / "a.onnx", "did you mean 'aero2'?"),

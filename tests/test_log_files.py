@@ -126,7 +126,7 @@ def test_the_delimiter_is_the_one_that_gives_most_numbers(text, columns, tmp_pat
 def test_columns_without_names_are_mapped_by_their_numbers(text: str, tmp_path: Path):
     path = tmp_path / "log.txt"
     assert is_the_log(read(path, text, columns={"time": "1", "u": "2", "y": "3"}))
-    with pytest.raises(ValueError, match=r"no names, .* called 1, 2, 3 \(.*column time=NAME"):
+    with pytest.raises(ValueError, match=r"no names, .* called 1, 2, 3 \(.*--column time=NAME"):
         read(path, text)
     assert list(columns_in(path)) == ["1", "2", "3"]
 
@@ -208,12 +208,12 @@ def test_numbers_of_other_programs_are_read_to_twelve_digits(tmp_path: Path):
     ("time;u;y\n0;1.5;-0.25\n0.1;-2;1;7\n0.2;1;1\n", ("line 3", "4 values", "3")),
     ("time;y;u\n0;1.5;-0.25\n\n0.1;-2\n0.2;1;1\n", ("sample 2 of 'u' is missing",)),
     ("Time [s]  Input [V]\n0 1\n0.1 2\n", ("2 values", "has 4", "blanks in quotes")),
-    ("time,u,y\n[s],[V],[m]\n0,1,1\n0.1,2,1\n", ("sample 1 of 'time' is '[s]'", "rows 1:")),
+    ("time,u,y\n[s],[V],[m]\n0,1,1\n0.1,2,1\n", ("sample 1 of 'time' is '[s]'", "--rows 1:")),
     ("time,u,y\n0,1,1\n0.1,on,1\n", ("sample 2 of 'u' is 'on', not a number",)),
     ("time,u,y\n0,1,1\n0.1,\"1,5\",1\n", ("sample 2 of 'u' is '1,5', not a number",)),
     ("time,u,y,u\n0,1,1,2\n0.1,1,1,3\n", ("'u' is there twice", "u (column 2) or u (column 4)")),
-    ("Time,U,speed\n0,1,1\n0.1,1,1\n", ("no column 'time' (did you mean 'Time'?)", ", dt")),
-    ("time,u,Y1\n0,1,1\n0.1,1,1\n", ("no column 'y'", "time, u, Y1", "column y=NAME")),
+    ("Time,U,speed\n0,1,1\n0.1,1,1\n", ("no column 'time' (did you mean 'Time'?)", "--dt")),
+    ("time,u,Y1\n0,1,1\n0.1,1,1\n", ("no column 'y'", "time, u, Y1", "--column y=NAME")),
     (b"time,u,y\n0,1,1\n0.1,\x81\x8d,1\n", ("cannot be read as CSV text", "UTF-8")),
     ("# nothing\n\n", ("is empty",)),
 ])  # fmt: skip
@@ -564,9 +564,9 @@ def test_a_file_without_time_needs_its_sampling_time(tmp_path: Path):
     assert is_the_log(read(tmp_path / "log.csv", "time," + text.replace("\n", "\n7,")[:-2], dt=0.1))
     every_second = read(tmp_path / "log.csv", text, dt=0.1, rows=slice(None, None, 2))
     np.testing.assert_allclose(every_second.time, [0, 0.2])
-    with pytest.raises(ValueError, match=r"no column 'time'; .* dt"):
+    with pytest.raises(ValueError, match=r"no column 'time'; .* --dt"):
         read(tmp_path / "log.csv", text)
-    with pytest.raises(ValueError, match=r"dt is the sampling time in seconds of a file without"):
+    with pytest.raises(ValueError, match=r"--dt is the sampling time in seconds of a file without"):
         read(tmp_path / "log.csv", text, dt=0.1, units={"time": "ms"})
     for dt in (0.0, -1.0, math.nan, math.inf):
         with pytest.raises(ValueError, match=r"sampling time .* is not allowed: finite and pos"):
@@ -628,7 +628,7 @@ def test_a_constant_input_need_not_be_in_the_file(tmp_path: Path):
         ({"lod": 1.0}, r"no input 'lod' \(did you mean 'load'\?\); it has u, load"),
         ({"y": 1.0}, "no input 'y'"),
         ({"load": math.nan}, "value nan of input 'load' is not allowed"),
-        ({"load": 1.0, "u": 2.0}, "the file has a column 'u'; only inputs that it"),
+        ({"load": 1.0, "u": 2.0}, "the file has a column 'u'; --set-input is for inputs that it"),
     ):
         with pytest.raises(ValueError, match=sentence):
             read_record(path, two, set_inputs=set_inputs)
@@ -636,7 +636,7 @@ def test_a_constant_input_need_not_be_in_the_file(tmp_path: Path):
         read_record(path, two, {"load": "y"}, set_inputs={"load": 1.0})
     with pytest.raises(ValueError, match="nothing is left to read"):
         read_record(path, plant("load"), set_inputs={"load": 1.0}, dt=0.1, inputs_only=True)
-    with pytest.raises(ValueError, match=r"no column 'load'.*set input load=VALUE"):
+    with pytest.raises(ValueError, match=r"no column 'load'.*--set-input load=VALUE"):
         read_record(path, two)
 
 
@@ -667,14 +667,14 @@ def test_words_for_units_have_their_factor(word: str, unit: str, factor: float, 
 ])  # fmt: skip
 def test_a_unit_of_another_quantity_is_refused(word, unit, allowed, tmp_path: Path):
     (tmp_path / "log.csv").write_text("time,u,y\n0,1,2\n0.1,3,4\n")
-    with pytest.raises(ValueError, match=rf"unit .*{allowed}.*scale, y=FACTOR"):
+    with pytest.raises(ValueError, match=rf"unit .*{allowed}.*--scale y=FACTOR"):
         read_record(tmp_path / "log.csv", plant(unit=unit), units={"y": word})
 
 
 def test_a_unit_given_as_that_of_the_plant_confirms_it(tmp_path: Path):
     path, small = tmp_path / "log.csv", plant(unit="m", size=0.01)
     path.write_text("time,u,y\n0,0,1\n0.1,0,2\n")
-    with pytest.raises(ValueError, match=r"'y' reaches 2 m.*or the unit, y=UNIT"):
+    with pytest.raises(ValueError, match=r"'y' reaches 2 m.*or the unit, --unit y=UNIT"):
         read_record(path, small)
     assert read_record(path, small, units={"y": "m"}).outputs.max() == 2
     assert read_record(path, small, units={"y": "mm"}).outputs.max() == 0.002

@@ -537,7 +537,7 @@ def test_a_policy_is_saved_and_read_by_name_or_path(tmp_path):
     path = tmp_path / "own.safetensors"
     policy.save(path)
     assert read_policy(path).hash == read_policy(str(path)).hash == policy.hash
-    with pytest.raises(ValueError, match="overwrite it"):
+    with pytest.raises(ValueError, match="--overwrite"):
         policy.save(path)
     with pytest.raises(ValueError, match=r"end in \.safetensors"):
         policy.save(tmp_path / "own.bin")

@@ -305,11 +305,11 @@ def renamed(old: str, new: str) -> str:
 BAD_FILES: dict[str, tuple[str, str | bytes | Callable[[Path], None], tuple[str, ...]]] = {
     "unknown column": (
         "r.csv", renamed("pitch", "theta"),
-        ("no column 'pitch'", "time, voltage, theta", "column pitch=NAME"),
+        ("no column 'pitch'", "time, voltage, theta", "--column pitch=NAME"),
     ),
     "column named twice": (
         "r.csv", text_of(table()).replace("pitch", "voltage"),
-        ("twice", "voltage (column 2) or voltage (column 3)", "column voltage=NAME"),
+        ("twice", "voltage (column 2) or voltage (column 3)", "--column voltage=NAME"),
     ),
     "missing input": ("r.csv", spoiled(voltage={4: ""}), ("sample 5", "'voltage'", "is missing")),
     "blank input": ("r.csv", spoiled(voltage={4: "  "}), ("sample 5", "'voltage'", "is missing")),
@@ -358,7 +358,7 @@ BAD_FILES: dict[str, tuple[str, str | bytes | Callable[[Path], None], tuple[str,
     "text as MAT": ("r.mat", text_of(table()), ("not a readable MAT file",)),
     "HDF5 MAT": ("r.mat", hdf5_mat, ("7.3", "-v7", "CSV")),
     "MAT without column": (
-        "r.mat", mat_of(pitch="text"), ("no column 'pitch'", "time, voltage", "column pitch=NAME"),
+        "r.mat", mat_of(pitch="text"), ("no column 'pitch'", "time, voltage", "--column"),
     ),
     "MAT of unequal columns": (
         "r.mat", mat_of(pitch=np.zeros(7)), ("'pitch' has 7 samples", "'time' 30"),
@@ -545,7 +545,7 @@ def test_a_record_replaces_another_only_when_told_to(tmp_path):
     path = tmp_path / "r.csv"
     require_record_path(path, overwrite=False)
     write_record(path, drawn(AERO2), AERO2)
-    with pytest.raises(ValueError, match=r"r\.csv exists; .* overwrite it"):
+    with pytest.raises(ValueError, match=r"r\.csv exists; .* --overwrite"):
         require_record_path(path, overwrite=False)
     require_record_path(path, overwrite=True)
 
@@ -605,7 +605,7 @@ def finished_run(path: Path) -> None:
 def test_a_run_is_replaced_only_when_told_to(tmp_path):
     path = tmp_path / "run"
     finished_run(path)
-    with pytest.raises(ValueError, match="overwrite it"), new_run_folder(path):
+    with pytest.raises(ValueError, match="--overwrite"), new_run_folder(path):
         pass
     assert os.listdir(path) == ["run.json"]
     with new_run_folder(path, overwrite=True) as folder:

@@ -83,7 +83,7 @@ def test_what_the_plant_leaves_out_is_named_first(effect):
 def test_the_remedy_is_a_plant_that_explains_the_record(effect):
     record = recorded("aero2", effect, seed=2)
     first = ex.identify(record, "aero2", initial_state="known").suspects[0]
-    assert first.remedy == f"plant aero2+{effect}"
+    assert first.remedy == f"--plant aero2+{effect}"
     result = ex.identify(record, first.remedy.split()[1], initial_state="known")
     assert result.params[effect] == pytest.approx(first.value, rel=1e-4)
     assert result.std_error[effect] == pytest.approx(first.std_error, rel=0.05)
@@ -95,7 +95,7 @@ def test_a_plant_with_an_extension_may_leave_out_another():
     both = "aero2+coulomb_pitch_rate+delay_voltage"
     record = unnamed(ex.simulate(both, "multisine", seed=4))
     first = ex.identify(record, "aero2+coulomb", initial_state="known").suspects[0]
-    assert first.remedy == f"plant {both}"
+    assert first.remedy == f"--plant {both}"
     assert first.value == pytest.approx(0.05, rel=0.05)
 
 

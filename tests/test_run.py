@@ -178,7 +178,7 @@ def test_a_record_is_replaced_only_where_that_is_wanted(call, tmp_path):
     assert call(*words, 5)[0] == 0
     code, _, err = call(*words, 6)
     assert code == 2
-    assert "overwrite it" in err
+    assert "--overwrite" in err
     assert len(read_record("r.csv", AERO).time) == 6
     assert call(*words, 6, "--overwrite")[0] == 0
     assert len(read_record("r.csv", AERO).time) == 7
@@ -186,7 +186,7 @@ def test_a_record_is_replaced_only_where_that_is_wanted(call, tmp_path):
 
 SIGNAL = ("--input", "u.csv")
 REFUSALS = {
-    "no record": (SIGNAL, "out is missing"),
+    "no record": (SIGNAL, "--out FILE.csv is missing"),
     "record of another kind": ((*SIGNAL, "--out", "r.mat"), "line by line"),
     "record in no folder": ((*SIGNAL, "--out", "no/r.csv"), "does not exist"),
     "rig": ((*SIGNAL, *FAST, "--rig", "lego"), "unknown rig 'lego'"),
@@ -198,7 +198,7 @@ REFUSALS = {
         (*FAST, "--policy", "aero2-ppo-all", "--excitation", "chirp"), "exclude each other",
     ),
     "excitation": ((*FAST, "--excitation", "chrip"), "did you mean 'chirp'"),
-    "options of nothing": ((*FAST, "--set", "amplitude=1"), "options need an excitation that has"),
+    "options of nothing": ((*FAST, "--set", "amplitude=1"), "--set needs an --excitation"),
     "option of an excitation": (
         (*FAST, "--excitation", "loop-multisine", "--set", "gain=-1"), "must not be negative",
     ),
@@ -206,7 +206,7 @@ REFUSALS = {
         ("--out", "r.csv", "--excitation", "chirp", "--rig", "own.py:Foreign"),
         "the rig is of 'dc_motor'",
     ),
-    "fault": ((*SIGNAL, *FAST, "--fault", "wind=0.1"), "fault wind=0.1 is not allowed"),
+    "fault": ((*SIGNAL, *FAST, "--fault", "wind=0.1"), "--fault wind=0.1 is not allowed"),
     "fault of no number": ((*SIGNAL, *FAST, "--fault", "latency=nan"), "is not allowed"),
     "negative fault": ((*SIGNAL, *FAST, "--fault", "dropout=-0.1"), "is not allowed"),
     "latency": ((*SIGNAL, *FAST, "--fault", "latency=0.2"), "must be less than the sampling time"),
@@ -220,11 +220,11 @@ REFUSALS = {
     "own rig without file": ((*SIGNAL, *FAST, "--rig", "no.py:Still"), "no such file"),
     "a fault of a real rig": (
         (*SIGNAL, "--rig", "quanser", "--fault", "dropout=0.1", "--dry-run"),
-        "fault is an option of a simulated rig, not of 'quanser'",
+        "--fault is an option of a simulated rig, not of 'quanser'",
     ),
     "a real rig in a hurry": (
         (*SIGNAL, "--rig", "own.py:Still", "--fast", "--dry-run"),
-        "fast is an option of a simulated rig",
+        "--fast is an option of a simulated rig",
     ),
     "own rig without class": ((*SIGNAL, *FAST, "--rig", "own.py:Quick"), "no rig class 'Quick'"),
     "own rig that is none": ((*SIGNAL, *FAST, "--rig", "own.py:Other"), "no rig class 'Other'"),
@@ -378,8 +378,8 @@ def test_a_laboratory_computer_runs_without_jax(call, tmp_path, words):
 
 @pytest.mark.parametrize(("words", "sentence"), [
     ((*SIGNAL, "--rig", "simulated"), "need JAX, which is not installed"),
-    ((*SIGNAL, "--rig", "quanser", "--filter"), "the filter needs JAX, which is not installed"),
-    (("--excitation", "chirp", "--rig", "quanser"), "an excitation needs JAX, which is not"),
+    ((*SIGNAL, "--rig", "quanser", "--filter"), "--filter needs JAX, which is not installed"),
+    (("--excitation", "chirp", "--rig", "quanser"), "--excitation needs JAX, which is not"),
 ])  # fmt: skip
 def test_what_needs_jax_says_so(call, tmp_path, words, sentence):
     done = bare(tmp_path, *words, "--out", "r.csv")

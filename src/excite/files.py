@@ -158,7 +158,7 @@ def require_new_file(path: Path, overwrite: bool) -> None:
     if path.is_dir():
         raise ValueError(f"{path} is a folder; choose another name")
     if path.exists() and not overwrite:
-        raise ValueError(f"{path} exists; choose another name or overwrite it")
+        raise ValueError(f"{path} exists; choose another name or add --overwrite")
 
 
 def require_free_run_folder(path: Path, overwrite: bool) -> None:
@@ -173,7 +173,7 @@ def require_free_run_folder(path: Path, overwrite: bool) -> None:
     if not (path / "run.json").is_file():
         raise ValueError(f"{path} exists and is no run folder; choose another name")
     if not overwrite:
-        raise ValueError(f"{path} holds a run; choose another name or overwrite it")
+        raise ValueError(f"{path} holds a run; choose another name or add --overwrite")
 
 
 @contextlib.contextmanager

@@ -67,7 +67,7 @@ Intervals = Literal["linear", "profile"]
 _NOTHING_SEEN = (
     "no parameter is identifiable from the data; are columns, signs and units right, and does the "
     "input move the plant beyond the noise? or did the search begin too far from the truth "
-    "(another start)?"
+    "(--start)?"
 )
 _STARTS, _SIZE_OF_MANY_STARTS = 8, 50_000  # measured values up to which so many are tried
 _SIZE_OF_SUSPECTS = 10_000  # measured values up to which suspects are tried
@@ -275,7 +275,9 @@ def _chosen(
     method = estimator_from(estimator)
     for word, values in (("start", start), ("hold", hold)):
         if values and not isinstance(method, AbstractSearch):
-            raise ValueError(f"{method.name} estimates all parameters at once and takes no {word}")
+            raise ValueError(
+                f"{method.name} estimates all parameters at once and takes no {word} (--{word})"
+            )
     begin = params_from(plant, start)
     if not hold:
         return method, begin

@@ -156,13 +156,13 @@ def suspects(
             for begin in (start, estimate.params)
         ]
         after = np.asarray(min(ended, key=quality).residual)
-        found.append(suspect(f"{word}_{channel}", after, f"hold input {channel}={word}"))
+        found.append(suspect(f"{word}_{channel}", after, f"--hold-input {channel}={word}"))
     sd = np.asarray(estimator.weights(plant, experiments, jax.device_put(estimate)))
     search = _Search(plant, whole, experiments, start, estimate, free, sd)
     trials = [_Trial(n, v) for n in names for v in _tried(whole, n, experiments.inputs)]
     for trial in search.promising(trials):
         value, std_error, after = search.best(trial)
-        remedy, freedoms = f"plant {plant_word}+{trial.name}", 1 + trial.name.startswith("drift_")
+        remedy, freedoms = f"--plant {plant_word}+{trial.name}", 1 + trial.name.startswith("drift_")
         named = suspect(trial.name, after, remedy, freedoms)
         unit = _parameter(whole, trial.name).unit
         found.append(dataclasses.replace(named, value=value, std_error=std_error, unit=unit))

@@ -121,5 +121,6 @@ def check_size(values: np.ndarray, part: Input | Output, path: Path) -> None:
 def unit_hint(name: str) -> str:
     """What to do about a column in another unit."""
     return (
-        f"Give a scale, {name}=FACTOR (1 confirms that the unit is right), or the unit, {name}=UNIT"
+        f"Give a scale, {name}=FACTOR (1 confirms that the unit is right), or the unit, "
+        f"--unit {name}=UNIT"
     )

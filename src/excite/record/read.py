@@ -138,7 +138,7 @@ class _Options:
             raise ValueError(f"sampling time {self.dt:g} s is not allowed: finite and positive")
         if self.dt is not None and "time" in {*self.columns, *self.scales, *self.units}:
             raise ValueError(
-                "dt is the sampling time in seconds of a file without time; give it, or column, "
+                "--dt is the sampling time in seconds of a file without time; give it, or column, "
                 "unit and scale of 'time'"
             )
 
@@ -201,8 +201,8 @@ def _cells(
     table = columns_in(path)
     if in_file := [name for name in options.set_inputs if name in table]:
         raise ValueError(
-            f"{path}: the file has a column {in_file[0]!r}; only inputs that it does not "
-            "have can be set"
+            f"{path}: the file has a column {in_file[0]!r}; --set-input is for inputs that it does "
+            "not have"
         )
     if "time" in needed and options.column("time") not in table and "time" not in options.columns:
         for name in _SAMPLING_TIME:
@@ -241,15 +241,15 @@ def _no_column(
 ) -> ValueError:
     """What the file has instead of a column, and the options that mend it."""
     column, names = options.column(name), list(table)
-    ways = f"column {name}=NAME"
+    ways = f"--column {name}=NAME"
     if name == "time":
-        ways += ", or its sampling time, dt"
+        ways += ", or give a sampling time with --dt"
     elif name in names_of(options.description.inputs):
-        ways += f", or set input {name}=VALUE"
+        ways += f", or a constant value with --set-input {name}=VALUE"
     if several := [known for known in names if known.startswith(f"{column} (column ")]:
         return ValueError(
             f"{path}: column {column!r} is there twice, with different values: "
-            f"{' or '.join(several)} (choose one: {ways})"
+            f"{' or '.join(several)} (choose one with {ways})"
         )
     listed = ", ".join(map(_short, names[:_MOST_NAMES])) or "none"
     if len(names) > _MOST_NAMES:
@@ -258,7 +258,7 @@ def _no_column(
         listed = f"no names, its columns are called {listed}"
     return ValueError(
         f"{path}: no column {_short(column)!r}{_nearest(column, names)}; the file has {listed} "
-        f"(give {ways})"
+        f"(name it with {ways})"
     )
 
 
@@ -348,7 +348,7 @@ def _bad_cell(cells: np.ndarray, k: int, name: str, what: str, where: Path) -> V
     if _THOUSANDS.fullmatch(text):
         found += "; save the file without thousands separators"
     elif k == 0:
-        found += "; every row below the names must hold numbers (rows 1: leaves out the first)"
+        found += "; every row below the names must hold numbers (--rows 1: leaves out the first)"
     return ValueError(f"{where}: sample {k + 1} of {name!r} {found}")
 
 

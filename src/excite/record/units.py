@@ -49,6 +49,6 @@ def unit_factor(name: str, word: str, unit: str) -> float:
         raise ValueError(
             f"unit {reprlib.repr(word)} of {name!r} is not allowed: the plant has it in "
             f"{unit or '1'!r}, and known are {allowed} (for another unit give a "
-            f"scale, {name}=FACTOR)"
+            f"factor with --scale {name}=FACTOR)"
         )
     return table[word] / table[unit]

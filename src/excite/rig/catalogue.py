@@ -62,7 +62,7 @@ def _simulated(
     for name, value in options.fault.items():
         if name not in FAULTS or not 0 <= value < 1:
             raise ValueError(
-                f"fault {name}={value:g} is not allowed: latency, jitter or dropout in [0, 1)"
+                f"--fault {name}={value:g} is not allowed: latency, jitter or dropout in [0, 1)"
             )
     num_readings = readings_per_sample(plant)
     key = jax.random.key(options.seed)
@@ -112,7 +112,7 @@ def rig_named(
     is_simulated = name == "simulated"
     for option, is_there in (("fault", is_simulated), ("fast", is_simulated or is_fmu)):
         if getattr(options, option) and not is_there:
-            raise ValueError(f"{option} is an option of a simulated rig, not of {name!r}")
+            raise ValueError(f"--{option} is an option of a simulated rig, not of {name!r}")
     return rig
 
 

@@ -241,7 +241,7 @@ def run(
     if path is not None:
         require_record_path(path, overwrite)
     elif not dry_run:
-        raise ValueError("out is missing, a file .csv: every experiment must be recorded")
+        raise ValueError("--out FILE.csv is missing: every experiment must be recorded")
     known = _plant(plant, rig)
     default = DEFAULT_POLICY if plant is None or known is None else known.definition.name
     source = _source(policy, signal, excitation, options or {}, default)
@@ -258,15 +258,15 @@ def run(
         if plant is not None or filter or source.excitation is not None:
             raise ValueError(
                 f"the rig is of {description.name!r}, with other inputs, outputs, levels or "
-                f"another sampling time than the plant {known.description.name!r}: a plant, an "
-                "excitation and the filter must be for the rig's plant"
+                f"another sampling time than the plant {known.description.name!r}: --plant, "
+                "--excitation and --filter need the rig's plant"
             )
         known = None
     warnings = tuple(source.warnings(description))
     for warning in warnings:
         on_warning(warning)
     make = source.maker(description, known, steps, seed)
-    prior = _required(known, "the filter") if filter else None
+    prior = _required(known, "--filter") if filter else None
     safety_filter = None if prior is None else SafetyFilter.of(prior, spread, slew)
 
     def make_player() -> AbstractPlayer:
@@ -326,12 +326,12 @@ class _Source:
             inputs = read_signal(self.signal, description).inputs[:-1]
             longest, make = len(inputs), functools.partial(SignalPlayer, inputs[:steps])
         else:
-            plant, given = _required(plant, "an excitation"), self.excitation or self.name
+            plant, given = _required(plant, "--excitation"), self.excitation or self.name
             excitation, _ = excitation_and_origin(given, self.options, plant)
             length = experiment_length(excitation, self.name, steps, isinstance(given, Record))
             return functools.partial(ExcitationPlayer, excitation, plant, length, _key(seed))
         if steps is not None and steps > longest:
-            raise ValueError(f"{self.name} was made for {longest} steps: got {steps}")
+            raise ValueError(f"{self.name} was made for {longest} steps; --steps asks for {steps}")
         return make
 
 
@@ -340,9 +340,9 @@ def _key(seed: int) -> PRNGKeyArray:
     return jax.random.fold_in(jax.random.key(seed), 1)
 
 
-def _required(plant: AbstractPlant | None, what: str) -> AbstractPlant:
+def _required(plant: AbstractPlant | None, option: str) -> AbstractPlant:
     if plant is None:
-        raise ValueError(f"{what} needs JAX, which is not installed")
+        raise ValueError(f"{option} needs JAX, which is not installed")
     return plant
 
 
@@ -355,9 +355,7 @@ def _source(
 ) -> _Source:
     """The source that is played."""
     if sum(given is not None for given in (policy, signal, excitation)) > 1:
-        raise ValueError(
-            "a policy, a designed input and an excitation exclude each other: give one of them"
-        )
+        raise ValueError("--policy, --input and --excitation exclude each other: give one of them")
     if isinstance(excitation, Policy):
         policy = excitation
     elif isinstance(excitation, str | Path):
@@ -366,7 +364,7 @@ def _source(
         elif str(excitation).endswith(SIGNAL_ENDINGS):
             signal = excitation
     if options and (policy or signal or excitation is None):
-        raise ValueError("options need an excitation that has some, such as chirp")
+        raise ValueError("--set needs an --excitation with options, such as chirp")
     if signal is not None:
         return _Source(str(signal), signal=Path(signal))
     if excitation is not None and policy is None:
@@ -389,7 +387,7 @@ def _plant(plant: PlantLike | None, rig: str | AbstractRig) -> AbstractPlant | N
         require_inputs(chosen)
         return chosen
     if plant is not None or rig == "simulated":
-        raise ValueError("a plant and a simulated rig need JAX, which is not installed")
+        raise ValueError("--plant and a simulated rig need JAX, which is not installed")
     return None
 
 

@@ -54,7 +54,7 @@ def evaluate(
         ValueError: for an argument that is not allowed, or a policy that cannot excite the plant.
     """
     if filter and not rig:
-        raise ValueError("the safety filter is part of a rig: filter needs rig")
+        raise ValueError("the safety filter is part of a rig: filter (--filter) needs rig (--rig)")
     if not isinstance(policy, str | Path | Policy):
         raise wrong_type("policy", policy, "a name, a path or a policy")
     with tempfile.TemporaryDirectory() as folder:

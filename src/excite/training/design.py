@@ -181,14 +181,14 @@ def design(
     tuned = None
     if kind in BY_GRADIENT:
         if trials is not None:
-            raise ValueError(f"trials are for tuning; a {kind} design has updates")
+            raise ValueError(f"trials are for tuning; a {kind} design has updates (--updates)")
         if kind == "clairvoyant":  # the plant is known, the objective is the same
             env = dataclasses.replace(env, spread=0.0)
         inputs, worth_by_start = _searched(env, kind, seed, starts, updates, progress)
     else:
         if updates is not None or starts is not None:
             name = "starts" if updates is None else "updates"
-            raise ValueError(f"{name} are for designs by gradient; a tuning has trials")
+            raise ValueError(f"{name} are for designs by gradient; a tuning has trials (--trials)")
         inputs, tuned = _tuned(env, kind, criterion, seed, trials, progress)
     count = 1 if kind == "clairvoyant" else NUM_FRESH
     keys = jax.random.split(jax.random.key(seed + 1), count)

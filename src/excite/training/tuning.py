@@ -68,8 +68,8 @@ class Tuned:
         """Its options on the command line, and its violations."""
         settings = ",".join(f"{k}={json.dumps(v)}" for k, v in self.options.items())
         return (
-            f"as an excitation, generated for each plant: {self.excitation} "
-            f"with {settings}; {self.violations} violations on {self.episodes} new plants"
+            f"as an excitation, generated for each plant: --excitation {self.excitation} "
+            f"--set {settings}; {self.violations} violations on {self.episodes} new plants"
         )
 
 

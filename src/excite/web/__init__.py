@@ -194,7 +194,7 @@ def listening_at(host: str, port: int) -> socket.socket:
         listening.close()
         raise ValueError(
             f"cannot listen at {host}, port {port} ({error.strerror}); is another page open, or "
-            "the address another computer's? (port 0 takes a free one)"
+            "the address another computer's? (--port 0 takes a free port)"
         ) from None
     return listening
 

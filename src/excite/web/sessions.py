@@ -56,7 +56,7 @@ class PageSettings:
         if token is not None and len(token) < 8:
             raise ValueError("a token needs eight characters or more")
         if not runs.is_dir():
-            raise ValueError(f"{runs}: no such folder; runs must be the folder of runs to show")
+            raise ValueError(f"{runs}: no such folder; --runs names the run folder to show")
         if token is None and not is_loopback(host):
             token = secrets.token_urlsafe(16)
         return cls(runs.absolute(), host, token, workers or min(4, num_cores()), cache)
