@@ -27,7 +27,7 @@ from excite.estimation import NLS, stack_experiments
 from excite.excitation import PRBS, Chirp
 from excite.plant import Aero2, Sensor
 from excite.simulation import run_episode
-from excite.study.evaluation import estimate_all
+from excite.study.methods import estimate_all
 
 SD, BATCH, STEPS, LONG = 0.00063, 1000, 500, 1_000_000
 PLANT = Aero2(sensor=Sensor(jnp.array([SD]), jnp.array([0.0])))

@@ -16,7 +16,7 @@ from excite.excitation import PRBS, Chirp, Random
 from excite.files import json_ready
 from excite.information import best_possible
 from excite.plant import EMPS, Aero2, draw_params
-from excite.study import evaluation as benchmark
+from excite.study import methods as benchmark
 from excite.study.run import _locked, opened, run_study
 from excite.study.spec import Study, study_from
 from excite.study.statistics import wilson
@@ -381,6 +381,23 @@ def test_an_overwritten_run_begins_anew(tmp_path):
     with opened(study, tmp_path / "run", overwrite=True) as tasks:
         assert not kept.exists()
         assert len(tasks) == 2
+
+
+def test_what_was_evaluated_is_told_with_and_without_a_run_folder(tmp_path):
+    for out in (None, tmp_path / "run"):
+        told: list[str] = []
+        run_study(tiny(episodes=2), out, on_done=told.append)
+        assert told == ["methods"]
+    run_study(tiny(episodes=2), tmp_path / "run", on_done=told.append)
+    assert told == ["methods"]  # nothing was missing
+
+
+def test_workers_and_clusters_that_would_be_unused_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="'tiny' has nothing to train or design"):
+        run_study(tiny(), tmp_path / "run", workers=2)
+    with pytest.raises(ValueError, match="the engine 'dask' needs a run folder"):
+        run_study(tiny(), engine="dask", address="tcp://127.0.0.1:9")
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_study_with_signals_to_design_needs_a_run_folder():

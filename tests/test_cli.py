@@ -23,6 +23,7 @@ from experiments import NUM_STEPS
 
 from excite.cli import cli, completion, main
 from excite.cli.options import Lines, progress_bar
+from excite.cli.study import running
 from excite.estimation.catalogue import ESTIMATORS
 from excite.excitation.catalogue import EXCITATIONS
 from excite.plant import Aero2
@@ -389,15 +390,22 @@ def test_a_progress_bar_goes_to_stderr_of_a_terminal_alone(run, here, monkeypatc
 
 
 def test_where_stderr_is_no_terminal_lines_tell_how_far_it_is(monkeypatch, capsys):
+    def told(step: str) -> str:
+        """The first line about this step."""
+        deadline = time.monotonic() + PATIENCE
+        while time.monotonic() < deadline:
+            for line in capsys.readouterr().err.splitlines():
+                if step in line:
+                    return line
+            time.sleep(0.02)
+        raise TimeoutError(step)
+
     monkeypatch.setenv("EXCITE_PROGRESS", "0.05")
     with Lines("designing") as lines:
         lines.update("trial 1 of 4", 1, 4)
-        time.sleep(0.2)
+        assert re.fullmatch(r"designing: trial 1 of 4, \d+ s so far", told("trial 1"))
         lines.update("trial 2 of 4", 2, 4)
-        time.sleep(0.2)
-    told = capsys.readouterr().err.splitlines()
-    assert re.fullmatch(r"designing: trial 1 of 4, \d+ s so far", told[0])
-    assert re.fullmatch(r"designing: trial 2 of 4, 50 %, \d+ s left", told[-1])
+        assert re.fullmatch(r"designing: trial 2 of 4, 50 %, \d+ s left", told("trial 2"))
 
 
 # Plants, doctor
@@ -589,7 +597,7 @@ def test_a_run_folder_and_a_figure_are_left(run, here):
     assert "pitch [deg]" in (here / "fit.svg").read_text()
     again = run(*words.split())
     assert again.code == 2
-    assert "--overwrite" in again.err
+    assert "overwrite it" in again.err
     assert run(*words.split(), "--overwrite").code == 0
     assert [f.name for f in (here / "runs").iterdir()] == ["one"]
 
@@ -720,7 +728,7 @@ def test_a_defect_is_a_failed_run_in_one_line(run, here, monkeypatch):
 IDENTIFY = "identify {} --plant aero2 --out run --plot fit.png"
 BAD: dict[str, tuple[str, tuple[str, ...]]] = {
     "unknown column": (
-        IDENTIFY.format("column.csv"), ("column.csv", "'pitch'", "theta", "--column pitch=NAME"),
+        IDENTIFY.format("column.csv"), ("column.csv", "'pitch'", "theta", "column pitch=NAME"),
     ),
     "missing sample": (IDENTIFY.format("missing.csv"), ("missing.csv", "sample 5", "'voltage'")),
     "NaN": (IDENTIFY.format("nan.csv"), ("nan.csv", "sample 5", "'voltage'", "finite")),
@@ -833,13 +841,13 @@ BAD: dict[str, tuple[str, tuple[str, ...]]] = {
     ),
     "input beyond the limits": ("simulate aero2 loud.csv", ("loud.csv", "-24 to 24 V")),
     "start for what does not search": (
-        "identify good.csv --plant aero2 --estimator arx-rls --start J_p=0.02", ("--start",),
+        "identify good.csv --plant aero2 --estimator arx-rls --start J_p=0.02", ("takes no start",),
     ),
     "held in what estimates all": (
-        "identify good.csv --plant aero2 --estimator arx-rls --hold J_p=0.02", ("--hold",),
+        "identify good.csv --plant aero2 --estimator arx-rls --hold J_p=0.02", ("takes no hold",),
     ),
-    "a filter without a rig": ("evaluate aero2 --filter", ("--rig",)),
-    "record that exists": ("simulate aero2 --out good.csv", ("good.csv", "--overwrite")),
+    "a filter without a rig": ("evaluate aero2 --filter", ("filter needs rig",)),
+    "record that exists": ("simulate aero2 --out good.csv", ("good.csv", "overwrite it")),
     "record beside a foreign file": (
         "simulate aero2 --out notes.csv --overwrite", ("notes.json", "lost"),
     ),
@@ -1005,9 +1013,23 @@ def test_an_interrupted_benchmark_ends_with_130_and_leaves_nothing(here, tmp_pat
         program.kill()
     assert program.returncode == 130
     assert out == ""
-    assert err.strip() == "excite: interrupted; nothing was written"
+    assert err.strip() == "excite: interrupted; no file was left incomplete"
     assert contents(here) == before
     assert not (here / "run").exists()
+
+
+@pytest.mark.parametrize("keeps", [None, "missing", "there"])
+def test_an_interrupted_study_says_what_is_kept(keeps, tmp_path, capsys):
+    (tmp_path / "there").mkdir()
+    folder = None if keeps is None else tmp_path / keeps
+    is_kept = keeps == "there"
+    with (
+        click.Context(cli),
+        pytest.raises(SystemExit if is_kept else KeyboardInterrupt),
+        running("tiny", folder),
+    ):
+        raise KeyboardInterrupt
+    assert ("kept in" in capsys.readouterr().err) == is_kept
 
 
 WITHOUT_JAX = "import sys; sys.modules['jax'] = None; from excite.cli import main; main()"

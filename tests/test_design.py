@@ -168,6 +168,7 @@ def test_a_design_is_saved_shown_and_played(tmp_path):
     assert made.plant.outputs[0].noise_sd == 0.2
     assert repr(made).startswith("robust input for amplifier, 12 samples\nlog det ")
     assert max(map(len, repr(made).splitlines())) < 80
+    assert all(line in made._repr_html_() for line in repr(made).splitlines())
     made.save(tmp_path / "signal.csv")
     with pytest.raises(ValueError, match="exists"):
         made.save(tmp_path / "signal.csv")

@@ -3,15 +3,19 @@
 import doctest
 import inspect
 import json
+import re
 import subprocess
 import sys
 import textwrap
+from pathlib import Path
 
+import click
 import numpy as np
 import pytest
 from catalogue import LONG
 
 import excite as ex
+from excite.cli import cli
 
 NAMES = [name for name in ex.__all__ if name != "__version__"]
 
@@ -49,6 +53,36 @@ def test_a_verb_with_the_name_of_a_module_is_a_verb_whatever_was_imported(record
         ex.report([], "page.txt")
 
 
+@pytest.mark.parametrize("name", [n for n in ex.__all__ if n.replace("_", "-") in cli.commands])
+def test_an_option_is_an_argument_or_listed_as_an_exception(name):
+    page = Path(__file__).parent.parent / "docs" / "reference" / "python" / "index.md"
+    _, _, section = page.read_text(encoding="utf-8").partition("## Where the command line differs")
+    listed = set(re.findall(r"--([a-z-]+)", section.partition("\n## ")[0]))
+    parameters = inspect.signature(getattr(ex, name)).parameters
+    if "options" in parameters and parameters["options"].kind is inspect.Parameter.VAR_KEYWORD:
+        parameters = {**parameters, **inspect.signature(ex.identify).parameters}
+    options = [
+        p for p in cli.commands[name.replace("_", "-")].params if isinstance(p, click.Option)
+    ]
+    words = {word.removeprefix("--") for p in options for word in p.opts if word.startswith("--")}
+    assert {w for w in words if w.replace("-", "_") not in parameters} <= listed
+
+
+def test_a_report_replaces_a_file_only_if_it_may(tmp_path):
+    ex.simulate("aero2", steps=20).save(tmp_path / "record.csv")
+    told = []
+    page = ex.report(
+        tmp_path / "record.csv", tmp_path / "r.html", progress=lambda *n: told.append(n)
+    )
+    assert told == [("record.csv", 0, 1), ("done", 1, 1)]
+    (tmp_path / "r.html").write_text("mine")
+    with pytest.raises(ValueError, match=r"r\.html exists"):
+        ex.report(tmp_path / "record.csv", tmp_path / "r.html")
+    assert (tmp_path / "r.html").read_text() == "mine"
+    ex.report(tmp_path / "record.csv", tmp_path / "r.html", overwrite=True)
+    assert (tmp_path / "r.html").read_text() == page
+
+
 @pytest.fixture(scope="module")
 def record():
     return ex.simulate("aero2", "chirp", steps=200)
@@ -76,6 +110,12 @@ def test_a_result_shows_itself(result):
     assert result.plot().axes
     with pytest.raises(AttributeError, match="did you mean 'D_p'"):
         result.params.Dp  # noqa: B018
+
+
+def test_a_record_shows_the_same_as_text_and_as_html(record):
+    text = re.sub(r"<[^>]*>", " ", record._repr_html_()).split()
+    for word in repr(record).replace(" to ", " ").split():
+        assert word.strip(":,") in [t.strip(":,") for t in text]
 
 
 def test_a_record_is_replayed_and_its_inputs_are_a_signal(record):

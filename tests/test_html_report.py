@@ -17,10 +17,10 @@ import numpy as np
 import pytest
 
 from excite.cli import main
-from excite.record.rows import EstimateSummary
 from excite.report.estimates import parameter_cells, residual_cells, residual_in_words
 from excite.report.html import report_html
 from excite.report.numbers import number
+from excite.report.rows import EstimateSummary
 from excite.report.sections import elements
 from excite.report.study_table import difference_cells, footnotes
 from excite.report.svg import inline_svg
@@ -602,7 +602,7 @@ def test_a_bad_run_is_one_sentence_and_leaves_nothing(prepare, runs, sentence, h
     [
         ("r.pdf", "reports end in .html"),
         ("nowhere/r.html", "nowhere does not exist"),
-        ("old.html", "--overwrite"),
+        ("old.html", "overwrite it"),
         ("folder.html", "is a folder"),
     ],
 )

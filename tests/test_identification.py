@@ -18,7 +18,7 @@ from experiments import NUM_STEPS, autoregressive, record_of, recording, spread_
 from excite.description import Input, Output, Parameter, PlantDescription, State
 from excite.estimation import ARX, NLS
 from excite.estimation.identify import identify
-from excite.estimation.result import Identification, write_run
+from excite.estimation.result import Identification
 from excite.excitation import PRBS, Chirp, Random, Replay
 from excite.files import json_ready
 from excite.information import best_possible
@@ -495,7 +495,7 @@ def columns_of(path: Path) -> np.ndarray:
 
 
 def test_a_run_folder_holds_what_was_found(result, chirp, tmp_path):
-    write_run(result, tmp_path / "run")
+    result.save(tmp_path / "run")
     folder = tmp_path / "run"
     assert {f.name for f in folder.iterdir()} == {
         "record.csv", "record.json", "simulated.csv", "residual.csv", "estimate.json",
@@ -521,7 +521,7 @@ def test_a_run_folder_holds_what_was_found(result, chirp, tmp_path):
 
 def test_a_run_folder_of_several_records_numbers_them(foreign, tmp_path):
     result = identify([free_decay(), foreign], PLANT)
-    write_run(result, tmp_path / "run")
+    result.save(tmp_path / "run")
     for i, f in enumerate(result.fitted, 1):
         record = read_record(tmp_path / "run" / f"record_{i}.csv", result.plant)
         np.testing.assert_array_equal(record.outputs, f.record.outputs)
@@ -531,7 +531,7 @@ def test_a_run_folder_of_several_records_numbers_them(foreign, tmp_path):
 
 
 def test_a_run_folder_is_identified_to_the_same_result(result, tmp_path):
-    write_run(result, tmp_path / "run")
+    result.save(tmp_path / "run")
     again = identify([read_record(tmp_path / "run" / "record.csv", PLANT.description)], PLANT)
     assert again.params == result.params
 

@@ -136,7 +136,10 @@ def test_names_that_numpy_writes_are_read(tmp_path: Path):
         assert is_the_log(read_record(tmp_path / "log.dat", plant()))
 
 
-@pytest.mark.parametrize("comment", ["# time,u", "# 1,2,3", "# time,u,y\n\n", "# time,,y", ""])
+@pytest.mark.parametrize("comment", [
+    "# time,u", "# 1,2,3", "# time,u,y\n\n", "# time,,y", "", "# pitch and time", "# made by hand",
+    "# measured last week.", "# by hand, on Monday, outside",
+])  # fmt: skip
 def test_another_comment_is_not_the_names(comment: str, tmp_path: Path):
     (tmp_path / "log.csv").write_text(f"{comment}\n0,1,2\n1,2,3\n")
     assert list(columns_in(tmp_path / "log.csv")) == ["1", "2", "3"]
@@ -160,6 +163,17 @@ def test_thousands_separators_are_refused(cell: str, decimal: str, tmp_path: Pat
 def test_a_comma_that_may_separate_thousands_is_refused(text: str, tmp_path: Path):
     with pytest.raises(ValueError, match=r"has decimal commas, and '.*' with a point; save it"):
         read(tmp_path / "log.csv", text)
+
+
+@pytest.mark.parametrize("note", ["1.5", "1.234;", "v 2.0"])
+def test_a_column_of_notes_that_is_not_used_may_hold_anything(note: str, tmp_path: Path):
+    rows = "0;1,5;-0,25;ok\n0,1;-2;1;1,5\n0,2;0,25;3;" + note
+    assert is_the_log(read(tmp_path / "log.csv", f"time;u;y;note\n{rows.strip(';')}\n"))
+
+
+def test_a_used_column_with_points_is_refused_beside_decimal_commas(tmp_path: Path):
+    with pytest.raises(ValueError, match=r"has decimal commas, and '1\.5' with a point"):
+        read(tmp_path / "log.csv", "time;u;y\n0;1,5;1.5\n0,1;2;2.5\n")
 
 
 def test_numbers_of_other_programs_are_read_to_twelve_digits(tmp_path: Path):

@@ -16,7 +16,7 @@ from excite.description import Input, Output, Parameter, PlantDescription, State
 from excite.estimation import NLS, PEM, Estimate, Experiments, Status
 from excite.estimation.identify import identify
 from excite.estimation.kalman import innovations
-from excite.estimation.result import Identification, write_run
+from excite.estimation.result import Identification
 from excite.excitation import PRBS
 from excite.files import json_ready
 from excite.plant import AbstractPlant, Aero2, DCMotor
@@ -305,7 +305,7 @@ def test_prediction_and_simulation_are_told_apart():
 
 
 def test_the_run_folder_has_the_prediction(tmp_path):
-    write_run(identified(), tmp_path / "run")
+    identified().save(tmp_path / "run")
     names = ("record", "simulated", "predicted", "predicted_sd", "residual")
     tables = {n: np.loadtxt(tmp_path / f"run/{n}.csv", delimiter=",", skiprows=1) for n in names}
     measured = identified().fitted[0].record.outputs[:, 0]

@@ -19,7 +19,7 @@ from excite.policy import Layout, Policy
 from excite.training.checkpoint import Checkpoint
 from excite.training.ppo import BatchedVecEnv, policy_weights, train
 from excite.training.settings import PPOSettings
-from excite.training.validation import watch
+from excite.training.validation import validate
 
 TINY = PPOSettings(
     total_steps=4 * 8 * 30, num_envs=8, n_steps=30, batch_size=60, n_epochs=2,
@@ -236,7 +236,7 @@ def test_the_noise_is_learnt_where_none_is_given():
 
 def test_watching_plays_the_deterministic_policy(run):
     env, keys = aero2(), jax.random.split(jax.random.key(5), 3)
-    seen = watch(env, run[0].weights, keys)
+    seen = validate(env, run[0].weights, keys)
     policy = Policy(env.plant.description, env.layout, run[0].weights)
     step = eqx.filter_jit(env.step)
     for i, key in enumerate(keys):

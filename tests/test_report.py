@@ -14,9 +14,7 @@ import pytest
 from catalogue import TwoMasses
 
 from excite.description import HALF_95, PlantDescription
-from excite.plant import EMPS, Aero2, CartPole
-from excite.record import Record
-from excite.record.figure import (
+from excite.figure import (
     PLOT_ENDINGS,
     episode_figure,
     episodes_figure,
@@ -24,7 +22,8 @@ from excite.record.figure import (
     require_plot_path,
     save,
 )
-from excite.record.rows import Difference, EstimateSummary, Row, StudyFacts
+from excite.plant import EMPS, Aero2, CartPole
+from excite.record import Record
 from excite.report.figures import (
     autocorrelation_figure,
     benchmark_figure,
@@ -33,6 +32,7 @@ from excite.report.figures import (
     information_figure,
 )
 from excite.report.numbers import digits_for, number
+from excite.report.rows import Difference, EstimateSummary, Row, StudyFacts
 from excite.report.study_figures import agents_figure, curves_figure
 from excite.report.study_table import StudyTable, footnotes
 from excite.report.tables import fitting_tables, html_table, text_table

@@ -315,9 +315,11 @@ def test_run_is_a_function_of_the_library(call, tmp_path):
     assert shown.startswith("aero2_detailed, ")
     assert "ended" in shown
     assert max(map(len, shown.splitlines())) <= 80
+    assert all(f"<td>{cell}</td>" in result._repr_html_() for row in result.rows() for cell in row)
     dry = session.run(dry_run=True, steps=20, policy=read_policy("aero2_detailed"))
     assert dry.inputs.shape == (20, 1)
     assert "nothing is sent" in repr(dry)
+    assert f"<td>{dry.rows()[0][1]}</td>" in dry._repr_html_()
     with pytest.raises(ValueError, match="must be recorded"):
         session.run(fast=True)
 

@@ -330,8 +330,7 @@ def best_possible(
         ValueError: for a sensor without noise, which sets no bound, and for a response
             that is not finite.
     """
-    if not np.all(np.asarray(plant.sensor.sd) > 0):
-        raise ValueError("a sensor without noise sets no bound; give every output a noise")
+    require_noise(plant)
     information = experiment_information(
         plant, params, inputs, initial_state_known=initial_state_known
     )

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from commands import PATIENCE
 
-from excite.study import workers as processes
+from excite.study import pool as processes
 from excite.study.worker import Message, Result, Started
 from excite.web import workers as module
 from excite.web.jobs import columns
@@ -81,7 +81,7 @@ def test_a_worker_that_answers_oddly_is_replaced_and_nobody_waits(kind: str, pro
 def test_a_call_that_is_over_is_not_stopped(program: Path):
     """The program ends at a message that is not a call."""
     write(program, HEADER + "    print(good, flush=True)\n")
-    pool, said = processes.Workers(1), queue.SimpleQueue[Message]()
+    pool, said = processes.Pool(1), queue.SimpleQueue[Message]()
     calls = queue.SimpleQueue[processes.Call]()
 
     def tell(message: Message) -> None:

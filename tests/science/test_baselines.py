@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from experiments import ROOT
 
-from excite.study.evaluation import method_rows
+from excite.study.methods import method_rows
 from excite.study.spec import Study, read_study
 
 PARAMETERS = ("J_p", "K_pu", "D_p")

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from excite.study.evaluation import method_rows
+from excite.study.methods import method_rows
 from excite.study.spec import study_from
 
 POLICIES = ("aero2", "aero2-goals", "aero2-damping")

@@ -19,7 +19,7 @@ from cluster import Cluster, wait_for
 from commands import PATIENCE, excite
 
 from excite.policy import read_policy
-from excite.record.rows import SeedMetrics
+from excite.report.rows import SeedMetrics
 from excite.study import table
 from excite.study.engine import local_engine
 from excite.study.folder import seed_folder, study_of
@@ -535,8 +535,8 @@ def test_a_folder_in_use_is_refused(run):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--engine", "dask"], ["--address"]),
-        (["--address", "tcp://127.0.0.1:1"], ["--engine dask"]),
+        (["--engine", "dask"], ["'dask'", "address"]),
+        (["--address", "tcp://127.0.0.1:1"], ["engine 'dask'"]),
         (["--engine", "dask", "--address", "nowhere"], ["'nowhere'", "tcp://"]),
         (["--engine", "dask", "--address", "tcp://127.0.0.1:9"], ["no Dask scheduler"]),
         (["--workers", "0"], ["--workers"]),

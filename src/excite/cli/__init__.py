@@ -124,7 +124,7 @@ def main() -> None:
     except click.ClickException as error:
         _fail(error.format_message(), 2, debug)
     except (click.Abort, KeyboardInterrupt):
-        _fail("interrupted; nothing was written", 130, debug)
+        _fail("interrupted; no file was left incomplete", 130, debug)
     except RunFailedError as error:
         _fail(str(error), 1, debug)
     except Exception as error:

@@ -73,7 +73,7 @@ def design(
     plant: str, out: Path, plot: Path | None, noise: Any, as_json: bool, **options: Any
 ) -> None:
     """Design an open-loop input for PLANT, within its limits and safe for uncertain parameters."""
-    from ..record.figure import save
+    from ..figure import save
     from ..training.design import design as designed
 
     with progress_bar(f"designing for {plant}") as progress:

@@ -190,7 +190,6 @@ def identify(
     has its initial state.
     """
     from ..estimation.identify import identify as verb
-    from ..estimation.result import write_run
     from ..files import require_free_run_folder
 
     if out is not None:
@@ -208,11 +207,11 @@ def identify(
             **arguments_of(options),
         )
     if plot is not None:
-        from ..record.figure import save
+        from ..figure import save
 
         save(result.plot(), plot)
     if out is not None:
-        write_run(result, out, options["overwrite"], command_line())
+        result.save(out, options["overwrite"], command_line())
     if as_json:
         show_json(result.to_dict())
     else:

@@ -133,7 +133,7 @@ def computing(command: Callable[P, Result]) -> Callable[P, Result]:
             ) from None
         plot = kwargs.get("plot")
         if isinstance(plot, Path):
-            from ..record.figure import require_plot_path
+            from ..figure import require_plot_path
 
             require_plot_path(plot)
         return command(*args, **kwargs)

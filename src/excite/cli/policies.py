@@ -73,8 +73,8 @@ def policies(as_json: bool) -> None:
 @computing
 def evaluate(policy: str, as_json: bool, **options: Any) -> None:
     """Score POLICY, a file or a shipped name, on plants drawn at random."""
+    from ..policy import read_policy
     from ..study.evaluate import evaluate as evaluated
-    from ..study.evaluate import policy_at
 
     on_rig, filtered, noise = (options.pop(n) for n in ("on_rig", "filtered", "noise"))
     with warnings_shown(), progress_bar(f"evaluating {policy}") as progress:
@@ -83,7 +83,7 @@ def evaluate(policy: str, as_json: bool, **options: Any) -> None:
         )
     if as_json:
         settings = found.study.data()
-        show_json({"policy_hash": policy_at(policy).hash, "study": settings, **found.data()})
+        show_json({"policy_hash": read_policy(policy).hash, "study": settings, **found.data()})
     else:
         show_comparison(found)
         click.echo(f"log det of the Fisher information: {found.rows[0].log_det_information:.2f}")

@@ -20,15 +20,10 @@ def report(runs: tuple[Path, ...], out: Path, overwrite: bool, as_json: bool) ->
     RUN is a run folder of `excite identify` or `excite study run`, or a record with its
     sidecar; several are shown side by side.
     """
-    from ..files import require_new_file, write_bytes
-    from ..report.html import report_html
+    from ..report.html import report as verb
 
-    if out.suffix.lower() != ".html":
-        raise ValueError(f"{out}: reports end in .html")
-    require_new_file(out, overwrite)
     with progress_bar("report") as progress:
-        page = report_html(runs, progress).encode()
-    write_bytes(out, page)
+        page = verb(runs, out, overwrite=overwrite, progress=progress).encode()
     if as_json:
         show_json({"file": str(out), "runs": [str(run) for run in runs], "bytes": len(page)})
     else:

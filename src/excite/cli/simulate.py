@@ -132,7 +132,7 @@ def simulate(
         "warnings": experiment.warnings,
     }
     if plot is not None:
-        from ..record.figure import episode_figure, save
+        from ..figure import episode_figure, save
 
         save(episode_figure(description, record), plot)
     if out is not None:

@@ -59,7 +59,9 @@ def changes(command: Callable[..., Any]) -> Callable[..., Any]:
 )
 @click.option("--address", metavar="tcp://HOST:PORT", help="Scheduler of the Dask cluster.")
 @click.option(
-    "--workers", type=WholeNumber(1), help="Processes of the local engine; default one a core."
+    "--workers",
+    type=WholeNumber(1),
+    help="Processes of the local engine, for agents and designed signals; default one a core.",
 )
 @plot_option
 @json_option
@@ -84,11 +86,14 @@ def run_study_here(
         text = f"waiting for workers of the scheduler at {options['address']}"
         click.echo(text, err=True)
 
-    keeps = out if chosen.agents or chosen.clairvoyant else None
-    with running(chosen.name, keeps) as told:
+    has_tasks = bool(chosen.agents or chosen.clairvoyant)
+    is_resumed = not options["overwrite"] or options.get("engine") == "dask"
+    with running(chosen.name, out if has_tasks or is_resumed else None) as told:
+        if not has_tasks:  # the table shows that the methods are done
+            del told["on_done"]
         found = run_study(chosen, out, on_wait=waiting, **told, **options)
     if plot is not None:
-        from ..record.figure import save
+        from ..figure import save
 
         save(found.plot(), plot)
     show_comparison(found, out, as_json)
@@ -99,7 +104,7 @@ def running(name: str, keeps: Path | None) -> Iterator[dict[str, Any]]:
     """Messages of a running study, as arguments of a verb; shared with `train`.
 
     Args:
-        keeps: folder that keeps finished tasks after an interruption.
+        keeps: folder that keeps finished tasks after an interruption, if it exists by then.
     """
     from ..study.run import StudyFailedError
 
@@ -112,7 +117,7 @@ def running(name: str, keeps: Path | None) -> Iterator[dict[str, Any]]:
     except StudyFailedError as error:
         raise RunFailedError(str(error)) from None
     except KeyboardInterrupt:
-        if keeps is None:
+        if keeps is None or not keeps.exists():
             raise
         kept = f"what is finished is kept in {keeps}; rerun the same command to resume"
         click.echo(f"excite: interrupted; {kept}", err=True)

@@ -12,7 +12,7 @@ import numpy as np
 from ..description import names_of, unknown, wrong_type
 from ..files import read_json
 from ..plant import AbstractPlant, Params
-from ..record.rows import EstimateSummary
+from ..report.rows import EstimateSummary
 from .prior import Prior, bounded, parameter_of
 from .result import Identification
 

@@ -1,4 +1,4 @@
-"""The result of an identification, and its run folder."""
+"""The result of an identification."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from jaxtyping import Float
 
 from .. import __version__
 from ..description import Named, PlantDescription, names_of
-from ..files import csv_text, new_run_folder, write_json
-from ..record import Record, write_record
-from ..record.rows import USABLE, EstimateSummary
+from ..record import Record
+from ..record.run_folder import write_run
 from ..record.table import data_frame
 from ..report.results import identification_html, identification_text, wrapped
+from ..report.rows import USABLE, EstimateSummary
 from .diagnosis import correlation, fit_percent
 from .remedies import Suspect
 
@@ -77,6 +77,14 @@ class Fitted:
     def model(self) -> Float[np.ndarray, "sample output"]:
         """Outputs that the residual is measured from: predicted ones where there are any."""
         return self.simulated if self.predicted is None else self.predicted.outputs
+
+    @property
+    def computed(self) -> dict[str, Float[np.ndarray, "sample output"]]:
+        """Simulated outputs, residuals, and those of the prediction, by name."""
+        found = {"simulated": self.simulated, "residual": self.record.outputs - self.model}
+        if self.predicted is not None:
+            found |= {"predicted": self.predicted.outputs, "predicted_sd": self.predicted.sd}
+        return found
 
 
 @dataclass(frozen=True, repr=False)
@@ -195,6 +203,32 @@ class Identification:
         """The result as tables, figures and reports read it."""
         return EstimateSummary.of(self.to_dict())
 
+    def save(self, path: str | Path, overwrite: bool = False, command: str = "") -> None:
+        """Writes a run folder: records, simulated outputs, residuals, estimate, information.
+
+        Args:
+            path: of the folder.
+            overwrite: whether a run folder at `path` is replaced.
+            command: that made it.
+
+        Raises:
+            ValueError: where `path` is not a run folder, or is one and `overwrite` is False.
+        """
+        information = {
+            "coordinates": "logarithm of positive parameters, free ones over their scale",
+            "parameters": names_of(self.plant.parameters),
+            "information": self.information,
+            "covariance": self.covariance,
+        }
+        about = {"kind": "excite identification", "excite": __version__, "command": command}
+        contents = {
+            "estimate": self.to_dict(),
+            "information": information,
+            "run": {**about, "plant": self.plant.to_dict()},
+        }
+        records = [(f.record, f.computed) for f in self.fitted]
+        write_run(Path(path), self.plant, records, contents, overwrite)
+
     def to_dict(self) -> dict[str, object]:
         """The result as JSON-ready data; docs/reference/machine-readable.md lists its keys."""
         return {
@@ -245,40 +279,3 @@ def _prediction(fitted: Fitted) -> dict[str, object]:
         "prediction_fit_percent": dict(p.fit_percent),
         "inside_band_percent": dict(p.inside_percent),
     }
-
-
-def write_run(
-    result: Identification, path: Path, overwrite: bool = False, command: str = ""
-) -> None:
-    """Writes a run folder: records, simulated outputs, residuals, estimate, information.
-
-    Args:
-        command: that made it.
-
-    Raises:
-        ValueError: where `path` is not a run folder, or is one and `overwrite` is False.
-    """
-    d = result.plant
-    outputs = names_of(d.outputs)
-    with new_run_folder(path, overwrite) as folder:
-        for i, f in enumerate(result.fitted, 1):
-            ending = "" if len(result.fitted) == 1 else f"_{i}"
-            write_record(folder / f"record{ending}.csv", f.record, d)
-            columns = {"simulated": f.simulated, "residual": f.record.outputs - f.model}
-            if f.predicted is not None:
-                columns |= {"predicted": f.predicted.outputs, "predicted_sd": f.predicted.sd}
-            for name, values in columns.items():
-                table = {"time": f.record.time, **dict(zip(outputs, values.T, strict=True))}
-                (folder / f"{name}{ending}.csv").write_text(csv_text(table))
-        write_json(folder / "estimate.json", result.to_dict())
-        write_json(
-            folder / "information.json",
-            {
-                "coordinates": "logarithm of positive parameters, free ones over their scale",
-                "parameters": names_of(d.parameters),
-                "information": result.information,
-                "covariance": result.covariance,
-            },
-        )
-        about = {"kind": "excite identification", "excite": __version__, "command": command}
-        write_json(folder / "run.json", {**about, "plant": d.to_dict()})

@@ -34,6 +34,7 @@ from .prepare import (
     unit_hint,
 )
 from .record import Record, described_in, read_sidecar
+from .text import require_one_decimal_sign
 from .units import unit_factor
 
 SIGNAL_ENDINGS = (".csv", ".mat")
@@ -223,6 +224,8 @@ def _cells(
     if missing := [name for name in needed if options.column(name) not in table]:
         raise _no_column(table, missing[0], options, path)
     cells = {name: table[options.column(name)] for name in needed}
+    for column in cells.values():
+        require_one_decimal_sign(column, path)
     if "time" not in cells or not _is_in_first_row_only(cells["time"]):
         return cells, options.dt
     return cells, options.factor("time") * float(cells.pop("time")[0])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import io
 import json
 import os
@@ -84,13 +85,38 @@ class Record:
             object.__setattr__(self, name, values)
 
     def __repr__(self) -> str:
+        return "\n".join(
+            [
+                self._title(),
+                *(
+                    f"  {name}: {low} to {high} {unit}".rstrip()
+                    for name, low, high, unit in self._ranges()
+                ),
+                *self._warning(),
+            ]
+        )
+
+    def _repr_html_(self) -> str:
+        """The same for a notebook."""
+        caption = html.escape("; ".join([self._title(), *self._warning()]))
+        rows = [("", "smallest", "largest", "unit"), *self._ranges()]
+        body = ["".join(f"<td>{html.escape(cell)}</td>" for cell in row) for row in rows]
+        lines = [f"<tr>{line}</tr>\n" for line in body]
+        return f"<table>\n<caption>{caption}</caption>\n{''.join(lines)}</table>\n"
+
+    def _title(self) -> str:
+        """The plant, what was played, and the samples."""
         about = self.metadata.get("provenance") or {}
         made_with = self.metadata.get("plant") or {}
         played = f", {about['excitation']}" if "excitation" in about else ""
-        lines = [
+        return (
             f"record of {made_with.get('name', 'an unknown plant')}{played}: "
             f"{len(self.time)} samples, every {self.dt:.4g} s"
-        ]
+        )
+
+    def _ranges(self) -> list[tuple[str, str, str, str]]:
+        """Name, smallest and largest value, and unit of each input and output."""
+        made_with, found = self.metadata.get("plant") or {}, []
         for kind, values in (("inputs", self.inputs), ("outputs", self.outputs)):
             parts = made_with.get(kind) or [
                 {"name": f"{kind[:-1]} {i + 1}", "unit": ""} for i in range(values.shape[1])
@@ -98,10 +124,13 @@ class Record:
             for part, column in zip(parts, values.T, strict=True):
                 unit, factor = display_unit(part["unit"])
                 low, high = factor * np.nanmin(column), factor * np.nanmax(column)
-                lines.append(f"  {part['name']}: {low:.3g} to {high:.3g} {unit}".rstrip())
-        if "warning" in about:
-            lines.append(f"warning: {about['warning']}")
-        return "\n".join(lines)
+                found.append((part["name"], f"{low:.3g}", f"{high:.3g}", unit))
+        return found
+
+    def _warning(self) -> list[str]:
+        """A sentence where the policy that was played is of another plant."""
+        about = self.metadata.get("provenance") or {}
+        return [f"warning: {about['warning']}"] if "warning" in about else []
 
     @property
     def description(self) -> PlantDescription:
@@ -122,7 +151,7 @@ class Record:
 
     def plot(self) -> Figure:
         """Inputs and outputs over time, with the safety levels; ValueError without a plant."""
-        from .figure import episode_figure
+        from ..figure import episode_figure
 
         return episode_figure(self.description, self)
 

@@ -29,6 +29,9 @@ _NUMBER = re.compile(r"[+-]?(\d+(\.\d*|,\d+)?|[.,]\d+)([eE][+-]?\d+)?|nan", re.I
 _DECIMAL_POINT = re.compile(r"[+-]?\d*\.\d+([eE][+-]?\d+)?")
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
 _COMMA_OF_SECONDS = re.compile(r"(?<=:\d\d),(?=\d)")
+_SENTENCE = re.compile(
+    r"\b(and|are|at|by|for|from|is|of|the|to|was|were|with)\b|[.:!?]\s*$", re.IGNORECASE
+)
 _TRUNCATED = "is the file truncated?"
 
 
@@ -174,9 +177,15 @@ def _fitness(delimiter: str, first: Sequence[str]) -> tuple[bool, int, bool, int
 
 
 def _names_in_comment(comment: str, width: int) -> list[str]:
-    """The names in a comment such as `# t,u,y`, where it has one for each column."""
+    """The names in a comment such as `# t,u,y`, where it has one for each column.
+
+    Words of a sentence are no names.
+    """
+    words = comment.lstrip("#% \t")
+    if _SENTENCE.search(words):
+        return []
     for delimiter in (";", "\t", ",", " "):
-        names = _cells(comment.lstrip("#% \t"), delimiter)
+        names = _cells(words, delimiter)
         if len(names) == width and all(names) and not any(map(_NUMBER.fullmatch, names)):
             return names
     return []
@@ -249,23 +258,37 @@ def _read_cells(path: Path, look: _Look, layout: _Layout) -> list[np.ndarray]:
         raise _no_text(path, str(error).strip()) from None
     except (UnicodeError, OSError) as error:
         raise _no_text(path, str(error)) from None
-    return [_numbers_or_texts(path, frame[i].to_numpy(), has_commas) for i in frame]
+    return [_numbers_or_texts(frame[i].to_numpy(), has_commas) for i in frame]
 
 
-def _numbers_or_texts(path: Path, column: np.ndarray, has_commas: bool) -> np.ndarray:
+class _Pointed(str):
+    """A number with a decimal point in a file with decimal commas: perhaps of thousands."""
+
+
+def _numbers_or_texts(column: np.ndarray, has_commas: bool) -> np.ndarray:
     """A column of pandas: numbers, or texts in which decimal commas are points."""
     if column.dtype.kind in "fiub":
         return column.astype(float)
     texts = [str(cell).strip() for cell in column]
-    if not has_commas:
-        return np.array(texts, object)
-    if points := [text for text in texts if _DECIMAL_POINT.fullmatch(text)]:
+    return np.array(list(map(_with_point, texts)) if has_commas else texts, object)
+
+
+def _with_point(text: str) -> str:
+    if _DECIMAL_POINT.fullmatch(text):
+        return _Pointed(text)
+    number = text.replace(",", ".") if _DECIMAL_COMMA.fullmatch(text) else text
+    return _COMMA_OF_SECONDS.sub(".", number)
+
+
+def require_one_decimal_sign(column: np.ndarray, path: Path) -> None:
+    """Raises ValueError for a column with decimal points in a file with decimal commas."""
+    texts = column if column.dtype == object else ()
+    pointed = next((cell for cell in texts if isinstance(cell, _Pointed)), None)
+    if pointed is not None:
         raise ValueError(
-            f"{path}: the file has decimal commas, and {points[0]!r} with a point; save it with "
-            "one of them, and without thousands separators"
+            f"{path}: the file has decimal commas, and {str(pointed)!r} with a point; save it "
+            "with one of them, and without thousands separators"
         )
-    numbers = (t.replace(",", ".") if _DECIMAL_COMMA.fullmatch(t) else t for t in texts)
-    return np.array([_COMMA_OF_SECONDS.sub(".", text) for text in numbers], object)
 
 
 def _named(names: Sequence[str], columns: Sequence[np.ndarray]) -> dict[str, np.ndarray]:

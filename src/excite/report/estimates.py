@@ -7,8 +7,8 @@ import math
 import numpy as np
 
 from ..description import RARE
-from ..record.rows import EstimatedParameter, EstimateSummary
 from .numbers import digits_for, number
+from .rows import EstimatedParameter, EstimateSummary
 
 
 def parameter_header() -> list[str]:

@@ -12,8 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..description import HALF_95, PlantDescription, display_unit
-from ..record import Record
-from ..record.figure import (
+from ..figure import (
     BLUE,
     GREEN,
     GREY,
@@ -25,8 +24,9 @@ from ..record.figure import (
     new_figure,
     thin,
 )
-from ..record.rows import EstimatedParameter, EstimateSummary, Row
+from ..record import Record
 from .numbers import digits_for, number
+from .rows import EstimatedParameter, EstimateSummary, Row
 
 
 def identification_figure(

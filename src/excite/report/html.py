@@ -10,8 +10,8 @@ import matplotlib
 
 from .. import __version__
 from ..description import path_from, wrong_type
-from ..files import write_bytes
-from ..record.figure import MAX_POINTS, at_most
+from ..figure import MAX_POINTS, at_most
+from ..files import require_new_file, write_bytes
 from .sections.elements import Marker, Run, Section, paragraph, text
 from .sections.experiment import Experiment, comparison, read_experiment
 from .sections.record import read_recorded
@@ -55,7 +55,13 @@ def report_html(
     return page.replace("<main>\n", f"<main>\n{paragraph(_TOO_LARGE)}", 1)
 
 
-def report(runs: str | Path | Sequence[str | Path], out: str | Path | None = None) -> str:
+def report(
+    runs: str | Path | Sequence[str | Path],
+    out: str | Path | None = None,
+    *,
+    overwrite: bool = False,
+    progress: Callable[[str, int, int], None] = lambda *_: None,
+) -> str:
     """A report of run folders and records as one self-contained HTML page.
 
         >>> import excite as ex
@@ -67,22 +73,26 @@ def report(runs: str | Path | Sequence[str | Path], out: str | Path | None = Non
     Args:
         runs: one or several folders of `excite identify` and `excite study run`, and records
             with their sidecar.
-        out: file to write, replaced where it exists.
+        out: file to write, .html.
+        overwrite: whether the file may exist.
+        progress: called with what is drawn, how many are done, and the total.
 
     Returns:
         The page's text.
 
     Raises:
-        ValueError: for a path that cannot be read as one of them, or an `out` that is no
-            .html file.
+        ValueError: for a path that cannot be read as one of them, an `out` that is no .html
+            file, or one that exists, unless `overwrite`.
     """
-    if out is not None and Path(out).suffix.lower() != ".html":
-        raise ValueError(f"{out}: reports end in .html")
+    if out is not None:
+        if Path(out).suffix.lower() != ".html":
+            raise ValueError(f"{out}: reports end in .html")
+        require_new_file(Path(out), overwrite)
     given = [runs] if isinstance(runs, str | Path) else runs
     allowed = "a run folder, a record's file, or several"
     if not isinstance(given, Sequence):
         raise wrong_type("runs", runs, allowed)
-    page = report_html([path_from("runs", path, allowed) for path in given])
+    page = report_html([path_from("runs", path, allowed) for path in given], progress)
     if out is not None:
         write_bytes(Path(out), page.encode())
     return page

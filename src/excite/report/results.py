@@ -10,7 +10,6 @@ import textwrap
 from collections.abc import Mapping
 from typing import Any
 
-from ..record.rows import EstimateSummary, HeldOut
 from .estimates import (
     largest_correlation,
     parameter_cells,
@@ -18,6 +17,7 @@ from .estimates import (
     residual_in_words,
 )
 from .numbers import number
+from .rows import EstimateSummary, HeldOut
 from .tables import Table, html_table, text_table
 
 _WIDTH = 80

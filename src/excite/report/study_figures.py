@@ -10,8 +10,7 @@ import matplotlib.figure
 import numpy as np
 
 from ..description import PlantDescription
-from ..record import Record
-from ..record.figure import (
+from ..figure import (
     BLUE,
     RED,
     add_legend,
@@ -21,6 +20,7 @@ from ..record.figure import (
     new_figure,
     thin,
 )
+from ..record import Record
 
 Curve = Mapping[str, np.ndarray]
 """Columns of one learning curve by name; `steps` is one of them."""

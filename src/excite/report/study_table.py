@@ -15,9 +15,9 @@ from pydantic import Field, ValidationError
 
 from ..description import unknown
 from ..files import csv_text, damaged, read_json
-from ..record.rows import Difference, Gap, PublishedRow, RigCounts, Row, Saved, StudyFacts
 from ..record.table import data_frame
 from .numbers import mean_sd, number
+from .rows import Difference, Gap, PublishedRow, RigCounts, Row, Saved, StudyFacts
 from .tables import Table, html_table, markdown_table, text_table
 
 if TYPE_CHECKING:

@@ -28,10 +28,10 @@ if TYPE_CHECKING or HAS_JAX:
     import jax
 
     from ..plant import AbstractPlant
-    from .simulated import Body, SimulatedRig, readings_per_sample
+    from .simulated import Hardware, SimulatedRig, readings_per_sample
 
 FAULTS = ("latency", "jitter", "dropout")
-"""Of a simulated rig, see `simulated.Body`."""
+"""Of a simulated rig, see `simulated.Hardware`."""
 
 
 @dataclass(frozen=True)
@@ -66,8 +66,8 @@ def _simulated(
             )
     num_readings = readings_per_sample(plant)
     key = jax.random.key(options.seed)
-    body = Body.draw(plant, num_readings, options.spread, key, **options.fault)
-    return SimulatedRig(plant, body, num_readings, is_real_time=not options.fast)
+    hardware = Hardware.draw(plant, num_readings, options.spread, key, **options.fault)
+    return SimulatedRig(plant, hardware, num_readings, is_real_time=not options.fast)
 
 
 def _quanser(

@@ -22,7 +22,7 @@ from ..description import PlantDescription, display_unit, path_from, wrong_type
 from ..policy import Policy, mismatch, policy_path, read_policy
 from ..record import Record, read_record, read_signal, require_record_path
 from ..record.read import SIGNAL_ENDINGS
-from ..report.tables import text_table
+from ..report.tables import html_table, text_table
 from ..safety import Supervision, Watch, allowed
 from .catalogue import HAS_JAX, RigOptions, rig_named
 from .contract import AbstractRig, Interval, Sample
@@ -112,6 +112,10 @@ class RunResult:
         """The table that `excite run` prints."""
         return text_table(self.title, ["", ""], self.rows()) + f"\nrecord: {self.path}"
 
+    def _repr_html_(self) -> str:
+        """The same for a notebook."""
+        return html_table(self.title, ["", ""], [*self.rows(), ["record", str(self.path)]])
+
 
 @dataclass(frozen=True)
 class DryRun:
@@ -164,6 +168,10 @@ class DryRun:
     def __repr__(self) -> str:
         """The table that `excite run --dry-run` prints."""
         return text_table(self.title, self.header, self.rows())
+
+    def _repr_html_(self) -> str:
+        """The same for a notebook."""
+        return html_table(self.title, self.header, self.rows())
 
 
 def run(

@@ -1,6 +1,6 @@
 """A simulated rig that behaves like a real one: detailed plant, latency, jitter, dropouts.
 
-`Body` is the physics between two readings, a pure function. `SimulatedRig` steps it in
+`Hardware` is the physics between two readings, a pure function. `SimulatedRig` steps it in
 real time, or as fast as it can, as a rig. `run_batch` steps thousands in parallel with the
 same rules of the supervisor. It continues after a trip, to test whether the safe input was
 enough. The true parameters are shown only at the end.
@@ -36,7 +36,7 @@ from .contract import AbstractRig, Pacer, Reading
 from .filter import SafetyFilter
 
 
-class BodyState(eqx.Module):
+class HardwareState(eqx.Module):
     """State of a simulated rig.
 
     Attributes:
@@ -58,7 +58,7 @@ class BodyState(eqx.Module):
     largest: Float[Array, " output"]
 
 
-class Body(eqx.Module):
+class Hardware(eqx.Module):
     """Plant, parameters and faults of a simulated rig.
 
     Attributes:
@@ -85,8 +85,8 @@ class Body(eqx.Module):
         spread: float,
         key: PRNGKeyArray,
         **numbers: float,
-    ) -> Body:
-        """A body with parameters drawn around the nominal ones.
+    ) -> Hardware:
+        """Hardware with parameters drawn around the nominal ones.
 
         Args:
             plant: sampled as experiments are.
@@ -106,22 +106,22 @@ class Body(eqx.Module):
             **{name: jnp.asarray(value, float) for name, value in usual.items()},
         )
 
-    def start(self) -> BodyState:
+    def start(self) -> HardwareState:
         """At rest, input zero, at the first reading."""
         plant = self.plant
         output = plant.output(plant.initial_state, self.params)
         rest = jnp.asarray(safe_input(plant.definition))
         shown = measure(plant, output, jax.random.fold_in(self.key, 0))
         now, first = jnp.asarray(0.0), jnp.asarray(0)
-        return BodyState(plant.initial_state, rest, rest, now, shown, first, jnp.abs(output))
+        return HardwareState(plant.initial_state, rest, rest, now, shown, first, jnp.abs(output))
 
-    def write(self, state: BodyState, input: Float[Array, " input"]) -> BodyState:
+    def write(self, state: HardwareState, input: Float[Array, " input"]) -> HardwareState:
         """State after an input was written; it acts after latency and jitter."""
         late = jax.random.uniform(jax.random.fold_in(self.key, -1 - state.n), (), float, -1, 1)
         delay = jnp.maximum(self.latency + self.jitter * late, 0.0)
         return eqx.tree_at(lambda s: (s.written, s.delay), state, (input, delay))
 
-    def advance(self, state: BodyState) -> BodyState:
+    def advance(self, state: HardwareState) -> HardwareState:
         """State one interval later, at the next reading."""
         interval = self.plant.dt
         before = jnp.clip(state.delay, 0.0, interval)  # how long the earlier input still acts
@@ -131,7 +131,7 @@ class Body(eqx.Module):
         noise_key, dropout_key = jax.random.split(jax.random.fold_in(self.key, state.n + 1))
         measured = measure(self.plant, output, noise_key)
         is_lost = jax.random.uniform(dropout_key) < self.dropout
-        return BodyState(
+        return HardwareState(
             plant_state=after,
             acting=jnp.where(state.delay < interval, state.written, state.acting),
             written=state.written,
@@ -152,23 +152,23 @@ def at_interval(plant: AbstractPlant, num_readings: int) -> AbstractPlant:
     return plant.changed(dt=float(plant.dt) / num_readings)
 
 
-_advance = eqx.filter_jit(Body.advance)
-_write = eqx.filter_jit(Body.write)
+_advance = eqx.filter_jit(Hardware.advance)
+_write = eqx.filter_jit(Hardware.write)
 
 
 class SimulatedRig(AbstractRig):
-    """A body as a rig."""
+    """Simulated hardware as a rig."""
 
     starts_at_rest = True
 
     def __init__(
-        self, plant: AbstractPlant, body: Body, num_readings: int, is_real_time: bool
+        self, plant: AbstractPlant, hardware: Hardware, num_readings: int, is_real_time: bool
     ) -> None:
         """A rig of a plant.
 
         Args:
             plant: sampled as experiments are.
-            body: the physics between readings.
+            hardware: the physics between readings.
             num_readings: in one sampling time.
             is_real_time: whether readings come in real time.
 
@@ -177,34 +177,36 @@ class SimulatedRig(AbstractRig):
         """
         self.description = plant.description
         self.num_readings, self.is_real_time = num_readings, is_real_time
-        self.num_latency = round(float(body.latency) * num_readings / float(plant.dt))
-        if body.latency + body.jitter >= plant.dt or self.num_latency >= num_readings:
+        self.num_latency = round(float(hardware.latency) * num_readings / float(plant.dt))
+        if hardware.latency + hardware.jitter >= plant.dt or self.num_latency >= num_readings:
             raise ValueError(
                 f"latency and jitter must be less than the sampling time of {plant.dt:g} s: "
-                f"got {body.latency:g} and {body.jitter:g} s"
+                f"got {hardware.latency:g} and {hardware.jitter:g} s"
             )
-        self._body, self._interval = body, float(plant.dt) / num_readings
+        self._hardware, self._interval = hardware, float(plant.dt) / num_readings
 
     def open(self) -> None:
         """Starts at rest; compiles what a reading needs, so that the first is not late."""
-        self._state = self._body.start()
+        self._state = self._hardware.start()
         state, safe = self._state, jnp.asarray(self.safe_input)
         for _ in range(2):  # after a step, the state has another type for the compiler
-            state = _advance(self._body, _advance(self._body, _write(self._body, state, safe)))
+            state = _advance(
+                self._hardware, _advance(self._hardware, _write(self._hardware, state, safe))
+            )
         self._pacer, self._count = Pacer(self._interval), -1
 
     def read(self) -> Reading:
         """The next reading; in real time when it is due."""
         self._count += 1
         if self._count:
-            self._state = _advance(self._body, self._state)
+            self._state = _advance(self._hardware, self._state)
         if self.is_real_time:
             self._pacer.wait()
         return Reading(self._count * self._interval, np.array(self._state.shown))
 
     def write(self, input: np.ndarray) -> None:
         """Applies an input, after the latency."""
-        self._state = _write(self._body, self._state, jnp.asarray(input, float))
+        self._state = _write(self._hardware, self._state, jnp.asarray(input, float))
 
     def close(self) -> None:
         """Nothing to release."""
@@ -214,7 +216,7 @@ class SimulatedRig(AbstractRig):
         names = names_of(self.description.parameters)
         return {
             "simulated": True,
-            "true_params": dict(zip(names, map(float, self._body.params), strict=True)),
+            "true_params": dict(zip(names, map(float, self._hardware.params), strict=True)),
             "true_max_abs_output": np.asarray(self._state.largest).tolist(),
         }
 
@@ -258,17 +260,17 @@ NO_FILTER = NoFilter()
 
 @eqx.filter_jit
 def run_batch(
-    bodies: Body,
+    hardware: Hardware,
     excitation: AbstractExcitation,
     rules: Supervision,
     num_steps: int,
     num_readings: int,
     safety_filter: SafetyFilter | NoFilter = NO_FILTER,
 ) -> Runs:
-    """One experiment on every body, as the real-time loop would run it.
+    """One experiment for each hardware, as the real-time loop would run it.
 
     Args:
-        bodies: their leading axis is the run.
+        hardware: its leading axis is the run.
         excitation: proposes the inputs.
         rules: of the supervisor.
         num_steps: number of sampling instants.
@@ -276,14 +278,14 @@ def run_batch(
         safety_filter: between excitation and supervisor.
     """
 
-    def one(body: Body) -> Runs:
-        return _one_run(body, excitation, rules, num_steps, num_readings, safety_filter)
+    def one(hardware: Hardware) -> Runs:
+        return _one_run(hardware, excitation, rules, num_steps, num_readings, safety_filter)
 
-    return jax.vmap(one)(bodies)
+    return jax.vmap(one)(hardware)
 
 
 def _one_run(
-    body: Body,
+    hardware: Hardware,
     excitation: AbstractExcitation,
     rules: Supervision,
     num_steps: int,
@@ -291,22 +293,22 @@ def _one_run(
     safety_filter: SafetyFilter | NoFilter,
 ) -> Runs:
     interval = rules.dt / num_readings
-    latency = jnp.round(body.latency / interval).astype(int)
+    latency = jnp.round(hardware.latency / interval).astype(int)
 
     def reading(carry: tuple, _: None) -> tuple[tuple, Array]:
         state, watch = carry
-        state = body.advance(state)
+        state = hardware.advance(state)
         was_running = watch.trip == int(Trip.NONE)
         watch = check_reading(jnp, rules, watch, state.shown, interval)
         is_new = was_running & (watch.trip != int(Trip.NONE))
-        safe = body.write(state, jnp.asarray(rules.safe_input, float))
+        safe = hardware.write(state, jnp.asarray(rules.safe_input, float))
         state = jax.tree.map(lambda a, b: jnp.where(is_new, a, b), safe, state)
         return (state, watch), state.shown
 
-    def hold(state: BodyState, watch: Watch, input: Array) -> tuple[tuple, Array]:
+    def hold(state: HardwareState, watch: Watch, input: Array) -> tuple[tuple, Array]:
         """The readings of one sampling time, and the one at which the input begins to act."""
         now = state.shown
-        carry = body.write(state, input), watch
+        carry = hardware.write(state, input), watch
         carry, shown = jax.lax.scan(reading, carry, None, length=num_readings)
         return carry, jnp.concatenate([now[None], shown])[latency]
 
@@ -321,10 +323,10 @@ def _one_run(
         (state, watch), acted_on = hold(state, watch, input)
         return (state, watch, player, memory, count + is_changed), (input, acted_on)
 
-    state = body.start()
+    state = hardware.start()
     # A signal is made for the sampling time, not for the interval between two readings.
-    plant = eqx.tree_at(lambda p: p.dt, body.plant, jnp.asarray(rules.dt))
-    player = excitation.init(plant, num_steps, body.key)
+    plant = eqx.tree_at(lambda p: p.dt, hardware.plant, jnp.asarray(rules.dt))
+    player = excitation.init(plant, num_steps, hardware.key)
     watch = Watch.start(jnp, rules, state.shown)
     carry = state, watch, player, safety_filter.start(), jnp.asarray(0)
     (state, watch, *_, count), (inputs, measured) = jax.lax.scan(
@@ -337,15 +339,19 @@ def _one_run(
     return Runs(state.largest, is_over, trip, count, inputs, measured)
 
 
-def bodies(
+def drawn_hardware(
     plant: AbstractPlant,
     num_readings: int,
     spread: float,
     keys: Key[Array, " run"],
     **numbers: float,
-) -> Body:
-    """One body for each key, with the same plant as in `run_episodes`; see `Body.draw`."""
-    return eqx.filter_vmap(lambda key: Body.draw(plant, num_readings, spread, key, **numbers))(keys)
+) -> Hardware:
+    """Hardware for each key, with the same plant as in `run_episodes`; see `Hardware.draw`."""
+
+    def draw(key: PRNGKeyArray) -> Hardware:
+        return Hardware.draw(plant, num_readings, spread, key, **numbers)
+
+    return eqx.filter_vmap(draw)(keys)
 
 
 def readings_per_sample(plant: AbstractPlant) -> int:
@@ -356,12 +362,12 @@ def readings_per_sample(plant: AbstractPlant) -> int:
 def evaluate_on_rig(
     plant: AbstractPlant,
     excitation: AbstractExcitation,
-    bodies: Body,
+    hardware: Hardware,
     rules: Supervision,
     num_steps: int,
     safety_filter: SafetyFilter | NoFilter = NO_FILTER,
 ) -> tuple[Episodes, Runs]:
-    """One experiment on every body, scored as `run_episodes` scores those on plants.
+    """One experiment for each hardware, scored as `run_episodes` scores those on plants.
 
     Information and estimates are those of the whole experiment, also after a trip. A
     critical level counts as reached at any reading.
@@ -369,14 +375,14 @@ def evaluate_on_rig(
     Args:
         plant: as identification knows it.
         excitation: proposes the inputs.
-        bodies: their leading axis is the run, see `bodies`.
+        hardware: its leading axis is the run, see `drawn_hardware`.
         rules: of the supervisor.
         num_steps: number of sampling instants.
         safety_filter: between excitation and supervisor.
     """
     num_readings = readings_per_sample(plant)
-    runs = run_batch(bodies, excitation, rules, num_steps, num_readings, safety_filter)
-    return _scored(plant, bodies.params, runs), runs
+    runs = run_batch(hardware, excitation, rules, num_steps, num_readings, safety_filter)
+    return _scored(plant, hardware.params, runs), runs
 
 
 @eqx.filter_jit

@@ -14,8 +14,8 @@ from urllib.parse import urlsplit
 
 from .. import __version__
 from .engine import Engine
+from .pool import environment
 from .worker import Ending, Failure, answers, sentence_of
-from .workers import environment
 
 try:
     import distributed

@@ -14,8 +14,8 @@ from functools import partial
 from pathlib import Path
 from typing import Protocol
 
+from .pool import Pool
 from .worker import Ending, Failure, Message
-from .workers import Workers
 
 TICK = 1.0
 """Seconds between two calls of `on_tick`."""
@@ -63,11 +63,11 @@ class _Local:
     """The pool of this computer; a worker that dies affects only its task."""
 
     def __init__(self, num_workers: int, cache: Path | None, num_tasks: int) -> None:
-        self._workers = Workers(min(num_workers, num_tasks), cache=cache)
-        self._workers.open()
+        self._pool = Pool(min(num_workers, num_tasks), cache=cache)
+        self._pool.open()
 
     def num_slots(self) -> int:
-        return self._workers.num_workers
+        return self._pool.num_workers
 
     def is_lost(self) -> bool:
         return False
@@ -79,12 +79,12 @@ class _Local:
             if isinstance(message, Ending):
                 future.set_result(message)
 
-        self._workers.submit(target, arguments, tell)
+        self._pool.submit(target, arguments, tell)
         return future
 
     def close(self, is_done: bool) -> None:
         del is_done  # its processes hold nothing that could be lost
-        self._workers.close()
+        self._pool.close()
 
 
 def run(

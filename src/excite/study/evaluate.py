@@ -7,13 +7,13 @@ import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from ..description import unknown, wrong_type
+from ..description import wrong_type
 from ..plant import AbstractARXPlant
 from ..plant.catalogue import PlantLike
-from ..policy import POLICY_ENDING, Policy, mismatch, policy_path, read_policy, shipped_policies
+from ..policy import POLICY_ENDING, Policy, mismatch, read_policy
 from ..report.study_table import StudyTable
 from ..training.checkpoint import Progress
-from .evaluation import compared
+from .methods import compared
 from .spec import plant_tables, study_from
 
 
@@ -63,7 +63,7 @@ def evaluate(
             file = Path(folder) / f"policy{POLICY_ENDING}"
             file.write_bytes(policy.to_bytes())
             word = str(file)
-        trained, name = policy_at(word), Path(word).stem
+        trained, name = read_policy(word), Path(word).stem
         tables, built = plant_tables(trained.plant.name if plant is None else plant, noise)
         kinds = ["arx-rls"] * isinstance(built, AbstractARXPlant) + ["nls"]
         settings = {
@@ -81,13 +81,3 @@ def evaluate(
         if (warning := mismatch(trained, built.description)) is not None:
             warnings.warn(f"{name}: {warning}", stacklevel=2)
         return compared(study, progress)
-
-
-def policy_at(policy: str | Path) -> Policy:
-    """The policy of a file or a shipped name; ValueError for another word."""
-    path = policy_path(str(policy))
-    if path is None and Path(policy).exists():
-        raise ValueError(f"{policy}: policy files end in {POLICY_ENDING}")
-    if path is None:
-        raise unknown("policy", str(policy), [*shipped_policies(), "path/to/policy.safetensors"])
-    return read_policy(path)

@@ -21,6 +21,7 @@ from typing import Any, Literal
 import jax
 
 from .. import __version__
+from ..figure import image
 from ..files import (
     csv_text,
     json_ready,
@@ -32,24 +33,24 @@ from ..files import (
 )
 from ..plant import AbstractPlant
 from ..policy import POLICY_ENDING, read_policy
-from ..record.figure import image
 from ..record.read import SIGNAL_ENDINGS
-from ..record.rows import Rows
 from ..report.frontier import frontier_figure, lengths_figure
+from ..report.rows import Rows
 from ..report.study_figures import agents_figure, curves_figure
 from ..report.study_table import StudyTable, differences_csv
 from ..training.checkpoint import Progress
 from .catalogue import study_path
 from .cluster import dask_engine
 from .engine import Engine, local_engine, run
-from .episodes import episodes_data, example_episodes
-from .evaluation import compared, method_rows
+from .example_episodes import episodes_data, example_episodes
 from .folder import agent_settings, fingerprint, read_json, seed_folder, study_of
+from .methods import compared, method_rows
+from .pool import num_cores
 from .progress import read_progress, remove_progress
 from .spec import Study, read_study
 from .table import best_seeds, learning_curves, study_table
 from .tasks import clairvoyant_task, methods_task, seed_task
-from .workers import num_cores
+from .worker import OF_PPO
 
 KIND = "excite study"
 FREE = {"name", "title", "inferred", "ours", "reference", "source"}
@@ -95,7 +96,8 @@ def run_study(
         seed: replaces the study's.
         estimators: replace the study's: their names, or these with commas between.
         engine: processes of this machine, or a Dask cluster.
-        workers: processes of the local engine; default one per core.
+        workers: processes of the local engine, where agents are trained or signals designed;
+            default one per core.
         address: of the cluster's scheduler, tcp://HOST:PORT.
         overwrite: whether a run in `out` is replaced instead of resumed.
         progress: called with what is being computed, how much is done, and the total.
@@ -111,10 +113,18 @@ def run_study(
     chosen = chosen.changed(episodes=episodes, seed=seed, estimators=estimators)
     machine = _engine(engine, workers, address, on_wait)
     what = "agents to train" if chosen.agents else "signals to design" if chosen.clairvoyant else ""
+    if workers is not None and not what:
+        raise ValueError(
+            f"the study {chosen.name!r} has nothing to train or design: it needs no workers"
+        )
     if out is None:
         if what:
-            raise ValueError(f"the study {chosen.name!r} has {what}: it needs a run folder (--out)")
-        return compared(chosen, progress)
+            raise ValueError(f"the study {chosen.name!r} has {what}: it needs a run folder, out")
+        if engine == "dask":
+            raise ValueError("the engine 'dask' needs a run folder, out")
+        table = compared(chosen, progress)
+        on_done("methods")
+        return table
     folder = Path(out)
     place: contextlib.AbstractContextManager[Path] = contextlib.nullcontext(folder)
     if overwrite:
@@ -143,12 +153,14 @@ def _engine(
 ) -> Engine:
     if engine == "dask":
         if address is None:
-            raise ValueError("--engine dask needs --address tcp://HOST:PORT of its scheduler")
+            raise ValueError(
+                "the engine 'dask' needs the address of its scheduler, tcp://HOST:PORT"
+            )
         if workers is not None:
-            raise ValueError("--workers is for the local engine, not for a Dask cluster")
+            raise ValueError("workers are for the engine 'local', not for a Dask cluster")
         return dask_engine(address, on_wait)
     if address is not None:
-        raise ValueError("--address is for --engine dask")
+        raise ValueError("the address is for the engine 'dask'")
     cache = jax.config.values["jax_compilation_cache_dir"]
     return local_engine(workers or num_cores(), Path(cache) if cache else None)
 
@@ -170,11 +182,7 @@ def _require_trainer(study: Study, folder: Path | None) -> None:
         and all((seed_folder(folder, *seed) / "metrics.json").is_file() for seed in seeds)
     ):
         return
-    missing = [
-        n
-        for n in ("stable_baselines3", "torch", "tensorboard")
-        if importlib.util.find_spec(n) is None
-    ]
+    missing = [name for name in OF_PPO if importlib.util.find_spec(name) is None]
     if missing:
         raise ValueError(f"training needs {', '.join(missing)}: pip install 'excite[ppo]'")
 
@@ -407,6 +415,7 @@ def run_tasks(
             if "methods" in tasks:
                 rows = method_rows(study, progress)
                 _keep(targets["methods"], folder, Rows(rows=tuple(rows)).data())
+                on_done("methods")
             return {}
 
         def finished(name: str, result: object) -> None:

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from ..description import HALF_95, PlantDescription, display_unit, names_of
 from ..estimation import Status
-from ..record.rows import ErrorStatistics, LargestOutput, MeanSd, Rate, RigCounts, Row
+from ..report.rows import ErrorStatistics, LargestOutput, MeanSd, Rate, RigCounts, Row
 from ..safety import watched_output
 from .spec import Study
 

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.stats
 
 from ..description import PlantDescription, names_of
-from ..record.rows import (
+from ..report.rows import (
     BoundByLength,
     Difference,
     ErrorStatistics,
@@ -24,8 +24,8 @@ from ..record.rows import (
 )
 from ..report.study_table import StudyTable
 from ..training.gradient import GradientSettings, rank
-from .evaluation import facts
 from .folder import advice, damaged, read_columns, read_json, seed_folder, study_of
+from .methods import facts
 from .spec import Study
 from .statistics import mean_sd, violation_rate
 

@@ -27,12 +27,12 @@ from ..excitation import PolicyExcitation, Replay
 from ..files import write_bytes
 from ..plant import AbstractPlant
 from ..policy import Policy
-from ..record.rows import Rows, SeedMetrics
+from ..report.rows import Rows, SeedMetrics
 from ..training.checkpoint import Checkpoint, Trained
 from ..training.signals import clairvoyant_signals, signal_env
 from .agent import Agent
-from .evaluation import episode_keys, evaluate_method, method_rows, scores
 from .folder import agent_settings, fingerprint
+from .methods import episode_keys, evaluate_method, method_rows, scores
 from .progress import write_progress
 from .spec import Study, study_from
 from .statistics import table_row

@@ -32,7 +32,8 @@ except ImportError:  # Windows: no limit
 
 _MAX_SENTENCE = 1000  # characters; a file's content may be quoted in it
 _BYTES = "__bytes__"
-
+OF_PPO = ("stable_baselines3", "torch", "tensorboard")
+"""Modules of the extra `ppo`."""
 
 READY = {"kind": "ready"}
 """The first line of a worker."""
@@ -138,7 +139,9 @@ def answers(target: str, arguments: Mapping[str, object]) -> Generator[Answer, N
             result = None
         yield Result(result)
     except ModuleNotFoundError as error:
-        lack = f"the worker has no module {error.name!r}; training needs the extra 'ppo'"
+        lack = f"the worker has no module {error.name!r}"
+        if (error.name or "").partition(".")[0] in OF_PPO:
+            lack += "; PPO needs the extra: pip install 'excite[ppo]'"
         yield _failure(lack, is_mistake=True)
     except MemoryError:
         yield _failure("this needs more memory than a worker may use")

@@ -26,6 +26,7 @@ from ..information import d_optimality, require_noise
 from ..plant import AbstractPlant
 from ..plant.catalogue import PlantLike, plant_from, require_inputs, with_sensor
 from ..record import Record, require_record_path, write_record
+from ..report.tables import html_table
 from ..simulation import response, run_episode
 from .checkpoint import Progress
 from .signals import CLAIRVOYANT, ROBUST, clairvoyant_signals, robust_signal, signal_env
@@ -89,7 +90,7 @@ class Design:
 
     def plot(self) -> matplotlib.figure.Figure:
         """The inputs and the nominal plant's response over time, with limits and levels."""
-        from ..record.figure import episode_figure
+        from ..figure import episode_figure
 
         return episode_figure(self.plant, self.record)
 
@@ -106,12 +107,20 @@ class Design:
 
     def __repr__(self) -> str:
         """Two lines, a third for a tuned excitation."""
+        return "\n".join(self._lines())
+
+    def _repr_html_(self) -> str:
+        """The same for a notebook."""
+        title, *lines = self._lines()
+        return html_table(title, [""], [[line] for line in lines])
+
+    def _lines(self) -> list[str]:
         where = f"{self.evaluations} new plants" if self.evaluations > 1 else "the nominal plant"
         lines = [
             f"{self.kind} input for {self.plant.name}, {len(self.inputs)} samples",
             f"log det {self.log_det_information:.2f}, {self.violations} violations on {where}",
         ]
-        return "\n".join(lines + [str(self.tuned)] * (self.tuned is not None))
+        return lines + [str(self.tuned)] * (self.tuned is not None)
 
 
 def design(

@@ -27,7 +27,7 @@ from ..policy import Layout, Weights, act
 from ..safety import watched_levels
 from .checkpoint import Checkpoint, OnBoundary, Trained
 from .settings import GradientSettings
-from .validation import look, watch_keys
+from .validation import look, validation_keys
 
 
 class Network(eqx.Module):
@@ -259,7 +259,7 @@ def _looked(
     for s, curve in enumerate(course.curves):
         own = jax.tree.map(lambda x, s=s: x[s], course.now)
         seen = look(env, own.player.weights, settings.watch_episodes)
-        judged = _judged(env, own.player, watch_keys(settings.watch_episodes))
+        judged = _judged(env, own.player, validation_keys(settings.watch_episodes))
         curve.append({"steps": steps, **judged, **seen, **_state(own)})
         own_rank = rank(settings, curve[-1])
         if own_rank > tuple(course.rank[s]):

@@ -12,11 +12,11 @@ from ..description import names_of
 from ..environment import Env
 from ..policy import Weights, forward
 
-WATCH_SEED = 0x7A11DA7E
+VALIDATION_SEED = 0x7A11DA7E
 """Seed of the validation episodes: the same for all trainings, not used elsewhere."""
 
 
-class Watched(eqx.Module):
+class Validation(eqx.Module):
     """Episodes of a policy without exploration noise; the leading axis is the episode.
 
     Attributes:
@@ -33,10 +33,10 @@ class Watched(eqx.Module):
 
 
 @eqx.filter_jit
-def watch(env: Env, weights: Weights, keys: Key[Array, " episode"]) -> Watched:
+def validate(env: Env, weights: Weights, keys: Key[Array, " episode"]) -> Validation:
     """One episode of the deterministic policy for every key."""
 
-    def episode(key: PRNGKeyArray) -> Watched:
+    def episode(key: PRNGKeyArray) -> Validation:
         state, observation = env.reset(key)
 
         def advance(carry: tuple, _: None) -> tuple[tuple, tuple]:
@@ -50,19 +50,19 @@ def watch(env: Env, weights: Weights, keys: Key[Array, " episode"]) -> Watched:
         _, kept = jax.lax.scan(advance, start, None, length=env.layout.num_steps)
         rewards, errors, violations, squares = kept
         rms = jnp.sqrt(jnp.mean(squares))
-        return Watched(jnp.sum(rewards), errors[-1], violations[-1], rms)
+        return Validation(jnp.sum(rewards), errors[-1], violations[-1], rms)
 
     return jax.vmap(episode)(keys)
 
 
-def watch_keys(num_episodes: int) -> Key[Array, " episode"]:
+def validation_keys(num_episodes: int) -> Key[Array, " episode"]:
     """Keys of the validation episodes."""
-    return jax.random.split(jax.random.key(WATCH_SEED), num_episodes)
+    return jax.random.split(jax.random.key(VALIDATION_SEED), num_episodes)
 
 
 def look(env: Env, weights: Weights, num_episodes: int) -> dict[str, float]:
     """A row of the learning curve: results of the deterministic policy in validation episodes."""
-    seen = watch(env, weights, watch_keys(num_episodes))
+    seen = validate(env, weights, validation_keys(num_episodes))
     names = names_of(env.plant.definition.parameters)
     errors = np.asarray(seen.relative_errors).mean(axis=0)
     return {

@@ -34,8 +34,9 @@ from ..estimation import NLS, Experiments, Status, stack_experiments
 from ..estimation.catalogue import ESTIMATORS
 from ..estimation.diagnosis import half_95
 from ..estimation.identify import InitialState, identify
-from ..estimation.result import Identification, write_run
+from ..estimation.result import Identification
 from ..excitation.catalogue import EXCITATIONS, LOOP
+from ..figure import kept_samples
 from ..files import write_bytes
 from ..information import (
     cramer_rao_bound,
@@ -48,7 +49,6 @@ from ..plant import AbstractPlant
 from ..plant.catalogue import PLANTS
 from ..policy import Policy, mismatch, read_policy, shipped_policies
 from ..record import columns_in
-from ..record.figure import kept_samples
 from ..report.html import report_html
 from ..safety import critical_levels, is_violation, max_abs_output
 from ..simulation import Experiment, Trajectory
@@ -173,7 +173,7 @@ def followed(asked: ExperimentRequest, folder: str) -> Iterator[Event]:
     yield from _estimates(own, run, information)
     row, result = _outcome(own, run, information[-1])
     if result is not None:
-        write_run(result, Path(folder), command=_experiment_again(asked))
+        result.save(folder, command=_experiment_again(asked))
     identification = None if result is None else result.to_dict()
     yield {"kind": "result", "row": row, "identification": identification}
     for name in asked["others"]:
@@ -316,7 +316,7 @@ def identified(
             columns=asked["columns"],
             scales=asked["scales"],
         )
-    write_run(result, Path(folder), command=_identification_again(asked, name))
+    result.save(folder, command=_identification_again(asked, name))
     fitted = result.fitted[0]
     record = fitted.record
     signals = [*record.inputs.T, *record.outputs.T, *fitted.simulated.T]

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ..study.workers import num_cores
+from ..study.pool import num_cores
 from .requests import RefusedError
 from .trainings import Training
 

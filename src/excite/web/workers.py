@@ -9,8 +9,8 @@ from collections.abc import AsyncGenerator, Mapping
 from pathlib import Path
 from typing import Literal, cast
 
+from ..study.pool import Pool
 from ..study.worker import Ending, Event, Failure, Message, Started
-from ..study.workers import Workers as Processes
 from .events import JobEvent
 from .requests import RefusedError, without_folders
 
@@ -29,7 +29,7 @@ class Workers:
     """Processes that run the functions of `excite.web.jobs`."""
 
     def __init__(self, num_workers: int, cache: Path | None) -> None:
-        self._processes = Processes(
+        self._pool = Pool(
             num_workers,
             memory=_memory(num_workers),
             niceness=_NICENESS,
@@ -41,12 +41,12 @@ class Workers:
 
     async def open(self) -> None:
         """Starts the processes; they warm up while the page is served."""
-        self._processes.open()
+        self._pool.open()
 
     async def close(self) -> None:
         """Ends all workers; waiting and later calls fail."""
         self._is_closed = True
-        await asyncio.to_thread(self._processes.close, "the server has ended")
+        await asyncio.to_thread(self._pool.close, "the server has ended")
 
     async def events(
         self, job: Job, arguments: Mapping[str, object], urgent: bool = False
@@ -58,7 +58,7 @@ class Workers:
         """
         if self._is_closed:
             raise RefusedError(503, "the server has ended")
-        if self._processes.num_waiting >= MAX_WAITING:
+        if self._pool.num_waiting >= MAX_WAITING:
             raise RefusedError(503, "the queue of the workers is full; try again later")
         loop, said = asyncio.get_running_loop(), asyncio.Queue[Message]()
 
@@ -66,7 +66,7 @@ class Workers:
             with contextlib.suppress(RuntimeError):  # of a loop that has ended
                 loop.call_soon_threadsafe(said.put_nowait, message)
 
-        call = self._processes.submit(f"{JOBS}:{job}", arguments, tell, urgent)
+        call = self._pool.submit(f"{JOBS}:{job}", arguments, tell, urgent)
         try:
             is_over = False
             while not is_over:
@@ -74,7 +74,7 @@ class Workers:
                 is_over = isinstance(message, Ending)
                 yield _event(message)
         finally:
-            self._processes.withdraw(call)
+            self._pool.withdraw(call)
 
 
 def _event(message: Message) -> JobEvent:

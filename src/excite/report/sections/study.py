@@ -10,9 +10,9 @@ import numpy as np
 from ...description import PlantDescription, names_of
 from ...files import folder_word, read_columns, read_json
 from ...record import Record
-from ...record.rows import EpisodeData, Options, StudyFacts
 from ..figures import benchmark_figure
 from ..frontier import frontier_figure, lengths_figure
+from ..rows import EpisodeData, Options, StudyFacts
 from ..study_figures import Curve, agents_figure, curves_figure
 from ..study_table import (
     DIFFERENCES,

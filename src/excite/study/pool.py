@@ -89,7 +89,7 @@ class Call:
 # ------------------------------------------------------------------------------------ the pool
 
 
-class Workers:
+class Pool:
     """Processes that answer calls, and their queue.
 
     Args:

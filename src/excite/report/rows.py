@@ -1,7 +1,8 @@
 """Types of the files of studies and identifications: rows, differences, estimates.
 
-They are computed in `study` and `estimation`, kept as JSON (docs/machine-readable.md lists the
-keys) and shown by `report`. A number that does not exist is NaN here and `null` in a file.
+They are computed in `study` and `estimation`, kept as JSON and shown by `report`;
+docs/reference/machine-readable.md lists the keys. A number that does not exist is NaN here and
+`null` in a file.
 """
 
 from __future__ import annotations

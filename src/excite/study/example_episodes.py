@@ -21,8 +21,8 @@ from ..excitation import AbstractExcitation, PolicyExcitation
 from ..plant import AbstractARXPlant, AbstractPlant
 from ..policy import read_policy
 from ..record import Record
-from .evaluation import CHUNK, episode_keys
 from .folder import damaged, seed_folder
+from .methods import CHUNK, episode_keys
 from .spec import Study
 
 _DIGITS = 6  # more than a figure can show

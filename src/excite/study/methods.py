@@ -21,10 +21,10 @@ from ..estimation import AbstractEstimator, stack_experiments
 from ..excitation import AbstractExcitation
 from ..information import d_optimality, require_noise
 from ..plant import AbstractPlant
-from ..record.rows import BoundByLength, Row, StudyFacts
+from ..report.rows import BoundByLength, Row, StudyFacts
 from ..report.study_table import StudyTable
 from ..rig.filter import SafetyFilter
-from ..rig.simulated import bodies, evaluate_on_rig, readings_per_sample
+from ..rig.simulated import drawn_hardware, evaluate_on_rig, readings_per_sample
 from ..safety import Supervision, Trip
 from ..simulation import Trajectory
 from ..training.checkpoint import Progress
@@ -76,7 +76,7 @@ def player_of(study: Study, plant: AbstractPlant) -> Play:
     safety = SafetyFilter.of(plant, study.spread) if study.rig.filter else None
 
     def play(excitation: AbstractExcitation, keys: Keys) -> tuple[Episodes, dict[str, np.ndarray]]:
-        many = bodies(plant, readings_per_sample(plant), study.spread, keys, **numbers)
+        many = drawn_hardware(plant, readings_per_sample(plant), study.spread, keys, **numbers)
         on_rig = plant, excitation, many, rules, study.num_steps
         episodes, runs = evaluate_on_rig(*on_rig)
         seen = {"trips": runs.trip != int(Trip.NONE)}
