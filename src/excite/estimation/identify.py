@@ -33,6 +33,7 @@ from .catalogue import estimator_from
 from .contract import (
     AbstractEstimator,
     AbstractSearch,
+    Basis,
     Estimate,
     Experiments,
     Prediction,
@@ -225,6 +226,7 @@ def identify(
         ),
         initial_state_known=known,
         noise=_noise(plant.definition, fit.estimate),
+        basis=Basis(plant, experiments, estimator, fit.estimate, fit.free, uncertain_sd),
     )
 
 

@@ -29,7 +29,7 @@ from .contract import (
 )
 from .multiple_shooting import MultipleShooting, Point, Segments
 
-_FAR = 30.0  # largest logarithm of a positive parameter over its nominal value
+FAR = 30.0  # largest logarithm of a positive parameter over its nominal value
 Noise = Literal["declared", "known", "estimated"]
 
 
@@ -202,7 +202,7 @@ class Problem(eqx.Module):
         d = self.plant.definition
         usual = to_search(d, self.plant.nominal)
         positive = jnp.asarray([p.positive for p in d.parameters])
-        beyond = jax.lax.stop_gradient(z - jnp.clip(z, usual - _FAR, usual + _FAR))
+        beyond = jax.lax.stop_gradient(z - jnp.clip(z, usual - FAR, usual + FAR))
         z = z - jnp.where(positive, beyond, 0.0)  # the derivative is kept beyond the limit
         return from_search(d, jnp.where(self.free, z, self.start))
 
