@@ -87,7 +87,7 @@ evaluations: .venv/core ## evaluates the shipped policies on new plants, in resu
 	touch $@
 
 .venv/dev: .venv/core
-	$(INSTALL) --editable '.[dev,docs,ppo,dask,tune,fmu,onnx,logs,web]'
+	$(INSTALL) --editable '.[dev,docs,ppo,dask,tune,fmu,onnx,logs,bayes,web]'
 	touch $@
 
 clean: ## removes the installation

@@ -65,6 +65,9 @@ DOORS = {
     "dask": ["study/cluster"],
     "distributed": ["study/cluster"],
     "onnx": ["policy/onnx"],
+    "blackjax": ["estimation/posterior"],
+    "xarray": ["estimation/posterior"],
+    "arviz_stats": ["estimation/posterior"],
     "fmpy": ["rig/fmu"],
     "quanser": ["rig/quanser"],
     "matplotlib": ["figure", "report"],
@@ -131,6 +134,7 @@ SHOWING = (
     "_require_parquet",
     "_require_libraries",
     "_require_least_squares",
+    "posterior",
 )
 """Functions that import Matplotlib's figures, a package that not every computer has, or one that
 takes long to load, when they are called."""

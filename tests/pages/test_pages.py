@@ -17,7 +17,7 @@ from experiments import recording
 README = ROOT / "README.md"
 HERE = Path(sys.executable).parent
 TARGETS = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.M))
-MADE = re.compile(r"--(?:out|onnx|plot)[ =](\S+)")
+MADE = re.compile(r"--(?:out|onnx|plot|posterior)[ =](\S+)")
 
 # One process a page: most of a short command's time is what it imports.
 PLAYER = """
@@ -110,7 +110,9 @@ def test_every_command_of_a_page_exists(page: Path):
             continue
         values = parsed(command)
         made |= {
-            file for option in ("--out", "--onnx", "--plot") for file in values.get(option, [])
+            file
+            for option in ("--out", "--onnx", "--plot", "--posterior")
+            for file in values.get(option, [])
         }
         for word in (word for words in values.values() for word in words):
             file = re.split(r"[:=]", word)[0]

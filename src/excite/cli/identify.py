@@ -14,6 +14,7 @@ from .options import (
     NUMBERS,
     OUT_FILE,
     Callback,
+    WholeNumber,
     command_line,
     computing,
     json_option,
@@ -175,13 +176,31 @@ def _priors(words: Sequence[str]) -> list[dict[str, str] | Path] | None:
     help="Standard deviation of known constants, which widens the intervals: m=5%,g=0.02.",
 )
 @of_records
+@click.option(
+    "--posterior",
+    type=OUT_FILE,
+    metavar="FILE.nc",
+    help="Draw posterior samples of the parameters, and write them as netCDF.",
+)
+@click.option(
+    "--samples",
+    type=WholeNumber(min=10),
+    default=1000,
+    show_default=True,
+    help="Posterior samples of each of four chains.",
+)
 @click.option("--out", type=OUT_FILE, metavar="FOLDER", help="Run folder to write.")
-@click.option("--overwrite", is_flag=True, help="Replace the run folder if it exists.")
+@click.option("--overwrite", is_flag=True, help="Replace what exists.")
 @plot_option
 @json_option
 @computing
 def identify(
-    files: tuple[Path, ...], out: Path | None, plot: Path | None, as_json: bool, **options: Any
+    files: tuple[Path, ...],
+    out: Path | None,
+    plot: Path | None,
+    posterior: Path | None,
+    as_json: bool,
+    **options: Any,
 ) -> int:
     """Estimate PLANT's parameters from one or several records.
 
@@ -194,6 +213,14 @@ def identify(
 
     if out is not None:
         require_free_run_folder(out, options["overwrite"])
+    if posterior is not None:
+        from ..estimation.posterior import require_extra
+        from ..files import require_new_file
+
+        require_extra()
+        if posterior.suffix != ".nc":
+            raise ValueError(f"{posterior}: a file of posterior samples ends in .nc")
+        require_new_file(posterior, options["overwrite"])
     with progress_bar("identifying") as progress:
         result = verb(
             files,
@@ -206,16 +233,31 @@ def identify(
             progress=progress,
             **arguments_of(options),
         )
+        is_drawn = posterior is not None and result.is_usable
+        samples = result.posterior(options["samples"], progress=progress) if is_drawn else None
     if plot is not None:
         from ..figure import save
 
         save(result.plot(), plot)
     if out is not None:
         result.save(out, options["overwrite"], command_line())
+    found: dict[str, Any] | None = None
+    if posterior is not None and samples is not None:
+        from ..estimation.posterior import summary
+        from ..files import write_bytes
+
+        found = summary(samples)
+        write_bytes(posterior, bytes(samples.to_netcdf(engine="h5netcdf")))
     if as_json:
-        show_json(result.to_dict())
+        show_json(result.to_dict() | ({} if posterior is None else {"posterior": found}))
     else:
         click.echo(result)
+        if found is not None:
+            from ..report.results import posterior_text
+
+            click.echo(f"\n{posterior_text(found)}")
+        elif posterior is not None:
+            click.echo("no posterior samples: a failed estimate has none")
         if out is not None:
             click.echo(f"run folder: {out}")
     return 0 if result.is_usable else 1

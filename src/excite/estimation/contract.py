@@ -10,6 +10,7 @@ import abc
 import enum
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import ClassVar, TypeAlias
 
 import equinox as eqx
@@ -160,6 +161,27 @@ class Estimate(eqx.Module):
     steps: Int[Array, ""] | int = 0
     degrees: Float[Array, " param"] | None = None
     prediction: Prediction | None = None
+
+
+@dataclass(frozen=True)
+class Basis:
+    """What an identification was computed from.
+
+    Attributes:
+        plant: as it was fitted.
+        experiments: the records.
+        estimator: as it was called.
+        estimate: what it returned.
+        free: False for a parameter that was held.
+        uncertain: standard deviation of each known constant, or zero.
+    """
+
+    plant: AbstractPlant
+    experiments: Experiments
+    estimator: AbstractEstimator
+    estimate: Estimate
+    free: Bool[np.ndarray, " param"]
+    uncertain: Float[np.ndarray, " constant"]
 
 
 def quality(estimate: Estimate) -> float:

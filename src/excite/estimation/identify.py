@@ -34,6 +34,7 @@ from .catalogue import estimator_from
 from .contract import (
     AbstractEstimator,
     AbstractSearch,
+    Basis,
     Estimate,
     Experiments,
     Prediction,
@@ -267,6 +268,7 @@ def identify(
         ),
         initial_state_known=known,
         noise=_noise(plant.definition, fit.estimate),
+        basis=Basis(plant, experiments, estimator, fit.estimate, fit.free, uncertain_sd),
     )
 
 

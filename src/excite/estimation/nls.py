@@ -31,7 +31,7 @@ from .contract import (
 from .multiple_shooting import FREEDOM, MultipleShooting, Point, Segments, student_root
 from .prior import Prior
 
-_FAR = 30.0  # largest logarithm of a positive parameter over its nominal value
+FAR = 30.0  # largest logarithm of a positive parameter over its nominal value
 _ROUNDS, _SCALE_STEPS = 3, 20  # searches with the noise found by the one before; of its scale
 Noise = Literal["declared", "known", "estimated"]
 Likelihood = Literal["normal", "student"]
@@ -317,7 +317,7 @@ class Problem(eqx.Module):
         d = self.plant.definition
         usual = to_search(d, self.plant.nominal)
         positive = jnp.asarray([p.positive for p in d.parameters])
-        beyond = jax.lax.stop_gradient(z - jnp.clip(z, usual - _FAR, usual + _FAR))
+        beyond = jax.lax.stop_gradient(z - jnp.clip(z, usual - FAR, usual + FAR))
         z = z - jnp.where(positive, beyond, 0.0)  # the derivative is kept beyond the limit
         return from_search(d, jnp.where(self.free, z, self.start))
 

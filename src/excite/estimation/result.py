@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,18 +11,20 @@ import numpy as np
 from jaxtyping import Float
 
 from .. import __version__
-from ..description import Named, PlantDescription, names_of
+from ..description import RARE, Named, PlantDescription, names_of
 from ..record import Record
 from ..record.run_folder import write_run
 from ..record.table import data_frame
 from ..report.results import identification_html, identification_text, wrapped
 from ..report.rows import USABLE, EstimateSummary
+from .contract import Basis
 from .diagnosis import correlation, fit_percent
 from .remedies import Suspect
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
+    from xarray import DataTree
 
 
 @dataclass(frozen=True)
@@ -115,6 +117,7 @@ class Identification:
         fitted, validation: records and their simulation.
         initial_state_known: whether initial states were taken as known.
         noise: estimated with `pem`; otherwise None.
+        basis: what it was computed from; None for a result made otherwise.
     """
 
     plant: PlantDescription
@@ -134,6 +137,7 @@ class Identification:
     validation: tuple[Fitted, ...]
     initial_state_known: bool
     noise: Noise | None = None
+    basis: Basis | None = field(default=None, compare=False)
 
     @property
     def is_usable(self) -> bool:
@@ -198,6 +202,43 @@ class Identification:
             "held": [name in self.held for name in self.params],
         }
         return data_frame(columns, list(self.params))
+
+    def posterior(
+        self,
+        num_samples: int = 1000,
+        chains: int = 4,
+        seed: int = 0,
+        progress: Callable[[str, float, float], None] = lambda *_: None,
+    ) -> DataTree:
+        """Samples of the posterior of the parameters, in the groups and with the names of ArviZ.
+
+        The likelihood is that of the estimator `nls` with independent noise of one size for each
+        output. The prior is flat in the logarithms of positive parameters, flat in others and in
+        initial states, 1/sd in the size of the noise, and log-normal in uncertain constants. Held
+        parameters stay held. The chains begin around the estimate.
+
+        Args:
+            num_samples: of each chain.
+            chains: number of chains.
+            seed: of the sampler.
+            progress: called with the current step, how many draws are done, and their total.
+
+        Returns:
+            `posterior`: parameters, uncertain constants, `noise_sd` by output unless it is known,
+            `initial_state` if it was estimated; `sample_stats`; `observed_data`;
+            `log_likelihood` of every measured value, unless there are more than ten million;
+            `constant_data`: held parameters.
+
+        Raises:
+            ValueError: for a failed estimate, an estimator other than `nls`, a record without
+                noise, and where the extra `bayes` is not installed.
+        """
+        from .posterior import sampled
+
+        if self.basis is None or not self.is_usable:
+            raise ValueError(f"a failed estimate has no posterior (status: {self.status})")
+        coloured = [name for name, p in self.whiteness.items() if p < RARE]
+        return sampled(self.basis, coloured, num_samples, chains, seed, progress)
 
     def summary(self) -> EstimateSummary:
         """The result as tables, figures and reports read it."""

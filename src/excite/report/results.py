@@ -16,7 +16,7 @@ from .estimates import (
     parameter_header,
     residual_in_words,
 )
-from .numbers import number
+from .numbers import digits_for, number
 from .rows import EstimateSummary, HeldOut
 from .tables import Table, html_table, text_table
 
@@ -88,6 +88,27 @@ def identification_text(result: EstimateSummary) -> str:
     """Parameters with their intervals, tests and verdict, as plain text."""
     title, (header, rows) = _estimates(result)
     return "\n".join([text_table(title, header, rows), "", *_judgement(result)])
+
+
+def posterior_text(posterior: Data) -> str:
+    """Means and 95 % credible intervals of posterior samples, as plain text.
+
+    Args:
+        posterior: of `excite.estimation.posterior.summary`.
+    """
+    noise = {f"noise of {name}": p for name, p in (posterior["noise_sd"] or {}).items()}
+    rows = []
+    for name, p in {**posterior["params"], **noise}.items():
+        digits = digits_for(p["mean"], p["sd"])
+        ends = " to ".join(number(end, digits) for end in p["ci95"])
+        of_chains = [number(p["rhat"], 4), f"{p['ess']:.0f}"]
+        rows.append([name, p["unit"], number(p["mean"], digits), ends, *of_chains])
+    header = ["posterior", "unit", "mean", "95 % credible interval", "rhat", "ess"]
+    drawn = (
+        f"{posterior['chains']} chains of {posterior['samples']} samples, "
+        f"{posterior['divergences'] or 'no'} divergences"
+    )
+    return "\n".join([text_table("", header, rows), "", drawn, *posterior["verdict"]])
 
 
 def identification_html(result: EstimateSummary) -> str:
