@@ -91,27 +91,32 @@ def stack_experiments(
     xp = jnp if any(isinstance(rows, jax.core.Tracer) for rows in (*inputs, *measured)) else np
     longest, counts = max(map(len, inputs)), xp.asarray([len(y) for y in measured])
 
-    def stacked(records: Sequence[AnyArray], length: int) -> Array:
+    def stacked(records: Sequence[AnyArray], length: int) -> AnyArray:
         padded = [
-            xp.pad(rows, [(0, length - len(rows)), *[(0, 0)] * (rows.ndim - 1)])
+            rows
+            if len(rows) == length
+            else xp.pad(rows, [(0, length - len(rows)), *[(0, 0)] * (rows.ndim - 1)])
             for rows in (xp.asarray(rows, float) for rows in records)
         ]
-        return jax.device_put(xp.stack(padded))
+        return xp.stack(padded)
 
     valid = xp.arange(longest + 1)[None, :, None] < counts[:, None, None]
-    valid = jax.device_put(xp.tile(valid, (1, 1, measured[0].shape[1])))
+    valid = xp.tile(valid, (1, 1, measured[0].shape[1]))
     if seen is not None:
         valid = valid & (stacked(seen, longest + 1) > 0)
         measured = [xp.where(own, rows, 0.0) for own, rows in zip(seen, measured, strict=True)]
-
+    inputs, measured, valid, initial_state, dt, next_inputs = jax.device_put(
+        (
+            stacked(inputs, longest),
+            stacked(measured, longest + 1),
+            valid,
+            xp.tile(xp.asarray(plant.initial_state), (len(inputs), 1)),
+            None if dt is None else stacked(dt, longest),
+            None if next_inputs is None else stacked(next_inputs, longest),
+        )
+    )
     return Experiments(
-        inputs=stacked(inputs, longest),
-        measured=stacked(measured, longest + 1),
-        valid=valid,
-        initial_state=jax.device_put(xp.tile(xp.asarray(plant.initial_state), (len(inputs), 1))),
-        initial_state_known=initial_state_known,
-        dt=None if dt is None else stacked(dt, longest),
-        next_inputs=None if next_inputs is None else stacked(next_inputs, longest),
+        inputs, measured, valid, initial_state, initial_state_known, dt=dt, next_inputs=next_inputs
     )
 
 

@@ -252,7 +252,7 @@ class NLS(AbstractSearch):
     def length_of_segments(self, plant: AbstractPlant, num_samples: int) -> int:
         """Length of a segment: it is short, but determines its start state."""
         needed = 4 * len(plant.definition.states)
-        usual = max(needed, min(math.isqrt(num_samples), 100))
+        usual = max(needed, min(3 * math.isqrt(num_samples) // 4, 100))
         return min(self.segment_length or usual, num_samples)
 
 

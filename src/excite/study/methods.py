@@ -33,6 +33,7 @@ from .statistics import Scores, table_row
 
 CHUNK = 100
 """Episodes computed in one call: enough to be fast, few enough to show progress."""
+_SIDE_BY_SIDE = 10  # estimates: more do not fit the cache, and wait for the slowest search
 
 
 @eqx.filter_jit
@@ -41,13 +42,14 @@ def estimate_all(
 ) -> tuple[Float[Array, "episode param"], Float[Array, "episode param"], Array]:
     """Estimates, standard errors and status of every episode; initial states are known."""
 
-    def one(inputs: Array, measured: Array) -> tuple[Array, Array, Array]:
+    def one(rows: tuple[Array, Array]) -> tuple[Array, Array, Array]:
+        inputs, measured = rows
         data = stack_experiments(plant, [inputs], [measured], True)
         estimate = estimator(plant, data)
         variance = jnp.diagonal(estimate.covariance)
         return jnp.stack(estimate.params), jnp.sqrt(variance), estimate.status
 
-    return jax.vmap(one)(trajectory.inputs, trajectory.measured)
+    return jax.lax.map(one, (trajectory.inputs, trajectory.measured), batch_size=_SIDE_BY_SIDE)
 
 
 def episode_keys(study: Study) -> Key[Array, " episode"]:
