@@ -105,19 +105,15 @@ def stack_experiments(
     if seen is not None:
         valid = valid & (stacked(seen, longest + 1) > 0)
         measured = [xp.where(own, rows, 0.0) for own, rows in zip(seen, measured, strict=True)]
-    inputs, measured, valid, initial_state, dt, next_inputs = jax.device_put(
-        (
-            stacked(inputs, longest),
-            stacked(measured, longest + 1),
-            valid,
-            xp.tile(xp.asarray(plant.initial_state), (len(inputs), 1)),
-            None if dt is None else stacked(dt, longest),
-            None if next_inputs is None else stacked(next_inputs, longest),
-        )
-    )
-    return Experiments(
-        inputs, measured, valid, initial_state, initial_state_known, dt=dt, next_inputs=next_inputs
-    )
+    arrays = {
+        "inputs": stacked(inputs, longest),
+        "measured": stacked(measured, longest + 1),
+        "valid": valid,
+        "initial_state": xp.tile(xp.asarray(plant.initial_state), (len(inputs), 1)),
+        "dt": None if dt is None else stacked(dt, longest),
+        "next_inputs": None if next_inputs is None else stacked(next_inputs, longest),
+    }
+    return Experiments(**jax.device_put(arrays), initial_state_known=initial_state_known)
 
 
 class Prediction(eqx.Module):
