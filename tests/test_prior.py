@@ -286,7 +286,7 @@ def shifted(offset: float) -> Record:
 def test_the_initial_state_of_a_held_out_record_is_found_as_asked(state, words, error):
     other = shifted(2.0)
     found = identify(noisy(), Ramp, validate=other, validate_state=state).validation[0]
-    assert found.initial_state == words
+    assert found.initial_state.partition(" (")[0] == words
     if error is None:  # the first sample's noise remains
         assert found.simulated[0] == pytest.approx(other.outputs[0])
     else:

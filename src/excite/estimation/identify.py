@@ -145,7 +145,7 @@ def identify(
             measurements, where the outputs at one time determine it; 0.1 (or "10%"): estimated
             from this share of the record, which does not count in the fit; 1.0: from all of it,
             which counts. "auto": known where the sidecar says so, otherwise from the first
-            measurements, otherwise from a share of 10 %.
+            measurements, otherwise from all of it, and the fit with a share of 10 % is told, too.
         progress: called with a text, how much is done, and the total.
         columns: names in the files where they are not the plant's: {"pitch": "qm"}.
         scales: factors from the files' units to the plant's: {"pitch": 0.01745}.
@@ -1015,7 +1015,7 @@ def _state_from(record: Record, plant: AbstractPlant, word: str | float) -> floa
             "such as 10%"
         )
     if word == "auto":
-        return _SHARE
+        return 1.0
     try:
         is_part = isinstance(word, str) and word.endswith("%")
         share = float(str(word).removesuffix("%")) * (0.01 if is_part else 1.0)
@@ -1062,8 +1062,12 @@ def _validated(
     (spent,) = _by_record([record], (used if share != 1 else ~valid).astype(float))
     fitted = _fitted(plant.definition, record, residual, *_predicted(plant, [record], prediction))
     scored = dataclasses.replace(record, outputs=np.where(spent == 0, record.outputs, np.nan))
-    fits = _fits(plant.definition, scored, fitted.simulated)
-    return dataclasses.replace(fitted, fit_percent=fits, initial_state=_in_words(share))
+    fits, words = _fits(plant.definition, scored, fitted.simulated), _in_words(share)
+    if share == 1:
+        begun = _validated(plant, record, linear, estimator, estimate, _SHARE).fit_percent.values()
+        percent = " and ".join(f"{fit:.4g} %" for fit in begun)
+        words += f" (from its first {100 * _SHARE:.0f} %, the rest fits {percent})"
+    return dataclasses.replace(fitted, fit_percent=fits, initial_state=words)
 
 
 def _in_words(share: float | None) -> str:
