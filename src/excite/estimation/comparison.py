@@ -13,7 +13,8 @@ from ..description import names_of
 from ..plant.catalogue import PlantLike, plant_from
 from ..report.results import comparison_html, comparison_text, wrapped
 from .diagnosis import chi2_tail, log_likelihood
-from .identify import RecordLike, identify, parts_of
+from .from_records import parts_of
+from .identify import RecordLike, identify
 from .result import Identification
 
 

@@ -1,0 +1,235 @@
+"""The fit of a plant: searches from several starts; what the data do not tell is held."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import jax
+import numpy as np
+
+from ..description import RARE, names_of
+from ..identifiability import STRUCTURALLY_NOT, worst_seen
+from ..plant import AbstractPlant, Params, floats
+from .contract import (
+    AbstractEstimator,
+    AbstractSearch,
+    Estimate,
+    Experiments,
+    Status,
+    bound_reached,
+    from_search,
+    quality,
+    to_search,
+)
+from .diagnosis import ljung_box
+from .held import structure_of
+from .nls import NLS
+from .pem import PEM
+
+Progress = Callable[[str, float, float], None]
+NOTHING_SEEN = (
+    "no parameter is identifiable from the data; are columns, signs and units right, and does the "
+    "input move the plant beyond the noise? or did the search begin too far from the truth "
+    "(--start)?"
+)
+_STARTS, _SIZE_OF_MANY_STARTS = 8, 50_000  # measured values up to which so many are tried
+_TELLING = 50  # measured values from which the residual tells whether the search missed something
+_FREE = 100.0  # scales of a parameter of free sign that are small for its standard error
+
+
+def known_parameters(plant: AbstractPlant, estimator: AbstractEstimator) -> np.ndarray:
+    """Which parameters the estimator holds because they are known; ValueError where all are."""
+    names = names_of(plant.definition.parameters)
+    held = estimator.held(plant) if isinstance(estimator, AbstractSearch) else (False,) * len(names)
+    if all(held):
+        raise ValueError("all parameters are held; none is left to estimate")
+    return np.array(held)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """An estimate, its free and known parameters, and a sentence for each held one.
+
+    `others` are the ends of searches that began elsewhere.
+    """
+
+    estimate: Estimate
+    free: np.ndarray
+    known: np.ndarray
+    reasons: tuple[str, ...]
+    others: Sequence[Estimate] = ()
+
+    def has_ended_in(self, status: Status) -> bool:
+        """Whether the estimate has this status."""
+        return int(self.estimate.status) == status
+
+    @property
+    def is_successful(self) -> bool:
+        """Whether the search converged."""
+        return self.has_ended_in(Status.SUCCESSFUL)
+
+    @property
+    def status(self) -> str:
+        """The status in words."""
+        if self.is_successful and not (self.free | self.known).all():
+            return "partly identifiable"
+        return Status(int(self.estimate.status)).name.lower().replace("_", " ")
+
+
+def fit_of(
+    plant: AbstractPlant,
+    experiments: Experiments,
+    estimator: AbstractEstimator,
+    start: Params,
+    progress: Progress,
+) -> Fit:
+    """Fits; parameters that were held are tested once more, from the estimate.
+
+    Far from the true values a search can end at an estimate where the outputs hardly depend
+    on a parameter, although the data determine it.
+    """
+    fit = _fit_seen(plant, experiments, estimator, start, progress)
+    if not (fit.reasons and fit.is_successful):
+        return fit
+    again = _fit_seen(plant, experiments, estimator, fit.estimate.params, progress)
+    return again if again.is_successful and again.free.sum() > fit.free.sum() else fit
+
+
+def _fit_seen(
+    plant: AbstractPlant,
+    experiments: Experiments,
+    estimator: AbstractEstimator,
+    start: Params,
+    progress: Progress,
+) -> Fit:
+    """Fits; holds a parameter that ends at a bound or is not identifiable, and fits again."""
+    names = names_of(plant.definition.parameters)
+    known = known_parameters(plant, estimator)
+    free, reasons = ~known, ()
+    found = _estimate(plant, experiments, estimator, start, free, progress)
+    while True:
+        fit = Fit(found[0], free, known, reasons, found[1:])
+        # ARX estimates all parameters or none.
+        if not isinstance(estimator, AbstractSearch) or fit.has_ended_in(Status.NOT_FINITE):
+            return fit
+        held = _to_hold(plant, fit, start)
+        if held is None:
+            return fit
+        chosen, value, why = held
+        start, last = (
+            params._replace(**{names[chosen]: floats(value)}) for params in (start, found[0].params)
+        )
+        free = free & (np.arange(len(names)) != chosen)
+        reasons = (*reasons, why)
+        if not free.any():
+            found = structure_of(plant, experiments, start)
+            groups = found.not_identifiable if found else ()
+            why = [f"{STRUCTURALLY_NOT}: {group.sentence}" for group in groups]
+            raise ValueError("; ".join([*why, NOTHING_SEEN]))
+        found = _estimate(plant, experiments, estimator, start, free, progress, [last])
+
+
+def _estimate(
+    plant: AbstractPlant,
+    experiments: Experiments,
+    estimator: AbstractEstimator,
+    start: Params,
+    free: np.ndarray,
+    progress: Progress,
+    others: Sequence[Params] | None = None,
+) -> list[Estimate]:
+    """Estimates, the best first; the search is repeated where it may have missed the best one.
+
+    Where more than noise is left, or a short record cannot tell, it begins at other starts as
+    well, default random ones; where it does not converge, it has longer segments.
+    """
+
+    def search(estimator: AbstractEstimator, start: Params) -> Estimate:
+        return jax.device_get(estimator(plant, experiments, *jax.device_put((start, free))))
+
+    if isinstance(estimator, PEM):  # it begins where least squares ends
+        least_squares = NLS(known=estimator.known)
+        first = _estimate(plant, experiments, least_squares, start, free, progress, others)
+        start = first[0].params
+        progress("prediction error", 0.4, 1.0)
+    found = [search(estimator, start)]
+    if not isinstance(estimator, NLS):
+        return found
+    size, num_samples = experiments.valid.size, experiments.valid.shape[1]
+    is_in_doubt = size < _TELLING or not is_noise(plant, experiments, found[0])
+    if size <= _SIZE_OF_MANY_STARTS and is_in_doubt:
+        others = _starts_around(plant, start, free) if others is None else others
+        for i, other in enumerate(others):
+            best = min(found, key=quality)
+            progress(
+                f"search from start {i + 2} of {len(others) + 1} (best sum of squares "
+                f"{float(best.cost):.6g}, found in {int(best.steps)} steps)",
+                0.1 + 0.4 * i / len(others),
+                1.0,
+            )
+            found.append(search(estimator, other))
+        found.sort(key=quality)
+    length = estimator.length_of_segments(plant, num_samples)
+    while int(found[0].status) == Status.ITERATIONS_EXHAUSTED and length < num_samples:
+        length *= 4
+        longer = search(dataclasses.replace(estimator, segment_length=length), start)
+        found = [longer] if int(longer.status) == Status.SUCCESSFUL else found
+    return found
+
+
+def _starts_around(plant: AbstractPlant, start: Params, free: np.ndarray) -> list[Params]:
+    """Random starts around one, always the same: up to a factor of three away."""
+    d, z = plant.definition, to_search(plant.definition, start)
+    width = np.where(free, [np.log(3) if p.positive else 2.0 for p in d.parameters], 0.0)
+    unit = jax.random.uniform(jax.random.key(0), (_STARTS - 1, len(width)), float, -1.0, 1.0)
+    return [plant.Params(*from_search(d, z + width * row)) for row in unit]
+
+
+def is_noise(plant: AbstractPlant, experiments: Experiments, estimate: Estimate) -> bool:
+    """Whether a search ended where only white noise is left; then it missed no better minimum."""
+    if int(estimate.status) != Status.SUCCESSFUL:
+        return False
+    residual, valid = np.asarray(estimate.residual), np.asarray(experiments.valid)
+    return all(
+        not whiteness_of([r[v, i] for r, v in zip(residual, valid[..., i], strict=True)], o.scale)
+        < RARE
+        for i, o in enumerate(plant.definition.outputs)
+    )
+
+
+def _to_hold(plant: AbstractPlant, fit: Fit, start: Params) -> tuple[int, float, str] | None:
+    """The parameter to hold next, its value, and the reason; None where there is none."""
+    names = names_of(plant.definition.parameters)
+    reached = bound_reached(plant.definition, fit.estimate.params)
+    if reached is not None and fit.free[reached[0]]:
+        name, value = names[reached[0]], float(fit.estimate.params[reached[0]])
+        return reached[0], value, f"{name} ended at its bound {reached[1]:g} and was held there"
+    # A positive parameter is searched by its logarithm, which ends nowhere if the data do not tell
+    # it from zero; one of free sign is far from that as long as the equations can be solved.
+    unit = np.array([1.0 if p.positive else _FREE for p in plant.definition.parameters])
+    information = np.asarray(fit.estimate.information) * np.outer(unit, unit)
+    unseen = worst_seen(names, information, fit.free)
+    if unseen is None:
+        return None
+    value = float(start[unseen[0]])
+    why = f"{unseen[1]}; {names[unseen[0]]} was held at {value:g}"
+    only = "; the others hold only for this value" if "separately" in why else ""
+    return unseen[0], value, why + only
+
+
+def with_initial_state(plant: AbstractPlant, experiments: Experiments, params: Params) -> Estimate:
+    """The best initial states for given parameters."""
+    held = jax.device_put(np.zeros(len(params), bool))
+    return jax.device_get(NLS()(plant, experiments, jax.device_put(params), held))
+
+
+def whiteness_of(residuals: list[np.ndarray], scale: float) -> float:
+    """p-value of white residuals; NaN where only rounding errors are left."""
+    return ljung_box(*(r for r in residuals if is_more_than_rounding(r, scale)))
+
+
+def is_more_than_rounding(residual: np.ndarray, scale: float) -> bool:
+    """Whether a residual is more than rounding errors of values of this size."""
+    return bool(np.any(np.abs(residual) > 1e-8 * scale))
