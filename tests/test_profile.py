@@ -65,6 +65,15 @@ def test_profile_intervals_of_a_reaction_are_scipys():
     assert linear.params == result.params
     result.plot()
 
+    for name in ("k1", "k2"):  # the profile crosses its limit at both ends of the interval
+        value, growth = result.profiles[name].T
+        assert growth[value == result.params[name]] == 0
+        for end in result.ci95(name):
+            np.testing.assert_allclose(growth[np.isclose(value, end)], 1, atol=5e-3)
+    titles = [axis.get_title() for axis in result.plot("diagnosis").axes]
+    assert {"correlation of the estimates", "residual of b", "profile of k2"} <= {*titles}
+    assert not any("profile" in axis.get_title() for axis in linear.plot("diagnosis").axes)
+
 
 def test_profile_intervals_of_many_samples_are_those_of_standard_errors():
     record = tank_record(1.8)
@@ -114,7 +123,11 @@ def test_the_command_line_has_profile_intervals(tmp_path):
     np.savetxt(tmp_path / "r.csv", rows, delimiter=",", header="time,b", comments="")
     words = ("identify", "r.csv", "--plant", FILE.replace("Conversion", "Product"))
     words = (*words, "--initial-state", "known", "--intervals", "profile", "--json")
-    done = excite(*words, cwd=tmp_path)
+    done = excite(*words, "--plot-diagnosis", "diagnosis.svg", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
+    assert "profile of k1" in (tmp_path / "diagnosis.svg").read_text()
+    assert len(json.loads(done.stdout)["starts"]) == 8
+    refused = excite(*words, "--plot-diagnosis", "diagnosis.exe", cwd=tmp_path)
+    assert refused.returncode == 2
     low, high = json.loads(done.stdout)["params"]["k1"]["ci95"]
     np.testing.assert_allclose((low, high), scipys_profile(record)[0], rtol=0.01)

@@ -192,12 +192,19 @@ def _priors(words: Sequence[str]) -> list[dict[str, str] | Path] | None:
 @click.option("--out", type=OUT_FILE, metavar="FOLDER", help="Run folder to write.")
 @click.option("--overwrite", is_flag=True, help="Replace what exists.")
 @plot_option
+@click.option(
+    "--plot-diagnosis",
+    type=OUT_FILE,
+    metavar="FILE",
+    help="Write a figure of starts, correlations, residuals and profiles.",
+)
 @json_option
 @computing
 def identify(
     files: tuple[Path, ...],
     out: Path | None,
     plot: Path | None,
+    plot_diagnosis: Path | None,
     posterior: Path | None,
     as_json: bool,
     **options: Any,
@@ -235,10 +242,13 @@ def identify(
         )
         is_drawn = posterior is not None and result.is_usable
         samples = result.posterior(options["samples"], progress=progress) if is_drawn else None
-    if plot is not None:
+    if plot is not None or plot_diagnosis is not None:
         from ..figure import save
 
-        save(result.plot(), plot)
+        if plot is not None:
+            save(result.plot(), plot)
+        if plot_diagnosis is not None:
+            save(result.plot("diagnosis"), plot_diagnosis)
     if out is not None:
         result.save(out, options["overwrite"], command_line())
     found: dict[str, Any] | None = None

@@ -131,11 +131,11 @@ def computing(command: Callable[P, Result]) -> Callable[P, Result]:
             raise ValueError(
                 "this command needs JAX, which is not installed: pip install excite"
             ) from None
-        plot = kwargs.get("plot")
-        if isinstance(plot, Path):
-            from ..figure import require_plot_path
+        for plot in (kwargs.get("plot"), kwargs.get("plot_diagnosis")):
+            if isinstance(plot, Path):
+                from ..figure import require_plot_path
 
-            require_plot_path(plot)
+                require_plot_path(plot)
         return command(*args, **kwargs)
 
     return wrapped

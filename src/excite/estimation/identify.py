@@ -231,10 +231,10 @@ def identify(
     values = np.array([float(value) for value in fit.estimate.params])
     sd = np.where(fit.free, np.sqrt(np.maximum(np.diag(covariance), 0.0)), np.nan)
     half = np.where(fit.free, half_95(covariance, degrees), np.nan)
-    ends = np.stack([values - half, values + half], axis=1)
+    ends, profiles = np.stack([values - half, values + half], axis=1), {}
     if intervals == "profile" and isinstance(estimator, NLS) and fit.is_successful:
         estimate = jax.device_put(fit.estimate)
-        ends = profile_intervals(
+        ends, profiles = profile_intervals(
             plant,
             experiments,
             estimator,
@@ -265,6 +265,8 @@ def identify(
         ),
         initial_state_known=known,
         noise=_noise(plant.definition, fit.estimate),
+        starts=tuple(float(end.cost) for end in (fit.estimate, *fit.others)) if fit.others else (),
+        profiles=profiles,
         basis=Basis(plant, experiments, estimator, fit.estimate, fit.free, uncertain_sd),
     )
 

@@ -37,10 +37,12 @@ def profile_intervals(
     free: Bool[np.ndarray, " param"],
     half: Float[np.ndarray, " param"],
     progress: Callable[[str, float, float], None] = lambda *_: None,
-) -> Float[np.ndarray, "param end"]:
-    """Both ends of each free parameter's interval, infinite where it stays open; NaN if held.
+) -> tuple[Float[np.ndarray, "param end"], dict[str, Float[np.ndarray, "point 2"]]]:
+    """Both ends of each free parameter's interval, and the profiles.
 
-    A positive parameter whose interval stays open below begins at zero.
+    An end is infinite where the interval stays open, NaN for a held parameter; a positive
+    parameter whose interval stays open below begins at zero. A profile has the values that were
+    tried, and the growth of the sum of squares over the limit.
 
     Args:
         half: of the intervals by standard errors. They set the limits, so that both kinds agree
@@ -59,8 +61,9 @@ def profile_intervals(
     size = np.abs(np.asarray(relative_size(plant, estimate.params)))
     least = float(estimator.sum_of_squares(plant, experiments, estimate))
     ends = np.full((len(free), 2), np.nan)
+    profiles: dict[str, Float[np.ndarray, "point 2"]] = {}
 
-    def excess_of(index: int) -> Callable[[float], float]:
+    def excess_of(index: int, tried: list[tuple[float, float]]) -> Callable[[float], float]:
         """Growth of the sum of squares, with the parameter at a value and the others best."""
         name = names_of(plant.definition.parameters)[index]
         others = jax.device_put(free & (np.arange(len(free)) != index))
@@ -69,10 +72,11 @@ def profile_intervals(
         def excess(value: float) -> float:
             begin = nearest["params"]._replace(**{name: floats(value)})
             found = jax.device_get(estimator(plant, experiments, jax.device_put(begin), others))
-            if int(found.status) != Status.SUCCESSFUL:
-                return math.inf
-            nearest["params"] = found.params
-            return float(found.cost) - least
+            is_found = int(found.status) == Status.SUCCESSFUL
+            growth = float(found.cost) - least if is_found else math.inf
+            nearest["params"] = found.params if is_found else nearest["params"]
+            tried.append((value, growth))
+            return growth
 
         return excess
 
@@ -80,9 +84,12 @@ def profile_intervals(
         part, value = plant.definition.parameters[index], float(estimate.params[index])
         progress(f"profile of {part.name}", int(index), len(free))
         limit = (half[index] / (unit[index] * size[index])) ** 2
+        tried = [(value, 0.0)]
         for side, sign in enumerate((-1, 1)):
-            ends[index, side] = _end(part, value, sign, half[index], limit, excess_of(int(index)))
-    return ends
+            excess = excess_of(int(index), tried)
+            ends[index, side] = _end(part, value, sign, half[index], limit, excess)
+        profiles[part.name] = np.array(sorted(tried)) / np.array([1.0, limit])
+    return ends, profiles
 
 
 def _end(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -137,6 +137,8 @@ class Identification:
     validation: tuple[Fitted, ...]
     initial_state_known: bool
     noise: Noise | None = None
+    starts: tuple[float, ...] = ()
+    profiles: Mapping[str, Float[np.ndarray, "point 2"]] = field(default_factory=dict)
     basis: Basis | None = field(default=None, compare=False)
 
     @property
@@ -179,10 +181,24 @@ class Identification:
     def _repr_html_(self) -> str:
         return identification_html(self.summary())
 
-    def plot(self) -> Figure:
-        """Measured against simulated outputs of the first record, residuals, intervals."""
-        from ..report.figures import identification_figure
+    def plot(self, what: Literal["fit", "diagnosis"] = "fit") -> Figure:
+        """A figure of the fit, or of how far the estimate can be trusted.
 
+        Args:
+            what: "fit": measured against simulated outputs of the first record, residuals,
+                intervals; "diagnosis": starts of the search, correlation of the estimates,
+                autocorrelation of the residuals, and profiles where there are any.
+
+        Raises:
+            ValueError: for another word.
+        """
+        from ..report.figures import diagnosis_figure, identification_figure
+
+        if what == "diagnosis":
+            residuals = [f.record.outputs - f.model for f in self.fitted]
+            return diagnosis_figure(self.plant, self.summary(), residuals)
+        if what != "fit":
+            raise ValueError(f"a figure shows the fit or the diagnosis: got {what!r}")
         first = self.fitted[0]
         return identification_figure(self.plant, self.summary(), first.record, first.model)
 
@@ -308,6 +324,8 @@ class Identification:
             "process_noise": None if self.noise is None else dict(self.noise.process),
             "measurement_noise": None if self.noise is None else dict(self.noise.measurement),
             "suspects": [asdict(suspect) for suspect in self.suspects],
+            "starts": list(self.starts),
+            "profiles": {name: points.tolist() for name, points in self.profiles.items()},
         }
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import matplotlib.axes
 import matplotlib.figure
@@ -27,6 +27,8 @@ from ..figure import (
 from ..record import Record
 from .numbers import digits_for, number
 from .rows import EstimatedParameter, EstimateSummary, Row
+
+_HIGHEST = 5.0  # growth of a profile that is drawn, over the limit
 
 
 def identification_figure(
@@ -84,19 +86,115 @@ def autocorrelation_figure(
     """Autocorrelation of the residuals of all records, and its 95 % band for white noise."""
     outputs = description.outputs
     figure, axes = new_figure(1, len(outputs), width=4.0 * len(outputs), sharey="row")
-    count = sum(len(r) for r in residuals)
     for i, (axis, part) in enumerate(zip(axes[0], outputs, strict=True)):
-        lags = np.arange(1, min(25, min(len(r) for r in residuals) // 5) + 1)  # Ljung-Box's
-        centred = [r[:, i] - r[:, i].mean() for r in residuals]
-        power = sum(float(c @ c) for c in centred) or math.nan
-        values = [sum(float(c[lag:] @ c[:-lag]) for c in centred) / power for lag in lags]
-        axis.vlines(lags, 0, values, color=ORANGE, lw=2)
-        axis.axhline(0, color="black", lw=0.6)
-        for sign in (1, -1):
-            axis.axhline(sign * HALF_95 / math.sqrt(count), color=GREY, ls="--", lw=1)
-        axis.set(title=part.name, xlabel="lag [samples]")
+        _draw_autocorrelation(axis, [r[:, i] for r in residuals])
+        axis.set(title=part.name)
     axes[0, 0].set(ylabel="autocorrelation")
     return figure
+
+
+def _draw_autocorrelation(
+    axis: matplotlib.axes.Axes, residuals: Sequence[Float[np.ndarray, " sample"]]
+) -> None:
+    lags = np.arange(1, min(25, min(len(r) for r in residuals) // 5) + 1)  # Ljung-Box's
+    centred = [r - r.mean() for r in residuals]
+    power = sum(float(c @ c) for c in centred) or math.nan
+    values = [sum(float(c[lag:] @ c[:-lag]) for c in centred) / power for lag in lags]
+    axis.vlines(lags, 0, values, color=ORANGE, lw=2)
+    axis.axhline(0, color="black", lw=0.6)
+    for sign in (1, -1):
+        band = sign * HALF_95 / math.sqrt(sum(map(len, residuals)))
+        axis.axhline(band, color=GREY, ls="--", lw=1)
+    axis.set(xlabel="lag [samples]")
+
+
+def diagnosis_figure(
+    description: PlantDescription,
+    result: EstimateSummary,
+    residuals: Sequence[Float[np.ndarray, "sample output"]],
+) -> matplotlib.figure.Figure:
+    """How far an estimate can be trusted.
+
+    The sums of squares at which the starts of the search ended, the correlation of the estimates,
+    the autocorrelation of the residuals and, where there are any, the profile likelihoods.
+    """
+    panels: list[Callable[[matplotlib.axes.Axes], object]] = []
+    if result.starts:
+        panels.append(lambda axis: _draw_starts(axis, result.starts))
+    if sum(p.has_interval for p in result.params.values()) > 1:
+        panels.append(lambda axis: _draw_correlations(axis, result))
+    for i, part in enumerate(description.outputs):
+
+        def draw(axis: matplotlib.axes.Axes, i: int = i, name: str = part.name) -> None:
+            _draw_autocorrelation(axis, [r[np.isfinite(r[:, i]), i] for r in residuals])
+            axis.set(title=f"residual of {name}", ylabel="autocorrelation")
+
+        panels.append(draw)
+    for name in result.profiles:
+        panels.append(lambda axis, name=name: _draw_profile(axis, result, name))
+    columns = min(len(panels), 3)
+    rows = -(-len(panels) // columns)
+    figure, axes = new_figure(rows, columns, height=2.8, width=3.4 * columns)
+    for axis, panel in itertools.zip_longest(axes.ravel(), panels):
+        if panel is None:
+            axis.set_visible(False)
+        else:
+            panel(axis)
+    add_title(figure, f"{description.name}: {result.estimator}, {result.status}")
+    return figure
+
+
+def _draw_starts(axis: matplotlib.axes.Axes, costs: Sequence[float]) -> None:
+    """Sums of squares over the least one, in their order."""
+    finite = np.sort([cost for cost in costs if math.isfinite(cost)])
+    ratio, numbers = finite / finite[0], range(1, len(finite) + 1)
+    axis.plot(numbers, ratio, "o-", color=BLUE, ms=4)
+    axis.set(title="starts of the search", xlabel="start, the best first", xticks=numbers)
+    is_wide = ratio[-1] > 10
+    axis.set(ylabel="sum of squares / least", yscale="log" if is_wide else "linear")
+    axis.set(ylim=(0.8, None if is_wide else max(2.0, 1.1 * ratio[-1])))
+
+
+def _draw_correlations(axis: matplotlib.axes.Axes, result: EstimateSummary) -> None:
+    """Correlation of the estimates, a field for each pair."""
+    free = [i for i, p in enumerate(result.params.values()) if p.has_interval]
+    names = [list(result.params)[i] for i in free]
+    values = np.array(result.correlation, float)[np.ix_(free, free)]
+    axis.imshow(values, vmin=-1, vmax=1, cmap="RdBu_r")
+    for i, j in itertools.product(range(len(free)), repeat=2):
+        is_dark = abs(values[i, j]) > 0.6
+        axis.text(
+            j,
+            i,
+            f"{values[i, j]:.2f}",
+            ha="center",
+            va="center",
+            fontsize=8,
+            color="white" if is_dark else "black",
+        )
+    axis.set_xticks(range(len(names)), names)
+    axis.set_yticks(range(len(names)), names)
+    axis.grid(visible=False)
+    axis.set(title="correlation of the estimates")
+
+
+def _draw_profile(axis: matplotlib.axes.Axes, result: EstimateSummary, name: str) -> None:
+    """Growth of the sum of squares with one parameter held, and the limit of its interval."""
+    value, growth = np.array(result.profiles[name]).T
+    shown = np.isfinite(growth) & (growth < _HIGHEST)
+    value, growth = value[shown], np.maximum(growth[shown], 0.0)
+    between = np.linspace(value[0], value[-1], 200)
+    side = np.sign(value - result.params[name].estimate)
+    root = np.interp(between, value, side * np.sqrt(growth))  # nearly a straight line
+    axis.plot(between, root**2, color=BLUE, lw=1)
+    axis.plot(value, growth, "o", color=BLUE, ms=3)
+    axis.axhline(1, color=GREY, ls="--", lw=1)
+    for end in result.params[name].ci95:
+        if math.isfinite(end):
+            axis.axvline(end, color=GREY, lw=0.8)
+    axis.set(title=f"profile of {name}", xlabel=f"{name} [{result.params[name].unit}]")
+    axis.set(ylabel="growth of squares / limit", ylim=(-0.1, None))
+    axis.locator_params(axis="x", nbins=4)
 
 
 def correlation_figure(result: EstimateSummary) -> matplotlib.figure.Figure | None:

@@ -325,6 +325,8 @@ class EstimateSummary(Saved):
     process_noise: dict[str, Number] | None = None
     measurement_noise: dict[str, Number] | None = None
     suspects: tuple[FoundSuspect, ...] = ()
+    starts: tuple[Number, ...] = ()
+    profiles: dict[str, tuple[tuple[Number, Number], ...]] = {}
 
     @property
     def is_predicted(self) -> bool:
