@@ -597,7 +597,7 @@ def test_a_run_folder_and_a_figure_are_left(run, here):
     assert "pitch [deg]" in (here / "fit.svg").read_text()
     again = run(*words.split())
     assert again.code == 2
-    assert "overwrite it" in again.err
+    assert "--overwrite" in again.err
     assert run(*words.split(), "--overwrite").code == 0
     assert [f.name for f in (here / "runs").iterdir()] == ["one"]
 
@@ -846,8 +846,8 @@ BAD: dict[str, tuple[str, tuple[str, ...]]] = {
     "held in what estimates all": (
         "identify good.csv --plant aero2 --estimator arx-rls --hold J_p=0.02", ("takes no hold",),
     ),
-    "a filter without a rig": ("evaluate aero2 --filter", ("filter needs rig",)),
-    "record that exists": ("simulate aero2 --out good.csv", ("good.csv", "overwrite it")),
+    "a filter without a rig": ("evaluate aero2 --filter", ("--filter", "needs rig (--rig)")),
+    "record that exists": ("simulate aero2 --out good.csv", ("good.csv", "--overwrite")),
     "record beside a foreign file": (
         "simulate aero2 --out notes.csv --overwrite", ("notes.json", "lost"),
     ),

@@ -82,3 +82,8 @@ def test_what_cannot_be_compared_is_refused(plants, words):
     record = Record(np.arange(3.0), np.zeros((3, 1)), np.zeros((3, 1)), {}, "log.csv")
     with pytest.raises(ValueError, match=words):
         ex.compare_plants(record, plants)
+
+
+def test_plants_are_compared_without_priors_and_other_likelihoods():
+    with pytest.raises(ValueError, match="compared by a normal likelihood, without priors"):
+        ex.compare_plants("record.csv", ["aero2", "aero2_lag"], likelihood="student")

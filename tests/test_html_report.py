@@ -602,7 +602,7 @@ def test_a_bad_run_is_one_sentence_and_leaves_nothing(prepare, runs, sentence, h
     [
         ("r.pdf", "reports end in .html"),
         ("nowhere/r.html", "nowhere does not exist"),
-        ("old.html", "overwrite it"),
+        ("old.html", "--overwrite"),
         ("folder.html", "is a folder"),
     ],
 )

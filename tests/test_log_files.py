@@ -128,6 +128,11 @@ def test_names_may_stand_in_a_comment_above_the_numbers(comment, rows, tmp_path:
     assert list(columns_in(path)) == ["time", "u", "y"]
 
 
+def test_names_in_a_comment_may_hold_small_words(tmp_path: Path):
+    (tmp_path / "log.csv").write_text("# time [s], rate of turn [deg/s], y\n0,1,2\n1,2,3\n")
+    assert list(columns_in(tmp_path / "log.csv")) == ["time [s]", "rate of turn [deg/s]", "y"]
+
+
 def test_names_that_numpy_writes_are_read(tmp_path: Path):
     values = np.column_stack([TIME, U, Y])
     for delimiter in (" ", ",", ";", "\t"):

@@ -56,6 +56,14 @@ class Bounded(Line):
     )
 
 
+class Loud(Bounded):
+    """The same with much noise."""
+
+    definition = dataclasses.replace(
+        Bounded.definition, outputs=(Output("y", "m", 1.0, noise_sd=0.5),)
+    )
+
+
 class Wall(Line):
     """The slope is a parameter times a constant, and cannot be simulated above 2.1."""
 
@@ -149,6 +157,22 @@ def test_a_normal_prior_counts_in_the_unit_of_the_parameter():
     misfit = (record.outputs[:, 0] - slope[:, None] * reached(record)) / 0.05
     density = -np.sum(misfit**2, axis=1) / 2 - ((slope - 1.2) / 0.05) ** 2 / 2
     require_quantiles(drawn, quantiles(slope, density))
+
+
+def test_a_uniform_prior_is_one_of_the_parameter():
+    record = line(0.7)
+    result = ex.identify(
+        record,
+        Loud,
+        NLS(noise="known"),
+        hold={"a": 0.0},
+        prior={"b": "uniform:0.2:1.2"},
+        initial_state="known",
+    )
+    drawn = result.posterior(num_samples=600)["posterior"].dataset["b"]
+    slope = np.linspace(0.2, 1.2, 4001)
+    misfit = (record.outputs[:, 0] - slope[:, None] * reached(record)) / 0.5
+    require_quantiles(drawn, quantiles(slope, -np.sum(misfit**2, axis=1) / 2))
 
 
 def test_initial_states_are_drawn_too():

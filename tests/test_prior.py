@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import pickle
 import re
 
 import jax
@@ -107,14 +108,44 @@ def test_a_prior_holds_what_the_data_do_not_tell_and_says_so():
     assert found.held == ()
     assert found.params.a == pytest.approx(0.9)
     assert found.std_error.a == pytest.approx(0.05, rel=1e-3)
-    assert "a rests on its prior; the data tell little of it" in found.verdict
+    assert "the estimate of a is that of its prior; the data hardly change it" in found.verdict
 
 
 def test_data_that_contradict_a_prior_are_remarked():
     found = identify(noisy(), Ramp, prior={"b": "normal:0.5:0.01"})
     assert "the data contradict the prior of b" in found.verdict
+    assert not found.suspects  # it is the prior, not the plant
     agreed = identify(noisy(), Ramp, prior={"b": "normal:0.3:0.1"})
     assert not any("prior" in sentence for sentence in agreed.verdict)
+
+
+def test_a_held_parameter_takes_its_joint_prior_as_a_condition():
+    """As profile and standard intervals agree only then, and it contradicts nothing."""
+    joint = Prior.normal(["a", "b"], [0.9, 0.6], [[0.01, 0.0095], [0.0095, 0.01]])
+    estimator = NLS(noise="known", prior=joint)
+    options = {"hold": {"b": 0.3}, "initial_state": "known"}
+    linear = identify(noisy(), Ramp, estimator, **options)
+    profile = identify(noisy(), Ramp, estimator, intervals="profile", **options)
+    np.testing.assert_allclose(profile.ci95("a"), linear.ci95("a"), rtol=1e-3)
+    information = COLUMNS[:, 0] @ COLUMNS[:, 0] / SD**2 + np.linalg.inv(joint_covariance())[0, 0]
+    assert linear.std_error.a == pytest.approx(information**-0.5, rel=1e-6)
+    assert not any("prior of b" in sentence for sentence in linear.verdict)
+
+
+def joint_covariance() -> np.ndarray:
+    return np.array([[0.01, 0.0095], [0.0095, 0.01]])
+
+
+def test_the_search_begins_at_the_mean_of_a_prior():
+    still = dataclasses.replace(noisy(), inputs=0 * INPUT)
+    told = identify(still, Ramp, prior={"a": "normal:7:1e9"})
+    assert told.held == ("a",)
+    assert told.params.a == pytest.approx(7.0)
+
+
+def test_the_only_parameter_may_end_at_its_bound():
+    with pytest.raises(ValueError, match="no parameter is left to estimate: b ended at its bound"):
+        identify(noisy(), Ramp, hold={"a": 0.8}, prior={"b": "uniform:0.1:0.25"})
 
 
 def test_a_uniform_prior_bounds_the_estimate():
@@ -171,6 +202,7 @@ def test_a_lognormal_prior_is_one_of_the_logarithm():
         ({"a": "uniform:2:3"}, "begins at a = 1 m/(V s), outside its uniform prior 2 to 3"),
         ([{"a": "normal:1:2"}, {"a": "uniform:0:2"}], "parameter 'a' has two priors; give one"),
         ([{"a": "normal:1:2"}, {"a": "normal:1:2"}], "parameter 'a' has two priors; give one"),
+        ([{"a": "uniform:0:2"}, {"a": "uniform:0:3"}], "parameter 'a' has two priors; give one"),
         ("nowhere", "nowhere: cannot be read"),
         (Prior.normal(["c"], [1.0], [[1.0]]), "unknown ramp parameter 'c'"),
     ],
@@ -201,6 +233,13 @@ def test_a_covariance_that_is_none_is_refused(covariance, sentence, tmp_path):
 def test_other_estimators_take_no_prior():
     with pytest.raises(ValueError, match="a prior needs the estimator nls: got pem"):
         identify(noisy(), Ramp, "pem", prior={"a": "normal:1:1"})
+    with pytest.raises(ValueError, match="a prior needs the estimator nls: got pem"):
+        identify(noisy(), Ramp, "pem", prior={"a": "uniform:0:2"})
+    own = NLS(prior=Prior.normal(["a"], [1.0], [[1.0]]))
+    with pytest.raises(ValueError, match="the estimator has a prior already"):
+        identify(noisy(), Ramp, own, prior={"a": "normal:1:1"})
+    with pytest.raises(ValueError, match="'a' is held and needs no prior"):
+        identify(noisy(), Ramp, hold={"a": 1.0}, prior={"a": "normal:1:1"})
 
 
 # Outliers
@@ -246,7 +285,7 @@ def test_students_intervals_hold_with_outliers():
 
 
 def test_other_estimators_have_one_likelihood():
-    with pytest.raises(ValueError, match="a likelihood other than normal needs the estimator nls"):
+    with pytest.raises(ValueError, match="likelihood student needs the estimator nls: got pem"):
         identify(noisy(), Ramp, "pem", likelihood="student")
 
 
@@ -286,7 +325,12 @@ def shifted(offset: float) -> Record:
 def test_the_initial_state_of_a_held_out_record_is_found_as_asked(state, words, error):
     other = shifted(2.0)
     found = identify(noisy(), Ramp, validate=other, validate_state=state).validation[0]
-    assert found.initial_state.partition(" (")[0] == words
+    first, _, more = found.initial_state.partition(" (")
+    assert first == words
+    if state == 1.0:
+        with_share = identify(noisy(), Ramp, validate=other, validate_state=0.1).validation[0]
+        fit = f"{with_share.fit_percent['y']:.4g}"
+        assert more == f"from its first 10 %, the rest fits {fit} %)"
     if error is None:  # the first sample's noise remains
         assert found.simulated[0] == pytest.approx(other.outputs[0])
     else:
@@ -307,10 +351,25 @@ def test_samples_that_the_initial_state_is_estimated_from_do_not_count():
     assert found.fit_percent["y"] == pytest.approx(expected)
 
 
+def test_a_share_that_leaves_nothing_to_compare_is_refused():
+    with pytest.raises(ValueError, match="too little is left to compare; give a smaller share"):
+        identify(noisy(), Ramp, validate=shifted(0.0), validate_state="99%")
+
+
 @pytest.mark.parametrize("state", ["0", "101%", "nan", "middle", 0.0, True])
 def test_a_share_that_is_none_is_refused(state):
     with pytest.raises(ValueError, match="validate_state must be auto, known, first or a share"):
+        identify(noisy(), Ramp, validate_state=state)
+    with pytest.raises(ValueError, match="validate_state must be auto, known, first or a share"):
         identify(noisy(), Ramp, validate=shifted(0.0), validate_state=state)
+
+
+def test_a_result_can_be_pickled():
+    result = identify(noisy(), Ramp)
+    again = pickle.loads(pickle.dumps(result))
+    assert str(again) == str(result)
+    with pytest.raises(ValueError, match="a result that was loaded has no posterior"):
+        again.posterior()
 
 
 def test_stages_are_told_in_order():

@@ -18,7 +18,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .description import Parameter, listed, names_of
 from .plant import AbstractPlant, Params, require_double_precision
@@ -92,6 +92,7 @@ def structure(
     *,
     initial_state_known: bool,
     inputs: Float[np.ndarray, "experiment time input"] | None = None,
+    known: Bool[np.ndarray, " param"] | None = None,
 ) -> Structure | None:
     """Which parameters no experiment can tell apart; None where the responses are not finite.
 
@@ -101,6 +102,7 @@ def structure(
     Args:
         initial_state_known: False where it is unknown too; it is then random as well.
         inputs: of experiments that are tried besides, up to the length of the random ones.
+        known: which parameters are no unknowns; default none.
     """
     require_double_precision()
     d = plant.definition
@@ -114,7 +116,10 @@ def structure(
     size = np.where([p.positive for p in d.parameters], values, [p.scale for p in d.parameters])
     numbers = jax.device_put((values, size, random_inputs, states))
     outputs, slopes = jax.device_get(_sensitivities(plant, numbers, initial_state_known))
-    found = [_Null.of(*rows) for rows in zip(outputs, slopes, size, strict=True)]
+    is_unknown = np.ones(len(params), bool) if known is None else ~known
+    slopes = slopes[..., np.append(is_unknown, np.ones(slopes.shape[-1] - len(params), bool))]
+    parameters = [p for p, is_free in zip(d.parameters, is_unknown, strict=True) if is_free]
+    found = [_Null.of(*rows) for rows in zip(outputs, slopes, size[:, is_unknown], strict=True)]
     num_unknowns, rank = slopes.shape[-1], max(null.rank for null in found)
     if rank < num_unknowns and not any(null.is_complete for null in found):
         return None
@@ -124,7 +129,7 @@ def structure(
         rank=rank,
         num_unknowns=num_unknowns,
         singular_values=tuple(best.singular_values.tolist()),
-        not_identifiable=_groups(d.parameters, names_of(d.states), generic),
+        not_identifiable=_groups(parameters, names_of(d.states), generic),
         tried=f"{_NUM_DRAWS} random parameter values, "
         f"{'inputs of random levels, ' * bool(d.inputs)}"
         f"{'and the given inputs, ' * (inputs is not None)}{NUM_STEPS} samples",

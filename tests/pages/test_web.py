@@ -956,7 +956,7 @@ def test_every_address_of_this_computer_is_answered_where_all_are_bound(runs, sc
         (["--host", "192.0.2.1"], "cannot listen"),
         (["--token", "short"], "eight characters"),
         (["--port", "70000"], "70000"),
-        (["--port", "TAKEN"], "port 0 takes a free one"),
+        (["--port", "TAKEN"], "--port 0 takes a free port"),
     ],
 )
 def test_a_mistake_is_one_sentence(words: list[str], sentence: str, tmp_path: Path):

@@ -225,6 +225,8 @@ def identify(
         from ..files import require_new_file
 
         require_extra()
+        if options["estimator"] != "nls" or options["likelihood"] != "normal":
+            raise ValueError("posterior samples need the estimator nls and the normal likelihood")
         if posterior.suffix != ".nc":
             raise ValueError(f"{posterior}: a file of posterior samples ends in .nc")
         require_new_file(posterior, options["overwrite"])

@@ -97,6 +97,8 @@ def compare_plants(
     """
     if isinstance(plants, str) or len(plants) < 2:
         raise ValueError(f"a comparison needs at least two plants: got {plants!r}")
+    if options.keys() & {"prior", "likelihood"}:
+        raise ValueError("plants are compared by a normal likelihood, without priors")
     chosen = [plant_from(plant) for plant in plants]
     outputs = [names_of(plant.definition.outputs) for plant in chosen]
     for plant, own in zip(chosen, outputs, strict=True):

@@ -113,7 +113,8 @@ def stack_experiments(
         "dt": None if dt is None else stacked(dt, longest),
         "next_inputs": None if next_inputs is None else stacked(next_inputs, longest),
     }
-    return Experiments(**jax.device_put(arrays), initial_state_known=initial_state_known)
+    arrays = jax.device_put(arrays) if xp is np else arrays
+    return Experiments(**arrays, initial_state_known=initial_state_known)
 
 
 class Prediction(eqx.Module):

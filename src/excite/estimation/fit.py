@@ -124,9 +124,11 @@ def _fit_seen(
         free = free & (np.arange(len(names)) != chosen)
         reasons = (*reasons, why)
         if not free.any():
-            found = structure_of(plant, experiments, start)
+            found = structure_of(plant, experiments, start, known)
             groups = found.not_identifiable if found else ()
             why = [f"{STRUCTURALLY_NOT}: {group.sentence}" for group in groups]
+            if bound_reached(plant.definition, start) is not None:
+                raise ValueError(f"no parameter is left to estimate: {'; '.join(reasons)}")
             raise ValueError("; ".join([*why, NOTHING_SEEN]))
         found = _estimate(plant, experiments, estimator, start, free, progress, [last])
 
@@ -164,7 +166,7 @@ def _estimate(
         for i, other in enumerate(others):
             best = min(found, key=quality)
             progress(
-                f"search from start {i + 2} of {len(others) + 1} (best sum of squares "
+                f"search from start {i + 2} of {len(others) + 1} (best cost "
                 f"{float(best.cost):.6g}, found in {int(best.steps)} steps)",
                 0.1 + 0.4 * i / len(others),
                 1.0,
@@ -219,10 +221,17 @@ def _to_hold(plant: AbstractPlant, fit: Fit, start: Params) -> tuple[int, float,
     return unseen[0], value, why + only
 
 
-def with_initial_state(plant: AbstractPlant, experiments: Experiments, params: Params) -> Estimate:
-    """The best initial states for given parameters."""
+def with_initial_state(
+    plant: AbstractPlant,
+    experiments: Experiments,
+    params: Params,
+    estimator: AbstractEstimator | None = None,
+) -> Estimate:
+    """The best initial states for given parameters, with the likelihood of an estimator."""
+    is_nls = isinstance(estimator, NLS)
+    search = NLS(likelihood=estimator.likelihood) if is_nls else NLS()
     held = jax.device_put(np.zeros(len(params), bool))
-    return jax.device_get(NLS()(plant, experiments, jax.device_put(params), held))
+    return jax.device_get(search(plant, experiments, jax.device_put(params), held))
 
 
 def whiteness_of(residuals: list[np.ndarray], scale: float) -> float:

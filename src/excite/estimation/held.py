@@ -9,8 +9,8 @@ from jaxtyping import Bool
 from ..description import Parameter, listed
 from ..identifiability import STRUCTURALLY_NOT, Structure, structure
 from ..plant import AbstractPlant, Params
-from .contract import AnyArray, Estimate, Experiments, bound_reached
-from .diagnosis import effect_of_constants
+from .contract import AbstractEstimator, AnyArray, Estimate, Experiments, bound_reached
+from .diagnosis import inverse_information
 from .nls import NLS
 
 _CHANGE = 0.1  # relative change of a held parameter of which the effect is told
@@ -18,7 +18,10 @@ _LEAST = 0.005  # relative change of another parameter that is told
 
 
 def structure_of(
-    plant: AbstractPlant, experiments: Experiments, params: Params
+    plant: AbstractPlant,
+    experiments: Experiments,
+    params: Params,
+    known: Bool[np.ndarray, " param"],
 ) -> Structure | None:
     """The structural test near some parameters, for random inputs and those of the experiments."""
     return structure(
@@ -26,12 +29,14 @@ def structure_of(
         params,
         initial_state_known=experiments.initial_state_known,
         inputs=np.asarray(experiments.inputs),
+        known=known,
     )
 
 
 def told_of_held(
     plant: AbstractPlant,
     experiments: Experiments,
+    estimator: AbstractEstimator,
     estimate: Estimate,
     free: Bool[np.ndarray, " param"],
     known: Bool[np.ndarray, " param"],
@@ -51,10 +56,14 @@ def told_of_held(
     if not held:
         return ()
     given = jax.device_put((plant, experiments, estimate))
-    S = np.asarray(NLS().sensitivity(*given)[0])
+    own = estimator if isinstance(estimator, NLS) else NLS()
+    S = np.asarray(own.sensitivity(*given)[0])
+    P = np.asarray(own.prior_information(plant, estimate, S.shape[-1]))
     estimated = np.append(free, np.ones(S.shape[-1] - len(free), bool))
-    effects = effect_of_constants(S[..., estimated], S[..., held])[: free.sum()]
-    found = structure_of(plant, experiments, params)
+    rows = np.einsum("etou,etoh->uh", S[..., estimated], S[..., held]) + P[estimated][:, held]
+    inverse = inverse_information(S[..., estimated], P[np.ix_(estimated, estimated)])
+    effects = -(inverse @ rows)[: free.sum()]
+    found = structure_of(plant, experiments, params, known)
     others = [p for p, is_free in zip(parameters, free, strict=True) if is_free]
     return tuple(
         f"{_why(parameters[i].name, found)}; {_cost(parameters[i], others, effects[:, column])}"

@@ -71,7 +71,7 @@ from .prior_knowledge import PriorLike, with_prior
 from .profile import profile_intervals
 from .remedies import Suspect, outliers, suspects
 from .result import Identification, Noise
-from .validation import fitted_all, state_from, validated
+from .validation import fitted_all, require_state_word, state_from, validated
 
 InitialState = Literal["auto", "free", "known"]
 Intervals = Literal["linear", "profile"]
@@ -94,7 +94,7 @@ def identify(
     hold: Mapping[str, float] | None = None,
     prior: PriorLike | Sequence[PriorLike] | None = None,
     uncertain: Mapping[str, float | str] | None = None,
-    likelihood: Likelihood = "normal",
+    likelihood: Likelihood | None = None,
     initial_state: InitialState = "auto",
     intervals: Intervals = "linear",
     hold_input: str | Mapping[str, str] = "constant",
@@ -130,7 +130,8 @@ def identify(
             records, a file with mean and covariance, or several of these.
         uncertain: standard deviation of known constants, by name: {"m": 0.02} in the constant's
             unit, {"m": "5%"} of its value. It widens the intervals.
-        likelihood: of the noise, "normal" or "student", with which outliers hardly count.
+        likelihood: of the noise, "normal" (default) or "student", with which outliers hardly
+            count. With "student", or a prior, likely causes of a residual are not looked for.
         initial_state: "known" (the plant's), "free" (estimated too), or "auto": known
             where every sidecar says so.
         intervals: "linear": from standard errors; "profile": from the profile likelihood, which
@@ -161,14 +162,14 @@ def identify(
         raise ValueError("no record is given")
     plant = plant_from(_plant_of(given[0]) if plant is None else plant)
     estimator, begin = _chosen(estimator, plant, start, hold)
-    if likelihood not in get_args(Likelihood):
-        raise ValueError(f"likelihood {likelihood!r} is not one of: normal, student")
-    plant, prior = with_prior(plant, prior, begin)
-    if prior is not None or likelihood != "normal":
-        what = "a likelihood other than normal" if prior is None else "a prior"
+    estimator = _with_likelihood(estimator, likelihood)
+    if prior is not None:
         if not isinstance(estimator, NLS):
-            raise ValueError(f"{what} needs the estimator nls: got {estimator.name}")
-        estimator = dataclasses.replace(estimator, prior=prior, likelihood=likelihood)
+            raise ValueError(f"a prior needs the estimator nls: got {estimator.name}")
+        if estimator.prior is not None:
+            raise ValueError("the estimator has a prior already; give one of the two")
+        plant, known_before, begin = with_prior(plant, prior, begin, start or {}, hold or {})
+        estimator = dataclasses.replace(estimator, prior=known_before)
     if intervals not in get_args(Intervals):
         raise ValueError(f"intervals {intervals!r} are not one of: linear, profile")
     if intervals == "profile" and not isinstance(estimator, NLS):
@@ -195,6 +196,7 @@ def identify(
         initial_state == "auto" and all(starts_at(record, plant) for record in records)
     )
     require_enough(plant, records, int(np.sum(~known_parameters(plant, estimator))), known)
+    require_state_word(validate_state)
     shares = [state_from(record, plant, validate_state) for record in validation]
     for record in validation:
         require_enough(plant, [record], 0, False)
@@ -209,7 +211,8 @@ def identify(
     fit = fit_of(plant, experiments, estimator, begin, progress)
     residual = _residuals(plant, records, experiments, estimator, fit)
     fitted = fitted_all(plant, records, experiments, fit.estimate, residual)
-    if isinstance(estimator, NLS) and not fit.has_ended_in(Status.NOT_FINITE):
+    is_normal = isinstance(estimator, NLS) and estimator.likelihood == "normal"
+    if is_normal and not fit.has_ended_in(Status.NOT_FINITE):
         _require_explanation(records, residual, int(fit.free.sum()))
     whiteness = {
         name: whiteness_of([finite(r[:, i]) for r in residual], plant.definition.outputs[i].scale)
@@ -330,6 +333,21 @@ def _chosen(
     return dataclasses.replace(method, known=names), begin
 
 
+def _with_likelihood(
+    estimator: AbstractEstimator, likelihood: Likelihood | None
+) -> AbstractEstimator:
+    """The estimator with the likelihood that is asked for."""
+    if likelihood is None:
+        return estimator
+    if likelihood not in get_args(Likelihood):
+        raise ValueError(f"likelihood {likelihood!r} is not one of: normal, student")
+    if isinstance(estimator, NLS):
+        return dataclasses.replace(estimator, likelihood=likelihood)
+    if likelihood != "normal":
+        raise ValueError(f"likelihood {likelihood} needs the estimator nls: got {estimator.name}")
+    return estimator
+
+
 def _uncertain(
     plant: AbstractPlant, estimator: AbstractEstimator, given: Mapping[str, float | str] | None
 ) -> Float[np.ndarray, " constant"]:
@@ -423,7 +441,7 @@ def _confidence(
     elif coloured or uncertain.any():
         estimate, free = jax.device_put((fit.estimate, fit.free))
         S, residual = map(np.asarray, estimator.sensitivity(plant, experiments, estimate, free))
-        prior = np.asarray(estimator.prior_information(plant, estimate, S.shape[-1]))
+        prior = np.asarray(estimator.prior_information(plant, estimate, S.shape[-1], free))
         if coloured:
             robust, its = robust_covariance(S, residual, np.asarray(experiments.valid), prior)
             robust = np.outer(size, size) * robust[: len(names), : len(names)]
@@ -439,19 +457,18 @@ def _confidence(
             effect = effect * size[:, None]
             covariance, degrees = with_independent(covariance, degrees, effect @ effect.T)
             remarks.append(
-                f"the intervals include the standard deviation of {_told(plant, uncertain)}"
+                f"the intervals include the standard deviation of {_sd_in_words(plant, uncertain)}"
             )
     seen = identifiability(names, covariance / np.outer(size, size), fit.free)
     if isinstance(estimator, NLS) and estimator.prior is not None:
-        rows = [names.index(name) for name in estimator.prior.names]
         values = dict(zip(names, map(float, fit.estimate.params), strict=True))
-        white = np.asarray(fit.estimate.covariance)
-        remarks += estimator.prior.verdict(values, white[np.ix_(rows, rows)])
-    held = told_of_held(plant, experiments, fit.estimate, fit.free, fit.known)
+        sd = dict(zip(names, np.sqrt(np.diag(np.asarray(fit.estimate.covariance))), strict=True))
+        remarks += estimator.prior.verdict(values, {n: sd[n] for n in names if sd[n] > 0})
+    held = told_of_held(plant, experiments, estimator, fit.estimate, fit.free, fit.known)
     return covariance, degrees, (*fit.reasons, *held, seen, *remarks)
 
 
-def _told(plant: AbstractPlant, uncertain: np.ndarray) -> str:
+def _sd_in_words(plant: AbstractPlant, uncertain: np.ndarray) -> str:
     """The uncertain constants with their standard deviations."""
     pairs = zip(plant.definition.constants, uncertain, strict=True)
     return ", ".join(f"{c.name} ({f'{sd:.3g} {c.unit}'.strip()})" for c, sd in pairs if sd)
@@ -522,8 +539,8 @@ def _suspects(
     """What the plant may leave out, where more than noise is left; not for long records."""
     if not isinstance(estimator, NLS) or not fit.is_successful:
         return ()
-    if estimator.likelihood != "normal":  # outliers would hide them
-        return ()
+    if estimator.likelihood != "normal" or estimator.prior is not None:
+        return ()  # outliers would hide them, a prior explain what they explain
     if experiments.valid.size > _SIZE_OF_SUSPECTS:
         return ()
     residual, valid = np.asarray(fit.estimate.residual), np.asarray(experiments.valid)

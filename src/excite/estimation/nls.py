@@ -122,15 +122,19 @@ class NLS(AbstractSearch):
         return self._squares(problem, problem.start, estimate.residual, sd)
 
     def prior_information(
-        self, plant: AbstractPlant, estimate: Estimate, num_unknowns: int
+        self,
+        plant: AbstractPlant,
+        estimate: Estimate,
+        num_unknowns: int,
+        free: Bool[Array, " param"] | None = None,
     ) -> Float[Array, "unknown unknown"]:
-        """What the prior tells of the unknowns of `sensitivity`."""
+        """What the prior tells of the unknowns of `sensitivity`; nothing of held ones."""
         found = jnp.zeros((num_unknowns, num_unknowns))
         if self.prior is None:
             return found
         size, names = relative_size(plant, estimate.params), names_of(plant.definition.parameters)
         rows = jax.jacfwd(self.prior.residual, argnums=1)(names, jnp.stack(estimate.params))
-        rows = rows * size[None]
+        rows = rows * (size if free is None else jnp.where(free, size, 0.0))[None]
         return found.at[: len(names), : len(names)].set(rows.T @ rows)
 
     @property

@@ -1,10 +1,11 @@
 """Posterior samples of the parameters of a least-squares estimate.
 
 The likelihood is that of `NLS`: every output is the simulated one plus independent Gaussian noise.
-The prior is flat in the logarithms of positive parameters, from exp(-30) to exp(30) times the
-nominal value, flat in other parameters and in initial states, and 1/sd in the standard deviation
-of noise of unknown size. For a plant that is linear in its parameters the posterior of a parameter
-of free sign is then Student's t, with the degrees of freedom of its interval.
+Where `identify` was given no prior, it is flat in the logarithms of positive parameters, from
+exp(-30) to exp(30) times the nominal value, flat in other parameters and in initial states, and
+1/sd in the standard deviation of noise of unknown size. For a plant that is linear in its
+parameters the posterior of a parameter of free sign is then Student's t, with the degrees of
+freedom of its interval.
 
 The standard deviations are integrated out and drawn afterwards (A. Gelman et al., Bayesian Data
 Analysis, 3rd ed. 2013, section 14.2). The rest is drawn by the no-U-turn sampler (M. Hoffman and
@@ -39,6 +40,7 @@ from ..description import names_of
 from ..information import relative_size
 from .contract import Basis, residual_of, simulate_experiments, to_search
 from .nls import FAR, NLS, Problem
+from .prior import uniform_names
 
 if TYPE_CHECKING:
     from xarray import DataTree
@@ -183,7 +185,7 @@ class Density(eqx.Module):
         """Of the coordinates: of the prior, and normal in the scores of uncertain constants.
 
         Without a prior it is flat in relative changes, so that a coordinate has the density of its
-        derivative; a normal distribution of a positive parameter is one of its own changes.
+        derivative; a normal or uniform distribution is one of the parameter's own changes.
         """
         problem, z = self.problem, self.unpacked(x)[0][: len(self.problem.start)]
         values, slope = jax.jvp(problem.params, (z,), (jnp.ones_like(z),))
@@ -199,9 +201,10 @@ class Density(eqx.Module):
 
     @property
     def is_normal(self) -> Bool[np.ndarray, " param"]:
-        """Which positive parameters have a normal prior, not one of their logarithm."""
+        """Which positive parameters have a prior of their own, not one of their logarithm."""
         prior, parts = self.problem.prior, self.problem.plant.definition.parameters
         kinds = {} if prior is None else dict(zip(prior.names, prior.logarithmic, strict=True))
+        kinds |= dict.fromkeys(uniform_names(self.problem.plant), False)
         return np.array([p.positive and not kinds.get(p.name, True) for p in parts])
 
     def __call__(self, w: Float[Array, " unknown"]) -> Float[Array, ""]:

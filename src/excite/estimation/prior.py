@@ -99,35 +99,34 @@ class Prior(eqx.Module):
         logarithm = jnp.log(jnp.where(is_log, own, 1.0))
         return self.root @ (jnp.where(is_log, logarithm, own) - self.mean)
 
-    def sd(self) -> Float[np.ndarray, " part"]:
-        """Standard deviation of each parameter, relative where its logarithm is normal."""
-        inverse = np.linalg.inv(np.asarray(self.root))
-        return np.linalg.norm(inverse, axis=1)
+    def center(self) -> dict[str, float]:
+        """The mean of each parameter, or the median where its logarithm is normal."""
+        parts = zip(self.names, self.logarithmic, np.asarray(self.mean).tolist(), strict=True)
+        return {name: math.exp(mean) if is_log else mean for name, is_log, mean in parts}
 
-    def verdict(
-        self, values: Mapping[str, float], covariance: Float[np.ndarray, "part part"]
-    ) -> tuple[str, ...]:
+    def verdict(self, values: Mapping[str, float], sd: Mapping[str, float]) -> tuple[str, ...]:
         """Sentences where the data contradict the prior, or tell little beyond it.
 
         Args:
             values: estimated parameters.
-            covariance: of the estimates of this prior's parameters, for white noise.
+            sd: standard error, for white noise, of those that are not held.
         """
-        own = np.array([values[name] for name in self.names])
-        is_log = np.array(self.logarithmic)
-        unit = np.where(is_log, own, 1.0)
-        moved = np.where(is_log, np.log(np.where(is_log, own, 1.0)), own) - np.asarray(self.mean)
-        inverse = np.linalg.inv(np.asarray(self.root))
-        before, after = inverse @ inverse.T, covariance / np.outer(unit, unit)
-        told = []
-        # The covariance of what the data move is the prior's less the estimate's.
-        gained = np.diag(before) - np.diag(after)
-        for i, name in enumerate(self.names):
-            ratio = math.sqrt(max(after[i, i], 0.0) / before[i, i])
-            if gained[i] > 0 and chi2_tail(1, float(moved[i] ** 2 / gained[i])) < RARE:
+        told, inverse = [], np.linalg.inv(np.asarray(self.root))
+        for name, is_log, mean, spread in zip(
+            self.names, self.logarithmic, self.mean, np.linalg.norm(inverse, axis=1), strict=True
+        ):
+            if name not in sd:
+                continue
+            after = sd[name] / (values[name] if is_log else 1.0)
+            moved = (math.log(values[name]) if is_log else values[name]) - float(mean)
+            # The variance of what the data move is the prior's less the estimate's.
+            gained = spread**2 - after**2
+            if gained > 0 and chi2_tail(1, moved**2 / gained) < RARE:
                 told.append(f"the data contradict the prior of {name}")
-            elif ratio > _LITTLE:
-                told.append(f"{name} rests on its prior; the data tell little of it")
+            elif after > _LITTLE * spread:
+                told.append(
+                    f"the estimate of {name} is that of its prior; the data hardly change it"
+                )
         return tuple(told)
 
 
@@ -178,13 +177,20 @@ def _narrowed(
         lower, upper = by_name[part.name]
         lowest = [x for x in (lower, part.lower) if x is not None and (x > 0 or not part.positive)]
         highest = [x for x in (upper, part.upper) if x is not None]
+        usual = part.nominal if lower < part.nominal < upper else nominal[part.name]
         return dataclasses.replace(
             part,
             lower=max(lowest, default=None),
             upper=min(highest),
-            nominal=nominal[part.name],
+            nominal=usual,
             scale=part.scale,
         )
 
     narrow = dataclasses.replace(d, parameters=tuple(map(within, d.parameters)))
-    return type(kind.__name__, (kind,), {"definition": narrow, "__module__": kind.__module__})
+    own = {"definition": narrow, "uniform": tuple(by_name), "__module__": kind.__module__}
+    return type(kind.__name__, (kind,), own)
+
+
+def uniform_names(plant: AbstractPlant) -> tuple[str, ...]:
+    """Parameters that have a uniform prior."""
+    return getattr(plant, "uniform", ())

@@ -11,13 +11,13 @@ import numpy as np
 
 from ..description import names_of, unknown, wrong_type
 from ..files import read_json
-from ..plant import AbstractPlant, Params
+from ..plant import AbstractPlant, Params, floats
 from ..report.rows import EstimateSummary
 from .prior import Prior, bounded, parameter_of
 from .result import Identification
 
 _FORMS = "normal:MEAN:SD, lognormal:MEDIAN:SD or uniform:LOWEST:HIGHEST"
-_ALLOWED = f"a dict by parameter ({_FORMS}), a run folder, a result of identify, or several"
+_ALLOWED = f"a dict by parameter ({_FORMS}), a run folder, a result, a Prior, or several"
 _ADVICE = "give a run folder of `excite identify`, or a file with `mean` and `covariance`"
 
 PriorLike: TypeAlias = Mapping[str, str] | str | Path | Identification | Prior
@@ -26,17 +26,26 @@ PriorLike: TypeAlias = Mapping[str, str] | str | Path | Identification | Prior
 
 def with_prior(
     plant: AbstractPlant,
-    given: PriorLike | Sequence[PriorLike] | None,
-    start: Params,
-) -> tuple[AbstractPlant, Prior | None]:
-    """The plant, bounded by uniform priors, and all other priors as one.
+    given: PriorLike | Sequence[PriorLike],
+    begin: Params,
+    start: Mapping[str, float] | Params,
+    hold: Mapping[str, float] | Params,
+) -> tuple[AbstractPlant, Prior | None, Params]:
+    """The plant, bounded by uniform priors, all other priors as one, and where the search begins.
+
+    That is the mean of a prior where no start is given.
+
+    Args:
+        plant: has the parameters.
+        given: see `identify`.
+        begin: start of the search, without priors.
+        start: what the user chose of it.
+        hold: values of known parameters.
 
     Raises:
         ValueError: for a prior that is none, or excludes the start.
         TypeError: for something else.
     """
-    if given is None:
-        return plant, None
     is_one = isinstance(given, Mapping | str | Path | Identification | Prior)
     if not is_one and not isinstance(given, Sequence):
         raise wrong_type("prior", given, _ALLOWED)
@@ -46,7 +55,11 @@ def with_prior(
         if isinstance(one, Mapping):
             for name, text in one.items():
                 kind, a, b = _parsed(name, text, plant)
+                if name in _names(hold):
+                    raise ValueError(f"{name!r} is held and needs no prior; give one of the two")
                 if kind == "uniform":
+                    if name in bounds:
+                        raise ValueError(f"parameter {name!r} has two priors; give one")
                     bounds[name] = a, b
                 else:
                     is_log = kind == "lognormal"
@@ -65,7 +78,19 @@ def with_prior(
     for name in joint.names if joint else ():
         if name in bounds:
             raise ValueError(f"parameter {name!r} has two priors; give one")
-    return bounded(plant, bounds, start), joint
+    chosen = {*_names(start), *_names(hold)}
+    for name, mean in joint.center().items() if joint else ():
+        part = parameter_of(plant, name)
+        lower = 0.0 if part.positive and part.lower is None else part.lower
+        is_inside = (lower is None or mean > lower) and (part.upper is None or mean < part.upper)
+        if name not in chosen and is_inside:
+            begin = begin._replace(**{name: floats(mean)})
+    return bounded(plant, bounds, begin), joint, begin
+
+
+def _names(values: Mapping[str, float] | Params) -> Sequence[str]:
+    """Names of parameters given by name, or as the plant's named tuple."""
+    return tuple(values) if isinstance(values, Mapping) else values._fields
 
 
 def _require_names(plant: AbstractPlant, names: Sequence[str]) -> None:

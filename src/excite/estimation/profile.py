@@ -56,7 +56,8 @@ def profile_intervals(
     S, _ = map(
         np.asarray, estimator.sensitivity(plant, experiments, estimate, jax.device_put(free))
     )
-    prior = np.asarray(estimator.prior_information(plant, estimate, S.shape[-1]))
+    given = plant, estimate, S.shape[-1], jax.device_put(free)
+    prior = np.asarray(estimator.prior_information(*given))
     unit = np.sqrt(np.diag(inverse_information(S, prior)))[: len(free)]
     size = np.abs(np.asarray(relative_size(plant, estimate.params)))
     least = float(estimator.sum_of_squares(plant, experiments, estimate))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -117,7 +117,11 @@ class Identification:
         fitted, validation: records and their simulation.
         initial_state_known: whether initial states were taken as known.
         noise: estimated with `pem`; otherwise None.
-        basis: what it was computed from; None for a result made otherwise.
+        starts: costs at which several starts of the search ended: weighted sums of squares, or
+            numbers that grow as the likelihood falls where the noise is estimated with them.
+        profiles: with profile intervals, by parameter the values that were tried, and the growth
+            of the sum of squares over the limit of the interval.
+        basis: what it was computed from; None for a result that was loaded.
     """
 
     plant: PlantDescription
@@ -145,6 +149,10 @@ class Identification:
     def is_usable(self) -> bool:
         """Whether there is an estimate."""
         return self.status in USABLE
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What is pickled: all but the plant's own code."""
+        return self.__dict__ | {"basis": None}
 
     def ci95(self, name: str) -> tuple[float, float]:
         """95 % interval of a parameter: estimate ± t standard errors, or by profile likelihood.
@@ -229,9 +237,10 @@ class Identification:
         """Samples of the posterior of the parameters, in the groups and with the names of ArviZ.
 
         The likelihood is that of the estimator `nls` with independent noise of one size for each
-        output. The prior is flat in the logarithms of positive parameters, flat in others and in
-        initial states, 1/sd in the size of the noise, and log-normal in uncertain constants. Held
-        parameters stay held. The chains begin around the estimate.
+        output. The prior is that of `identify`; where it was given none, it is flat in the
+        logarithms of positive parameters, flat in others and in initial states, and 1/sd in the
+        size of the noise. Uncertain constants are log-normal. Held parameters stay held. The
+        chains begin around the estimate.
 
         Args:
             num_samples: of each chain.
@@ -251,6 +260,8 @@ class Identification:
         """
         from .posterior import sampled
 
+        if self.is_usable and self.basis is None:
+            raise ValueError("a result that was loaded has no posterior; identify again")
         if self.basis is None or not self.is_usable:
             raise ValueError(f"a failed estimate has no posterior (status: {self.status})")
         coloured = [name for name, p in self.whiteness.items() if p < RARE]

@@ -121,8 +121,17 @@ def state_from(record: Record, plant: AbstractPlant, word: str | float) -> float
             f"{plant.definition.name!r}; give the share of the record from which it is estimated, "
             "such as 10%"
         )
-    if word == "auto":
-        return 1.0
+    return 1.0 if word == "auto" else _share_of(word)
+
+
+def require_state_word(word: str | float) -> None:
+    """Raises ValueError where a word is no way to an initial state."""
+    if word not in ("auto", "known", "first"):
+        _share_of(word)
+
+
+def _share_of(word: str | float) -> float:
+    """A share of a record, given as a number or in percent."""
     try:
         is_part = isinstance(word, str) and word.endswith("%")
         share = float(str(word).removesuffix("%")) * (0.01 if is_part else 1.0)
@@ -162,12 +171,17 @@ def validated(
         counts = valid.any(2).cumsum(1)
         used = valid & (counts <= np.ceil(counts[:, -1:] * share).clip(1))[..., None]
         begun = dataclasses.replace(experiments, valid=jax.device_put(used))
-        initial = with_initial_state(plant, begun, estimate.params).initial_state
+        initial = with_initial_state(plant, begun, estimate.params, estimator).initial_state
         begun = dataclasses.replace(experiments, initial_state=jax.device_put(initial))
     begun = dataclasses.replace(begun, initial_state_known=True)
     (residual,) = by_record([record], _simulation_error(plant, begun, estimate.params))
     (spent,) = by_record([record], (used if share != 1 else ~valid).astype(float))
     fitted = _fitted(plant.definition, record, residual, *_predicted(plant, [record], prediction))
+    if share != 1 and np.any(np.sum(np.isfinite(record.outputs) & (spent == 0), axis=0) < 2):
+        raise ValueError(
+            f"{record.source or 'the record'}: with {100 * (share or 0.0):.4g} % for the initial "
+            "state too little is left to compare; give a smaller share"
+        )
     scored = dataclasses.replace(record, outputs=np.where(spent == 0, record.outputs, np.nan))
     fits, words = _fits(plant.definition, scored, fitted.simulated), _in_words(share)
     if share == 1:

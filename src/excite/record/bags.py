@@ -57,6 +57,28 @@ def read_bag(
         ValueError: one sentence for a bag that cannot be read, times of a topic that do not
             increase, and topics whose times have nothing in common.
     """
+    topics = _topics(path, wanted)
+    fields = [field for topic in topics for field in topic.fields]
+    read = [topic for topic in topics if topic.found]
+    if wanted is None:
+        return _joined(path, read, "time", held)
+    time = next((name for name in wanted if name in TIMES), "time")
+    return dict.fromkeys((*TIMES, *sorted(fields)), np.empty(0)) | _joined(path, read, time, held)
+
+
+def columns_of_bag(path: Path) -> dict[str, int]:
+    """The columns of a bag, and the number of messages that each has.
+
+    Raises:
+        ValueError: one sentence for a bag that cannot be read.
+    """
+    topics = _topics(path, None)
+    counts = {name: len(topic.log_times) for topic in topics for name in topic.found}
+    return {**dict.fromkeys(TIMES, max(counts.values(), default=0)), **counts}
+
+
+def _topics(path: Path, wanted: Collection[str] | None) -> list[_Topic]:
+    """The topics of a bag, with the columns that are wanted, default all."""
     topics: dict[str, _Topic] = {}
 
     def is_read(name: str) -> bool:
@@ -75,11 +97,7 @@ def read_bag(
             f"{path}: no topic has numbers that can be read; it has {', '.join(topics) or 'none'}, "
             "and messages in CDR (ROS 2) and JSON can be read"
         )
-    read = [topic for topic in topics.values() if topic.found]
-    if wanted is None:
-        return _joined(path, read, "time", held)
-    time = next((name for name in wanted if name in TIMES), "time")
-    return dict.fromkeys((*TIMES, *sorted(fields)), np.empty(0)) | _joined(path, read, time, held)
+    return [*topics.values()]
 
 
 class _Topic:

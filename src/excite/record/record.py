@@ -186,7 +186,8 @@ def require_readable(path: Path) -> None:
                 "metadata.yaml"
             )
         for part in path.iterdir():
-            _require_readable_file(part)
+            if not part.is_dir():
+                _require_readable_file(part)
         return
     if path.suffix.lower() not in READ_ENDINGS:
         raise ValueError(f"{path}: {WRONG_ENDING}")

@@ -182,9 +182,9 @@ def _names_in_comment(comment: str, width: int) -> list[str]:
     Words of a sentence are no names.
     """
     words = comment.lstrip("#% \t")
-    if _SENTENCE.search(words):
-        return []
     for delimiter in (";", "\t", ",", " "):
+        if delimiter in ", " and "[" not in words and _SENTENCE.search(words):
+            return []
         names = _cells(words, delimiter)
         if len(names) == width and all(names) and not any(map(_NUMBER.fullmatch, names)):
             return names

@@ -115,7 +115,7 @@ def diagnosis_figure(
 ) -> matplotlib.figure.Figure:
     """How far an estimate can be trusted.
 
-    The sums of squares at which the starts of the search ended, the correlation of the estimates,
+    The costs at which the starts of the search ended, the correlation of the estimates,
     the autocorrelation of the residuals and, where there are any, the profile likelihoods.
     """
     panels: list[Callable[[matplotlib.axes.Axes], object]] = []
@@ -145,13 +145,13 @@ def diagnosis_figure(
 
 
 def _draw_starts(axis: matplotlib.axes.Axes, costs: Sequence[float]) -> None:
-    """Sums of squares over the least one, in their order."""
+    """Costs over the least one, in their order."""
     finite = np.sort([cost for cost in costs if math.isfinite(cost)])
     ratio, numbers = finite / finite[0], range(1, len(finite) + 1)
     axis.plot(numbers, ratio, "o-", color=BLUE, ms=4)
     axis.set(title="starts of the search", xlabel="start, the best first", xticks=numbers)
     is_wide = ratio[-1] > 10
-    axis.set(ylabel="sum of squares / least", yscale="log" if is_wide else "linear")
+    axis.set(ylabel="cost / least", yscale="log" if is_wide else "linear")
     axis.set(ylim=(0.8, None if is_wide else max(2.0, 1.1 * ratio[-1])))
 
 

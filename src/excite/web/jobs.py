@@ -49,6 +49,7 @@ from ..plant import AbstractPlant
 from ..plant.catalogue import PLANTS
 from ..policy import Policy, mismatch, read_policy, shipped_policies
 from ..record import columns_in
+from ..record.bags import columns_of_bag, is_bag
 from ..report.html import report_html
 from ..safety import critical_levels, is_violation, max_abs_output
 from ..simulation import Experiment, Trajectory
@@ -292,15 +293,20 @@ def _by_name(parts: Sequence[Parameter | Output], values: Iterable[ArrayLike]) -
 def columns(folder: str, name: str) -> Iterator[Event]:
     """The columns of an uploaded file, and how many samples each has."""
     with contextlib.chdir(folder):  # so that messages have the file's name without its folder
-        table = columns_in(Path(name))
-    if not table:
+        path = Path(name)
+        counts = (
+            columns_of_bag(path)
+            if is_bag(path)
+            else {word: len(values) for word, values in columns_in(path).items()}
+        )
+    if not counts:
         raise ValueError(f"{name} has no column of numbers")
-    if len(table) > _MAX_COLUMNS or max(map(len, table)) > _MAX_NAME:
+    if len(counts) > _MAX_COLUMNS or max(map(len, counts)) > _MAX_NAME:
         raise ValueError(
-            f"{name} has {len(table)} columns, the longest name has {max(map(len, table))} "
+            f"{name} has {len(counts)} columns, the longest name has {max(map(len, counts))} "
             f"characters; at most {_MAX_COLUMNS} columns of {_MAX_NAME} characters are taken"
         )
-    yield {"kind": "columns", "columns": {word: len(values) for word, values in table.items()}}
+    yield {"kind": "columns", "columns": counts}
 
 
 def identified(
