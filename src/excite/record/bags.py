@@ -74,7 +74,7 @@ def columns_of_bag(path: Path) -> dict[str, int]:
     """
     topics = _topics(path, None)
     counts = {name: len(topic.log_times) for topic in topics for name in topic.found}
-    return {**dict.fromkeys(TIMES, max(counts.values(), default=0)), **counts}
+    return {"time": max(counts.values(), default=0), **counts}
 
 
 def _topics(path: Path, wanted: Collection[str] | None) -> list[_Topic]:
