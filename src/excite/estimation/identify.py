@@ -207,7 +207,7 @@ def identify(
     plant = sampled_as([*records, *validation], plant)
     known = known and all(len(parts_of(record)) == 1 for record in records)
     experiments = experiments_of(plant, records, known, linear)
-    progress("first search", 0.05, 1.0)
+    progress("first search", 0.0, 1.0)
     fit = fit_of(plant, experiments, estimator, begin, progress)
     residual = _residuals(plant, records, experiments, estimator, fit)
     fitted = fitted_all(plant, records, experiments, fit.estimate, residual)
