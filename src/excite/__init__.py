@@ -27,6 +27,7 @@ _PLACES = {
     "design": "training.design",
     "train": "study.train",
     "evaluate": "study.evaluate",
+    "falsify": "study.falsify",
     "run_study": "study.run",
     "report": "report.html",
     "run": "rig.session",
@@ -117,6 +118,7 @@ if TYPE_CHECKING:
     from .simulation import simulate as simulate
     from .study.catalogue import studies as studies
     from .study.evaluate import evaluate as evaluate
+    from .study.falsify import falsify as falsify
     from .study.run import run_study as run_study
     from .study.spec import Study as Study
     from .study.spec import read_study as read_study

@@ -170,8 +170,15 @@ def measure(
     plant: AbstractPlant, output: Float[Array, " output"], key: PRNGKeyArray
 ) -> Float[Array, " output"]:
     """Measurement of the outputs: noise is added, then an encoder rounds to its step."""
+    return sensed(plant, output, jax.random.normal(key, output.shape, float))
+
+
+def sensed(
+    plant: AbstractPlant, output: Float[Array, " output"], noise: Float[Array, " output"]
+) -> Float[Array, " output"]:
+    """Measurement of the outputs with given noise, in its standard deviations."""
     sensor = plant.sensor
-    noisy = output + sensor.noise_sd * jax.random.normal(key, output.shape, float)
+    noisy = output + sensor.noise_sd * noise
     resolution = jnp.where(sensor.resolution > 0, sensor.resolution, 1.0)
     rounded = jnp.where(sensor.resolution > 0, jnp.round(noisy / resolution) * resolution, noisy)
     # Straight-through: rounding has no useful derivative, the measurement has.
@@ -196,14 +203,17 @@ def run_episode(
     excitation: AbstractExcitation,
     num_steps: int,
     key: PRNGKeyArray,
+    noise: Float[Array, "sample output"] | None = None,
 ) -> Trajectory:
     """One experiment in closed loop: measure, excite, clip to the limits, integrate.
 
     The sensor noise depends on the key alone: with one key it is the same for every
     excitation.
+
+    Args:
+        noise: in place of that of the key, in standard deviations of the sensor.
     """
-    excitation_key, sensor_key = jax.random.split(key)
-    noise_keys = jax.random.split(sensor_key, num_steps + 1)
+    noise = sensor_noise(plant, num_steps, key) if noise is None else noise
     lower, upper = plant.input_limits
 
     delay = plant.delay(params)
@@ -216,25 +226,34 @@ def run_episode(
         return step(plant, state, first, params, next_input=last), past
 
     def advance(carry: tuple, now: tuple) -> tuple[tuple, tuple]:
-        (state, past, memory), (noise_key, k) = carry, now
+        (state, past, memory), (noise, k) = carry, now
         output = plant.output(state, params)
-        measured = measure(plant, output, noise_key)
+        measured = sensed(plant, output, noise)
         memory, input = excitation(memory, measured)
         input = jnp.clip(input, lower, upper)
         state, past = moved(state, past, input, k)
         return (state, past, memory), (input, measured, output)
 
     past = jnp.zeros((0 if delay is None else num_steps, len(lower)))
-    start = plant.initial_state, past, excitation.init(plant, num_steps, excitation_key)
-    steps = noise_keys[:-1], jnp.arange(num_steps)
+    start = plant.initial_state, past, excitation.init(plant, num_steps, jax.random.split(key)[0])
+    steps = noise[:-1], jnp.arange(num_steps)
     (state, *_), (inputs, measured, outputs) = jax.lax.scan(advance, start, steps)
     last = plant.output(state, params)
     return Trajectory(
         time=jnp.arange(num_steps + 1) * plant.dt,
         inputs=inputs,
-        measured=jnp.concatenate([measured, measure(plant, last, noise_keys[-1])[None]]),
+        measured=jnp.concatenate([measured, sensed(plant, last, noise[-1])[None]]),
         outputs=jnp.concatenate([outputs, last[None]]),
     )
+
+
+def sensor_noise(
+    plant: AbstractPlant, num_steps: int, key: PRNGKeyArray
+) -> Float[Array, "sample output"]:
+    """The noise of `run_episode` with this key, in standard deviations of the sensor."""
+    keys = jax.random.split(jax.random.split(key)[1], num_steps + 1)
+    count = len(plant.definition.outputs)
+    return jax.vmap(lambda own: jax.random.normal(own, (count,), float))(keys)
 
 
 class DivergedError(ValueError):

@@ -21,6 +21,7 @@ from .completion import complete_names
 from .design import design
 from .doctor import doctor
 from .export import export
+from .falsify import falsify
 from .identify import identify
 from .information import information
 from .options import RememberingGroup, RunFailedError
@@ -48,6 +49,7 @@ _SECTIONS: dict[str, dict[click.Command, str]] = {
         design: "excite design aero2 --out signal.csv",
         train: "excite train aero2 --out runs/first",
         evaluate: "excite evaluate aero2 --episodes 100",
+        falsify: "excite falsify dc_motor --uncertain initial_state=2% --out worst.json",
         export: "excite export aero2 --onnx aero2.onnx",
     },
     "Experiment on a rig": {

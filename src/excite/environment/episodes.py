@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Key, PRNGKeyArray
 from ..excitation import AbstractExcitation
 from ..information import cramer_rao_bound, experiment_information, relative_size
 from ..plant import AbstractPlant, Params, draw_params
+from ..plant.uncertainty import Uncertainty
 from ..safety import critical_levels, is_violation, max_abs_output
 from ..simulation import Trajectory, run_episode
 
@@ -45,13 +46,27 @@ def run_episodes(
     num_steps: int,
     spread: float,
     keys: Key[Array, " episode"],
+    uncertainty: Uncertainty | None = None,
 ) -> Episodes:
-    """One episode per key. Plant and noise of a key are the same for any excitation."""
+    """One episode per key. Plant and noise of a key are the same for any excitation.
+
+    Args:
+        plant: as identification knows it.
+        excitation: proposes the inputs.
+        num_steps: of an episode.
+        spread: parameters are uniform in nominal value ± spread times their scale.
+        keys: of the episodes.
+        uncertainty: in place of the spread, the box from which plants are drawn.
+    """
 
     def episode(key: PRNGKeyArray) -> Episodes:
         params_key, episode_key = jax.random.split(key)
-        params = draw_params(plant, params_key, spread)
-        return scored(plant, params, run_episode(plant, params, excitation, num_steps, episode_key))
+        if uncertainty is None:
+            true, own = plant, draw_params(plant, params_key, spread)
+        else:
+            true, own = uncertainty.at(uncertainty.draw(params_key))
+        run = run_episode(true, own, excitation, num_steps, episode_key)
+        return scored(plant, plant.Params(*own[: len(plant.nominal)]), run)
 
     return jax.vmap(episode)(keys)
 

@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
 
 from ..plant import AbstractARXPlant, AbstractPlant, Params, draw_params
 from ..plant.fields import floats
+from ..plant.uncertainty import Uncertainty
 from ..policy import (
     Layout,
     Window,
@@ -92,6 +93,7 @@ class Env(eqx.Module):
         constants: lowest and highest constants of the plant; they are drawn for every
             episode, so that a policy is robust against errors of constants that
             identification takes as known. Default the plant's constants.
+        uncertainty: box of the plants on which a policy is also made safe, without reward.
     """
 
     plant: AbstractPlant
@@ -100,6 +102,7 @@ class Env(eqx.Module):
     spread: Float[Array, ""] = eqx.field(converter=floats, default=0.3)
     penalty_weight: Float[Array, ""] = eqx.field(converter=floats, default=1.0)
     constants: tuple[PyTree, PyTree] | None = None
+    uncertainty: Uncertainty | None = None
 
     @classmethod
     def of(
@@ -111,6 +114,7 @@ class Env(eqx.Module):
         spread: float | Float[Array, ""] = 0.3,
         penalty_weight: float | Float[Array, ""] = 1.0,
         constants: tuple[PyTree, PyTree] | None = None,
+        uncertainty: Uncertainty | None = None,
     ) -> Env:
         """The paper's process for a plant, except for the given choices."""
         return cls(
@@ -120,6 +124,7 @@ class Env(eqx.Module):
             spread,
             penalty_weight,
             constants,
+            uncertainty,
         )
 
     def reset(self, key: PRNGKeyArray) -> tuple[EnvState, Float[Array, " observation"]]:

@@ -132,7 +132,8 @@ def suspects(
         plant_word: the plant on the command line.
         progress: called with a text, how many suspects are fitted, and their number.
     """
-    names = [name for name in extensions_of(plant) if not name.startswith("bias_")]
+    # A gain cannot be told from the plant's own.
+    names = [name for name in extensions_of(plant) if not name.startswith(("bias_", "gain_"))]
     whole, valid = extended(plant, names), np.asarray(experiments.valid)
     before, tests = np.asarray(estimate.residual), len(names) + len(linear) + 1
 

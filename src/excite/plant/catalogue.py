@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,13 +13,20 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..description import Listing, first_line, names_of, told, unknown, wrong_type
-from ..files import class_at
+from ..files import class_at, damaged, read_json
 from .aero2 import Aero2, Aero2Detailed, Aero2Lag
 from .cart_pole import CartPole
-from .contract import AbstractPlant, Sensor, as_number, require_double_precision
+from .contract import (
+    AbstractPlant,
+    Params,
+    Sensor,
+    as_number,
+    require_double_precision,
+    with_nominal,
+)
 from .dc_motor import DCMotor
 from .emps import EMPS
-from .extension import extended
+from .extension import extended, plain_kind
 from .fields import floats
 
 PLANTS: Mapping[str, type[AbstractPlant]] = {
@@ -70,7 +78,8 @@ def plant_from(given: PlantLike) -> AbstractPlant:
 def plant_named(name: str) -> AbstractPlant:
     """A shipped plant by name, or one in a user's file as `path/to/file.py:ClassName`.
 
-    Either may have extensions: `aero2+delay_voltage`.
+    Either may have extensions: `aero2+delay_voltage`. A file (.json) is read as
+    `plant_in_file` writes it.
 
     The user's file is imported, so its code runs. Take such a name only from the user's
     command line, script or study file.
@@ -78,6 +87,8 @@ def plant_named(name: str) -> AbstractPlant:
     Raises:
         ValueError: for an unknown name, or a file without such a class.
     """
+    if name.endswith(PLANT_ENDING):
+        return _plant_of_file(Path(name))
     path, colon, class_name = name.rpartition(":")
     plain, *extensions = class_name.split("+")
     if extensions:
@@ -85,11 +96,77 @@ def plant_named(name: str) -> AbstractPlant:
     if name in PLANTS:
         return PLANTS[name]()
     if not colon or not path.endswith(".py"):
-        raise unknown("plant", name, [*PLANTS, "path/to/file.py:ClassName"])
+        known = [*PLANTS, "path/to/file.py:ClassName", f"path/to/plant{PLANT_ENDING}"]
+        raise unknown("plant", name, known)
     plant_class = class_at(Path(path), class_name, AbstractPlant, "plant")
     plant = _complete(plant_class, f"{class_name} in {path}")
     _check_plant(plant, f"{class_name} in {path}")
     return plant
+
+
+def word_of(plant: AbstractPlant) -> str:
+    """The name by which `plant_named` makes a plant of this class.
+
+    Raises:
+        ValueError: for a class that is in no file, as one of a notebook.
+    """
+    kind = plain_kind(plant)
+    added = "".join(f"+{name}" for name in plant.definition.name.split("+")[1:])
+    shipped = [name for name, plant_class in PLANTS.items() if plant_class is kind]
+    if shipped:
+        return shipped[0] + added
+    try:
+        return f"{inspect.getfile(kind)}:{kind.__name__}{added}"
+    except (TypeError, OSError):  # defined in a notebook or a shell
+        raise ValueError(
+            f"other processes cannot import the plant class {kind.__name__}: save it in a file (in "
+            f"a notebook by %%writefile plant.py) and name it as 'plant.py:{kind.__name__}'"
+        ) from None
+
+
+PLANT_ENDING = ".json"
+
+
+def plant_in_file(plant: AbstractPlant, params: Params) -> dict[str, object]:
+    """Content of a plant's file: its class, and its numbers by name.
+
+    `plant_named` makes the plant of such a file, with these parameters as nominal ones.
+
+    Raises:
+        ValueError: as `word_of`.
+    """
+    d = plant.description
+    return {
+        "format": _FORMAT,
+        "plant": word_of(plant),
+        "params": dict(zip(names_of(d.parameters), map(float, params), strict=True)),
+        "constants": {c.name: c.value for c in d.constants},
+        "initial_state": {s.name: s.initial for s in d.states},
+        "noise_sd": {o.name: o.noise_sd for o in d.outputs},
+    }
+
+
+_FORMAT = "excite plant 1"
+
+
+def _plant_of_file(path: Path) -> AbstractPlant:
+    """The plant in a file; ValueError for a file that holds none."""
+    advice = "a file of a plant is written by 'excite falsify'"
+    content = read_json(path, "plant", "params", "constants", "initial_state", "noise_sd",
+                        advice=advice)  # fmt: skip
+    try:
+        if content.get("format") != _FORMAT or str(content["plant"]).endswith(PLANT_ENDING):
+            raise damaged(path, advice)
+        plant = plant_named(content["plant"])
+        start = [float(content["initial_state"][s.name]) for s in plant.definition.states]
+        constants = {name: float(value) for name, value in content["constants"].items()}
+        plant = with_sensor(plant, content["noise_sd"])
+        plant = plant.changed(initial_state=floats(start), **constants)
+        return with_nominal(plant, content["params"])
+    except (KeyError, TypeError, AttributeError):
+        raise damaged(path, advice) from None
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
 
 
 def _complete(plant_class: type[AbstractPlant], where: str) -> AbstractPlant:

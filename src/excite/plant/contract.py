@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from ..description import PlantDescription, names_of, wrong_type
+from ..description import Parameter, PlantDescription, names_of, unknown, wrong_type
 from .fields import floats
 
 # Estimation and information need double precision. Every computation imports this module,
@@ -277,6 +277,45 @@ def _allowed(plant: AbstractPlant, name: str, value: object) -> float:
             f"{'infinity' if p.upper is None else format(p.upper, 'g')}"
         )
     return number
+
+
+def with_nominal(plant: AbstractPlant, values: Mapping[str, float]) -> AbstractPlant:
+    """The plant with other nominal parameters; their scales stay.
+
+    A bound that a value touches is left out, because nominal values lie inside the bounds.
+
+    Raises:
+        ValueError: for an unknown name or a value that is not finite.
+    """
+    names = names_of(plant.definition.parameters)
+    for name in values:
+        if name not in names:
+            raise unknown(f"parameter of {plant.definition.name!r}", name, names)
+    usual = zip(names, plant.nominal, strict=True)
+    nominal = tuple(as_number(name, values.get(name, value)) for name, value in usual)
+    tuned = _tuned(type(plant), nominal)(
+        sensor=plant.sensor,
+        initial_state=plant.initial_state,
+        dt=plant.dt,
+        **plant.constants._asdict(),
+    )
+    object.__setattr__(tuned, "substeps", plant.substeps)
+    return tuned
+
+
+@cache
+def _tuned(kind: type[AbstractPlant], nominal: tuple[float, ...]) -> type[AbstractPlant]:
+    """The class with other nominal parameters; the same one every time, so that JAX knows it."""
+    d = kind.definition
+
+    def tuned(p: Parameter, value: float) -> Parameter:
+        lower = p.lower if p.lower is not None and p.lower < value else None
+        upper = p.upper if p.upper is not None and p.upper > value else None
+        return dataclasses.replace(p, nominal=value, lower=lower, upper=upper)
+
+    parameters = map(tuned, d.parameters, nominal)
+    definition = dataclasses.replace(d, parameters=tuple(parameters))
+    return type(kind.__name__, (kind,), {"definition": definition, "__module__": kind.__module__})
 
 
 def as_number(name: str, value: object) -> float:

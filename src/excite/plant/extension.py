@@ -2,6 +2,7 @@
 
     delay_voltage, lag_voltage      the input acts later (negative: it is recorded late), or
                                     through a first-order lag [s]
+    gain_voltage                    factor of the input, -1 for a wrong sign
     offset_voltage                  is added to the input
     saturation_voltage              largest magnitude of the input
     dead_zone_voltage               magnitude up to which the input does nothing
@@ -27,7 +28,7 @@ from ..description import Parameter, PlantDescription, State, names_of, unknown
 from .contract import AbstractPlant, Params
 
 _INPUT, _VELOCITY, _OUTPUT = (
-    ("delay", "lag", "offset", "saturation", "dead_zone"),
+    ("delay", "lag", "gain", "offset", "saturation", "dead_zone"),
     ("coulomb", "drag"),
     ("bias", "drift"),
 )
@@ -124,6 +125,8 @@ class Extended(AbstractPlant):
                 lagging = added.pop(0)
                 slopes.append((inputs[at] - lagging) / jnp.maximum(value, self._shortest_lag))
                 inputs[at] = jnp.where(value > 0, lagging, inputs[at])
+            elif e.kind == "gain":
+                inputs[at] *= value
             elif e.kind == "offset":
                 inputs[at] += value
             elif e.kind == "saturation":
@@ -223,6 +226,8 @@ def _parameter(plant: AbstractPlant, e: _Extension) -> Parameter:
         u = d.inputs[e.index]
         if e.kind == "saturation":
             return Parameter(e.name, u.unit, u.amplitude, target=False)
+        if e.kind == "gain":
+            return size("", 1.0, 1.0, None)
         if e.kind == "dead_zone":
             return size(u.unit, 0.05 * u.amplitude, 0.1 * u.amplitude)
         return size(u.unit, 0.0, 0.1 * u.amplitude, None)

@@ -197,12 +197,14 @@ class Policy:
         layout: what it observes.
         weights: float32 matrices and biases.
         provenance: how it was made, JSON-ready.
+        certificate: what a search for the least safe plant found (`excite falsify`), JSON-ready.
     """
 
     plant: PlantDescription
     layout: Layout
     weights: Weights
     provenance: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    certificate: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
         layers = tuple(
@@ -240,8 +242,12 @@ class Policy:
 
     @property
     def hash(self) -> str:
-        """SHA-256 of the policy's file content."""
-        return hashlib.sha256(self.to_bytes()).hexdigest()
+        """SHA-256 of the policy's file content without its certificate."""
+        return hashlib.sha256(self.certified(None).to_bytes()).hexdigest()
+
+    def certified(self, certificate: Mapping[str, Any] | None) -> Policy:
+        """The same policy with another certificate."""
+        return dataclasses.replace(self, certificate=certificate)
 
     def save(self, path: str | Path, overwrite: bool = False) -> None:
         """Writes the policy's file (.safetensors); `read_policy` reads it back.
@@ -263,6 +269,8 @@ class Policy:
             "layout": dataclasses.asdict(self.layout),
             "provenance": dict(self.provenance),
         }
+        if self.certificate is not None:
+            contract["certificate"] = dict(self.certificate)
         tensors = {
             f"{i}.{part}": array
             for i, layer in enumerate(self.weights)
@@ -296,7 +304,10 @@ class Policy:
             if any(array.dtype != np.float32 for array in tensors.values()):
                 raise ValueError("weights are not in single precision")
             _check_layout(layout, plant)
-            return cls(plant, layout, weights, dict(contract["provenance"]))
+            certificate = contract.get("certificate")
+            if certificate is not None:
+                _check_certificate(certificate)
+            return cls(plant, layout, weights, dict(contract["provenance"]), certificate)
         except (KeyError, TypeError, AttributeError, OverflowError) as error:
             raise ValueError(f"{where}: incomplete or malformed contract ({error})") from None
         except ValueError as error:
@@ -319,6 +330,15 @@ def _check_layout(layout: Layout, plant: PlantDescription) -> None:
         raise ValueError("the clocks of a layout are above 0 and at most half a cycle a step")
     if len(layout.output_scale) != len(plant.outputs) or min(layout.output_scale) <= 0:
         raise ValueError("the observation layout does not belong to the policy's plant")
+
+
+def _check_certificate(certificate: Any) -> None:
+    """Raises ValueError for a certificate without its numbers."""
+    numbers = [certificate[name] for name in ("nearness", "noise_nearness", "experiments")]
+    if not all(n is None or (isinstance(n, int | float) and n >= 0) for n in numbers):
+        raise ValueError("the certificate of the policy is malformed")
+    if not isinstance(certificate["uncertainty"], dict):
+        raise ValueError("the certificate of the policy is malformed")
 
 
 def _check_layers(weights: Weights, num_inputs: int, num_outputs: int) -> None:

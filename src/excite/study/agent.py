@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Annotated, Any, Literal
 
 from jaxtyping import PyTree
@@ -25,8 +26,9 @@ from ..environment import (
 from ..estimation import ARX, NLS
 from ..estimation.catalogue import estimator_named
 from ..plant import AbstractARXPlant, AbstractPlant
+from ..plant.uncertainty import Range, Uncertainty
 from ..policy import Layout
-from ..training.settings import GradientSettings, PPOSettings
+from ..training.settings import AGAINST_UNCERTAINTY, GradientSettings, PPOSettings
 from .settings import Count, EstimatorSettings, Positive, Settings, checked
 
 METHODS = {"ppo": PPOSettings, "gradient": GradientSettings}
@@ -75,6 +77,7 @@ class DecisionSettings(RewardSettings):
             policy may go, where that is less than the limits allow.
         spread: of the plants it is trained on, where it differs from the study's.
         constants: of these plants, each drawn from a range such as [0.12, 0.21].
+        uncertainty: in which it is trained to be safe, where that differs from the study's.
         normalise_penalty: whether the safety penalty is divided by the number of steps.
     """
 
@@ -85,6 +88,7 @@ class DecisionSettings(RewardSettings):
     input_amplitude: dict[str, Positive] = {}
     spread: Annotated[float, Field(ge=0, lt=1, strict=True, allow_inf_nan=False)] | None = None
     constants: dict[str, tuple[float, float]] = {}
+    uncertainty: dict[str, str | tuple[float, float]] = {}
     normalise_penalty: Annotated[bool, Field(strict=True)] = False
 
 
@@ -149,8 +153,20 @@ class Agent:
         chosen = checked(METHODS[own.method], {**training, **own.training}, "training")
         return cls(own.targets, own.method, process, chosen, estimators)
 
-    def env(self, plant: AbstractPlant, spread: float, num_steps: int) -> Env:
+    def env(
+        self,
+        plant: AbstractPlant,
+        spread: float,
+        num_steps: int,
+        ranges: Mapping[str, Range] = MappingProxyType({}),
+    ) -> Env:
         """The decision process of this agent.
+
+        Args:
+            plant: it is trained on.
+            spread: of the study.
+            num_steps: of an experiment.
+            ranges: declared uncertainty of the study.
 
         Raises:
             ValueError: for a target, output or input that does not exist, an amplitude
@@ -159,6 +175,7 @@ class Agent:
         """
         decision = self.decision
         own = spread if decision.spread is None else decision.spread
+        ranges = self.ranges(ranges)
         return Env.of(
             plant,
             objective=self._objective(plant, own),
@@ -166,7 +183,12 @@ class Agent:
             spread=own,
             penalty_weight=1 / num_steps if decision.normalise_penalty else 1.0,
             constants=_ends(plant, decision.constants),
+            uncertainty=Uncertainty.of(plant, own, ranges) if ranges else None,
         )
+
+    def ranges(self, of_study: Mapping[str, Range]) -> Mapping[str, Range]:
+        """The declared uncertainty: this agent's, or that of the study."""
+        return self.decision.uncertainty or of_study
 
     def _layout(self, plant: AbstractPlant, num_steps: int) -> Layout:
         decision, outputs = self.decision, plant.definition.outputs
@@ -242,19 +264,32 @@ class Agent:
         done = steps / (self.training.num_plants * num_steps)
         return f"updating {done:,.0f} of {self.training.num_updates:,}"
 
-    def settings(self, plant: AbstractPlant) -> dict[str, Any]:
-        """All settings that determine the policy, defaults included, JSON-ready."""
+    def settings(
+        self, plant: AbstractPlant, ranges: Mapping[str, Range] = MappingProxyType({})
+    ) -> dict[str, Any]:
+        """All settings that determine the policy, defaults included, JSON-ready.
+
+        Args:
+            plant: it is trained on.
+            ranges: declared uncertainty of the study.
+        """
+        is_uncertain = bool(self.ranges(ranges))
         names = names_of(plant.definition.parameters)
         mask = target_mask(plant.definition, self.targets)
         # Settings that were added later enter only where they are used, so that the
         # fingerprints of earlier trainings stay valid.
         later = {"clocks", "criterion", "max_sensitivity", "input_amplitude", "spread", "dense"}
-        later |= {"constants", "terms"}
+        later |= {"constants", "terms", "uncertainty"}
         return {
             "method": self.method,
             "targets": [name for name, chosen in zip(names, mask, strict=True) if chosen],
             "decision": self.decision.model_dump(exclude=later - self.decision.model_fields_set),
-            "training": dataclasses.asdict(self.training),
+            "training": {
+                name: value
+                for name, value in dataclasses.asdict(self.training).items()
+                if is_uncertain or name not in AGAINST_UNCERTAINTY
+            },
+            **({"uncertainty": dict(self.ranges(ranges))} if is_uncertain else {}),
         }
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from ..description import wrong_type
 from ..plant import AbstractARXPlant
 from ..plant.catalogue import PlantLike
+from ..plant.uncertainty import Range
 from ..policy import POLICY_ENDING, Policy, mismatch, read_policy
 from ..report.study_table import StudyTable
 from ..training.checkpoint import Progress
@@ -24,6 +25,7 @@ def evaluate(
     episodes: int = 1000,
     seed: int = 0,
     spread: float = 0.3,
+    uncertainty: Mapping[str, Range] | None = None,
     noise: Mapping[str, float] | None = None,
     estimators: str | Sequence[str] | None = None,
     rig: bool = False,
@@ -44,6 +46,8 @@ def evaluate(
         episodes: number of experiments, each on another plant.
         seed: of the plants, the noise and the excitations.
         spread: parameters are uniform in nominal value ± spread times their scale.
+        uncertainty: what else may differ, as in `falsify`: plants are drawn from it, and
+            estimated as if nothing did.
         noise: standard deviation by output, in its unit, where it differs from the plant's.
         estimators: names, default `nls`, and `arx-rls` where the plant has a mapping from ARX.
         rig: whether experiments are made on the plant's simulated rig.
@@ -73,6 +77,7 @@ def evaluate(
             "num_steps": trained.layout.num_steps,
             "seed": seed,
             "spread": spread,
+            "uncertainty": dict(uncertainty or {}),
             "methods": {name: {"excitation": word}},
             "estimators": {kind: {"kind": kind} for kind in kinds},
             "rig": {"filter": filter} if rig else None,

@@ -23,7 +23,7 @@ def seed_folder(folder: Path, agent: str, seed: int) -> Path:
 
 def agent_settings(study: Study, plant: AbstractPlant, agent: str) -> dict[str, object]:
     """All settings, except the plant, that determine the result of a seed, JSON-ready."""
-    own = study.agent(agent).settings(plant)
+    own = study.agent(agent).settings(plant, study.uncertainty)
     return {**own, "spread": study.spread, "num_steps": study.num_steps}
 
 

@@ -70,8 +70,9 @@ def num_chunks(study: Study) -> int:
 def player_of(study: Study, plant: AbstractPlant) -> Play:
     """A function that makes the study's experiments: on the plant, or on its simulated rig."""
     if study.rig is None:
+        box = study.build_uncertainty(plant)
         return lambda excitation, keys: (
-            run_episodes(plant, excitation, study.num_steps, study.spread, keys),
+            run_episodes(plant, excitation, study.num_steps, study.spread, keys, box),
             {},
         )
     rules, numbers = Supervision.of(plant.description), study.rig.numbers()

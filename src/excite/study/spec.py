@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -24,13 +23,14 @@ from ..files import folder_word
 from ..information import require_noise
 from ..plant import AbstractARXPlant, AbstractPlant
 from ..plant.catalogue import (
-    PLANTS,
     PlantLike,
     plant_from,
     plant_named,
     require_inputs,
     with_sensor,
+    word_of,
 )
+from ..plant.uncertainty import Uncertainty
 from ..policy import POLICY_ENDING
 from ..record.read import SIGNAL_ENDINGS
 from ..training.settings import GradientSettings, PPOSettings
@@ -107,6 +107,8 @@ class Study(Settings):
         seed: of plants, noise and excitations.
         spread: parameters are uniform in nominal value ± spread times their scale (by
             default the nominal value itself).
+        uncertainty: what else may differ, see `Uncertainty`: all are evaluated on plants drawn
+            from it; agents by gradient are trained to be safe in it, and falsified.
         sensor: by output, where it differs from the plant's.
         methods, estimators: by the name that tables show.
         agents: to be trained, by the name that tables show.
@@ -129,6 +131,7 @@ class Study(Settings):
     num_steps: Count = 500
     seed: Annotated[int, Field(ge=0, lt=2**63, strict=True)] = 0
     spread: Annotated[float, Field(ge=0, lt=1, strict=True, allow_inf_nan=False)] = 0.3
+    uncertainty: dict[str, str | tuple[float, float]] = {}
     sensor: dict[str, SensorSettings] = {}
     methods: dict[str, MethodSettings] = {}
     estimators: dict[str, EstimatorSettings]
@@ -158,6 +161,18 @@ class Study(Settings):
             {n: s.noise_sd for n, s in own if s.noise_sd is not None},
             {n: s.resolution for n, s in own if s.resolution is not None},
         )
+
+    def build_uncertainty(self, plant: AbstractPlant) -> Uncertainty | None:
+        """The declared uncertainty; None where only the parameters differ.
+
+        Raises:
+            ValueError: for a name or a range that is not allowed.
+        """
+        if not self.uncertainty:
+            return None
+        if self.rig is not None:
+            raise ValueError("experiments on a rig differ by spread alone: leave uncertainty out")
+        return Uncertainty.of(plant, self.spread, self.uncertainty)
 
     def build_methods(self, plant: AbstractPlant) -> dict[str, AbstractExcitation]:
         """The study's excitations, checked against the plant and the number of steps."""
@@ -223,6 +238,7 @@ class Study(Settings):
         """Validates all settings; returns self. ValueError, naming `where`, for a mistake."""
         try:
             plant = self.build_plant()
+            self.build_uncertainty(plant)
             self.build_methods(plant)
             self.build_estimators(plant)
             self.check_agents(plant)
@@ -247,7 +263,7 @@ class Study(Settings):
                     + (f"; {other!r} has the same" if other != name else "")
                 )
             try:
-                self.agent(name).env(plant, self.spread, self.num_steps)
+                self.agent(name).env(plant, self.spread, self.num_steps, self.uncertainty)
             except ValueError as error:
                 raise ValueError(f"agents.{name}: {error}") from None
         if self.agents:
@@ -359,7 +375,7 @@ def plant_tables(
     """
     given = plant_from(plant)
     require_inputs(given)
-    word = plant if isinstance(plant, str) else _word(type(given))
+    word = plant if isinstance(plant, str) else word_of(given)
     usual = given if isinstance(plant, str) else plant_named(word)
     if usual.changed(sensor=given.sensor).description.hash != given.description.hash:
         raise ValueError(
@@ -376,17 +392,3 @@ def plant_tables(
     for name, sd in (noise or {}).items():
         sensor[name] = {**sensor.get(name, {}), "noise_sd": sd}
     return {"plant": word, "sensor": sensor}, built
-
-
-def _word(kind: type[AbstractPlant]) -> str:
-    """The name of a plant's class in a study file."""
-    shipped = [name for name, plant_class in PLANTS.items() if plant_class is kind]
-    if shipped:
-        return shipped[0]
-    try:
-        return f"{inspect.getfile(kind)}:{kind.__name__}"
-    except (TypeError, OSError):  # defined in a notebook or a shell
-        raise ValueError(
-            f"other processes cannot import the plant class {kind.__name__}: save it in a file (in "
-            f"a notebook by %%writefile plant.py) and name it as 'plant.py:{kind.__name__}'"
-        ) from None

@@ -31,6 +31,7 @@ from ..report.rows import Rows, SeedMetrics
 from ..training.checkpoint import Checkpoint, Trained
 from ..training.signals import clairvoyant_signals, signal_env
 from .agent import Agent
+from .falsify import falsify
 from .folder import agent_settings, fingerprint
 from .methods import episode_keys, evaluate_method, method_rows, scores
 from .progress import write_progress
@@ -102,7 +103,7 @@ def seed_task(
         mark, own = fingerprint(chosen, built, agent), chosen.agent(agent)
         place = Path(folder) if folder and Path(folder).is_dir() else None
         keeper = _Keeper(place, mark, checkpoint_seconds)
-        env = own.env(built, chosen.spread, chosen.num_steps)
+        env = own.env(built, chosen.spread, chosen.num_steps, chosen.uncertainty)
         trained = _trained(env, own, seed, keeper)
         seconds = keeper.seconds()
         provenance = {
@@ -113,6 +114,8 @@ def seed_task(
             **agent_settings(chosen, built, agent),
         }
         policy = Policy(built.description, env.layout, trained.weights, provenance)
+        if env.uncertainty is not None:
+            policy = falsify(policy, built).certified()
         rows, rms = evaluate_method(chosen, built, agent, PolicyExcitation.of(policy))
         limit = np.array(policy.layout.input_half)
         metrics = SeedMetrics(

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from ..plant import AbstractARXPlant
 from ..plant.catalogue import PlantLike
+from ..plant.uncertainty import Range
 from ..policy import Policy, read_policy
 from ..training.checkpoint import Progress
 from .folder import seed_folder
@@ -30,6 +31,7 @@ def train(
     training: Mapping[str, object] | None = None,
     seeds: int = 1,
     spread: float = 0.3,
+    uncertainty: Mapping[str, Range] | None = None,
     steps: int = 500,
     noise: Mapping[str, float] | None = None,
     episodes: int = 100,
@@ -63,6 +65,8 @@ def train(
         training: hyper-parameters of the method (`excite.training.settings`).
         seeds: independent trainings; the best policy is returned.
         spread: plants are drawn from nominal values ± this fraction.
+        uncertainty: what else may differ, as in `falsify`: the policy is trained to be safe
+            there too (by gradient), and its file says what a search found.
         steps: samples of an experiment.
         noise: standard deviation by output, in its unit, where it differs from the plant's.
         episodes: experiments on which the policies are evaluated.
@@ -82,6 +86,7 @@ def train(
         "output_scale": dict(output_scale or {}),
         "window": window,
         "clocks": list(clock) if isinstance(clock, Sequence) else [clock],
+        "uncertainty": dict(uncertainty or {}),
     }
     agent = {
         "targets": ([target] if isinstance(target, str) else list(target)) or None,

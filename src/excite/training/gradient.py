@@ -10,10 +10,11 @@ an allowed violation rate on held-out plants is kept.
 
 from __future__ import annotations
 
-import functools
+import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -23,11 +24,17 @@ import optax
 from jaxtyping import Array, Float, Key, PRNGKeyArray, PyTree
 
 from ..environment import Env, EnvState
+from ..environment.falsification import Cases, Effort, OnPlant, climbed, nearness, search
+from ..excitation import PolicyExcitation
+from ..plant.uncertainty import Uncertainty
 from ..policy import Layout, Weights, act
 from ..safety import watched_levels
 from .checkpoint import Checkpoint, OnBoundary, Trained
 from .settings import GradientSettings
-from .validation import look, validation_keys
+from .validation import VALIDATION_SEED, look, validation_keys
+
+_LOOK = dataclasses.replace(Effort.of(1500), searched_noises=0)
+"""Of the search in a validation."""
 
 
 class Network(eqx.Module):
@@ -39,6 +46,10 @@ class Network(eqx.Module):
     def __call__(self, state: EnvState) -> Float[Array, " input"]:
         """The policy's action in this state."""
         return act(jnp, self.layout, self.weights, state.window, state.k)
+
+    def excitation(self) -> PolicyExcitation:
+        """The same policy, to be played on any plant."""
+        return PolicyExcitation(self.weights, self.layout)
 
 
 class Scores(eqx.Module):
@@ -101,41 +112,107 @@ class Optimisation(eqx.Module):
         player: the policy or signal being trained.
         adam: state of the optimiser.
         penalty_weight: of the safety penalty.
+        adversaries: of the last update; None where no uncertainty is declared.
     """
 
     player: PyTree
     adam: PyTree
     penalty_weight: Float[Array, "*training"]
+    adversaries: Cases | None = None
 
     @classmethod
-    def start(cls, player: PyTree, settings: GradientSettings) -> Optimisation:
+    def start(
+        cls, player: PyTree, settings: GradientSettings, box: Uncertainty | None = None
+    ) -> Optimisation:
         """Before the first update."""
         adam = _optimiser(settings).init(eqx.filter(player, eqx.is_array))
-        return cls(player, adam, jnp.asarray(settings.penalty_weight, float))
+        weight, count = jnp.asarray(settings.penalty_weight, float), settings.num_adversaries
+        if box is None:
+            return cls(player, adam, weight)
+        middle = Cases(jnp.zeros((count, len(box.names))), jnp.zeros(count, int))
+        return cls(player, adam, weight, middle)
 
 
 def update(
-    env: Env, settings: GradientSettings, now: Optimisation, keys: Key[Array, " plant"]
+    env: Env,
+    settings: GradientSettings,
+    now: Optimisation,
+    keys: Key[Array, " plant"],
+    is_adversarial: bool = False,
 ) -> tuple[Optimisation, Scores]:
-    """One step of Adam on the plants of these keys, and the experiments before it."""
+    """One step of Adam on the plants of these keys, and the experiments before it.
 
-    def loss(player: PyTree) -> tuple[Array, Scores]:
+    Args:
+        env: the decision process.
+        settings: hyper-parameters.
+        now: before the step.
+        keys: of the plants.
+        is_adversarial: whether the worst plants of the declared uncertainty are penalised too.
+    """
+    box, adversaries = env.uncertainty, now.adversaries
+    if is_adversarial and box is not None and adversaries is not None:
+        play = OnPlant(box, now.player.excitation(), env.layout.num_steps)
+        key = jax.random.fold_in(keys[0], 1)
+        adversaries = _adversaries(play, settings, adversaries, key)
+
+    def loss(player: PyTree) -> tuple[Array, tuple[Scores, Array]]:
         batch = experiments(env, player, keys, settings.margin)
+        excess, nearest = jnp.mean(batch.excess), batch.nearness
+        if is_adversarial and box is not None and adversaries is not None:
+            play = OnPlant(box, player.excitation(), env.layout.num_steps)
+            more, size = _excess(play, adversaries, settings.adversary_margin)
+            excess, nearest = excess + jnp.mean(more), jnp.concatenate([nearest, size])
         worth = env.objective.of_batch(batch.outcome)
-        return now.penalty_weight * jnp.mean(batch.excess) - worth, batch
+        return now.penalty_weight * excess - worth, (batch, nearest)
 
-    (cost, batch), gradient = eqx.filter_value_and_grad(loss, has_aux=True)(now.player)
+    (cost, (batch, nearest)), gradient = eqx.filter_value_and_grad(loss, has_aux=True)(now.player)
     gradient = jax.tree.map(lambda leaf: jnp.where(jnp.isfinite(cost), leaf, jnp.nan), gradient)
     step, adam = _optimiser(settings).update(gradient, now.adam)
-    is_near = jnp.mean(batch.nearness >= settings.near) > settings.violation_rate
+    is_near = jnp.mean(nearest >= settings.near) > settings.violation_rate
     change = jnp.where(is_near, settings.penalty_growth, -settings.penalty_decay)
     player = eqx.apply_updates(now.player, step)
     weight = jnp.maximum(now.penalty_weight * jnp.exp(change), settings.penalty_weight)
-    return Optimisation(player, adam, weight), batch
+    return Optimisation(player, adam, weight, adversaries), batch
+
+
+def _adversaries(
+    play: OnPlant, settings: GradientSettings, last: Cases, key: PRNGKeyArray
+) -> Cases:
+    """Plants and noise with which the policy comes near to a level, the nearest first.
+
+    Half of the ascents begin with the worst cases of the last update, half with new ones.
+    """
+    count = settings.num_adversaries
+    is_kept = jnp.arange(count) < count // 2
+    points = jax.vmap(play.uncertainty.draw)(jax.random.split(key, count))
+    seeds = jax.random.randint(key, (count,), 0, 2**31 - 1)
+    starts = Cases(
+        jnp.where(is_kept[:, None], last.point, points), jnp.where(is_kept, last.seed, seeds)
+    )
+    climb = partial(climbed, play, num_steps=settings.adversary_steps, decay=0.7)
+    worst, sizes, _ = jax.vmap(climb)(starts)
+    order = jnp.argsort(-sizes)
+    return jax.lax.stop_gradient(jax.tree.map(lambda leaf: leaf[order], worst))
+
+
+def _excess(
+    play: OnPlant, cases: Cases, margin: float
+) -> tuple[Float[Array, " case"], Float[Array, " case"]]:
+    """Of each case, the mean square of the distance beyond the margin, and the nearness."""
+    plant = play.uncertainty.plant
+    watched, _, critical = watched_levels(plant.definition)
+
+    def excess(case: Cases) -> tuple[Array, Array]:
+        outputs = play.outputs(case)
+        over = jnp.abs(outputs[:, np.array(watched, int)]) / critical[None] - margin
+        over = jnp.maximum(over, 0.0) / (1 - margin)
+        return jnp.mean(jnp.sum(over**2, axis=1)), nearness(plant, outputs)
+
+    return jax.vmap(excess)(cases)
 
 
 update_all = eqx.filter_jit(
-    eqx.filter_vmap(update, in_axes=(None, None, eqx.if_array(0), eqx.if_array(0)))
+    eqx.filter_vmap(update, in_axes=(None, None, eqx.if_array(0), eqx.if_array(0), None))
 )
 """`update` for several parallel trainings; their axis is the first of progress and keys."""
 
@@ -183,9 +260,11 @@ def train_all(
             _require_finite(course.now, settings, i)
             row = _looked(env, settings, course, steps)
             _require_computable(row)
-        on_boundary(functools.partial(course.checkpoint, steps), row)
+        on_boundary(partial(course.checkpoint, steps), row)
         if i < settings.num_updates:
-            course.now, _ = update_all(env, settings, course.now, keys(i))
+            is_adversarial = i >= settings.adversaries_from * settings.num_updates
+            is_adversarial = is_adversarial and env.uncertainty is not None
+            course.now, _ = update_all(env, settings, course.now, keys(i), is_adversarial)
             course.num_updates += 1
     best = course.best.weights
     weights = [jax.tree.map(lambda x, s=s: np.asarray(x[s]), best) for s in range(len(seeds))]
@@ -241,7 +320,8 @@ def started(
     pairs = jax.vmap(jax.random.split)(jnp.stack([jax.random.key(seed) for seed in seeds]))
 
     def start(key: PRNGKeyArray) -> Optimisation:
-        return Optimisation.start(Network(_first_weights(env, settings, key), env.layout), settings)
+        network = Network(_first_weights(env, settings, key), env.layout)
+        return Optimisation.start(network, settings, env.uncertainty)
 
     def keys(i: int) -> Key[Array, "seed plant"]:
         own = jax.vmap(jax.random.fold_in, (0, None))(pairs[:, 1], i)
@@ -260,6 +340,7 @@ def _looked(
         own = jax.tree.map(lambda x, s=s: x[s], course.now)
         seen = look(env, own.player.weights, settings.watch_episodes)
         judged = _judged(env, own.player, validation_keys(settings.watch_episodes))
+        judged |= _falsified(env, own.player)
         curve.append({"steps": steps, **judged, **seen, **_state(own)})
         own_rank = rank(settings, curve[-1])
         if own_rank > tuple(course.rank[s]):
@@ -281,14 +362,24 @@ def _judged(env: Env, player: Network, keys: Key[Array, " plant"]) -> dict[str, 
     }
 
 
+def _falsified(env: Env, player: Network) -> dict[str, float]:
+    """The largest nearness that a short search in the declared uncertainty finds."""
+    if env.uncertainty is None:
+        return {}
+    play = OnPlant(env.uncertainty, player.excitation(), env.layout.num_steps)
+    found = search(play, _LOOK, VALIDATION_SEED)
+    return {"worst_nearness": max(stage.nearness for stage in found.stages)}
+
+
 def rank(settings: GradientSettings, row: Mapping[str, float]) -> tuple[float, float]:
-    """Rank of a validation: the violation rate beyond the allowed one, then the worth.
+    """Rank of a validation: violations and nearness beyond the allowed ones, then the worth.
 
     The first validation, of an untrained policy, is the last choice.
     """
     too_many = max(0.0, row["violation_rate"] - settings.violation_rate)
+    too_near = max(0.0, row.get("worst_nearness", 0.0) - settings.allowed_nearness)
     worth = -math.inf if math.isnan(row["worth"]) else row["worth"]
-    return (-too_many if row["steps"] else -math.inf, worth)
+    return (-too_many - too_near if row["steps"] else -math.inf, worth)
 
 
 def _optimiser(settings: GradientSettings) -> optax.GradientTransformation:

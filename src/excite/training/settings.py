@@ -64,6 +64,13 @@ class GradientSettings(_Checked):
         violation_rate: allowed on held-out plants.
         watch_every: updates between two validations of the policy.
         watch_episodes: episodes of a validation.
+        num_adversaries: of each step, plants of the declared uncertainty on which this policy
+            comes near to a level, in the penalty alone; none without a declared uncertainty.
+        adversary_steps: of the ascent that finds each of them.
+        adversary_margin: as `margin`, for them.
+        adversaries_from: fraction of the updates after which they join.
+        allowed_nearness: largest output over its critical level that a search of a validation
+            may find in the declared uncertainty.
     """
 
     num_updates: Count = 1000
@@ -80,6 +87,18 @@ class GradientSettings(_Checked):
     violation_rate: Fraction = 0.0
     watch_every: Count = 50
     watch_episodes: Count = 500
+    num_adversaries: Count = 48
+    adversary_steps: Count = 4
+    adversary_margin: Fraction = 0.9
+    adversaries_from: Fraction = 0.4
+    allowed_nearness: Fraction = 0.975
+
+
+AGAINST_UNCERTAINTY = (
+    "num_adversaries", "adversary_steps", "adversary_margin", "adversaries_from",
+    "allowed_nearness",
+)  # fmt: skip
+"""Hyper-parameters that matter only where an uncertainty is declared."""
 
 
 @dataclass(frozen=True)

@@ -140,7 +140,7 @@ def _search(
     """Actions at the end of all searches, side by side."""
     now = eqx.filter_vmap(lambda p: Optimisation.start(p, settings))(player)
     for i in range(settings.num_updates):
-        now, _ = update_all(env, settings, now, keys(i))
+        now, _ = update_all(env, settings, now, keys(i), False)
         report(f"updating {i + 1:,} of {settings.num_updates:,}", i + 1, settings.num_updates)
     return jnp.tanh(now.player.latent)
 

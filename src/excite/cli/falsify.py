@@ -1,0 +1,116 @@
+"""`excite falsify`: a search for the plant on which a policy or a signal is least safe."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from .options import (
+    NUMBERS,
+    OUT_FILE,
+    VALUES,
+    WholeNumber,
+    computing,
+    json_option,
+    merged,
+    plot_option,
+    progress_bar,
+    show_json,
+    uncertain_option,
+    warnings_shown,
+)
+
+
+@click.command()
+@click.argument("excitation", metavar="POLICY")
+@click.option("--plant", help="Name or path/to/file.py:ClassName; default the policy's plant.")
+@click.option(
+    "--set",
+    "settings",
+    type=VALUES,
+    multiple=True,
+    help="Options of a signal, such as amplitude=5.",
+)
+@click.option(
+    "--spread",
+    type=click.FloatRange(0, 1, max_open=True),
+    help="Spread of the parameters; default that of the policy's training, or 0.3.",
+)
+@uncertain_option("What else may differ; default that of the policy's training.")
+@click.option("--noise", type=NUMBERS, multiple=True, help="Noise sd of an output, in its unit.")
+@click.option(
+    "--steps",
+    type=WholeNumber(2, 1_000_000),
+    metavar="T",
+    help="Length in samples; default 500, or that of a policy or a file.",
+)
+@click.option(
+    "--budget",
+    type=WholeNumber(100, 10_000_000),
+    default=10_000,
+    show_default=True,
+    metavar="N",
+    help="Number of simulated experiments, about.",
+)
+@click.option(
+    "--seed",
+    type=WholeNumber(0, 2**63 - 1),
+    default=0,
+    show_default=True,
+    help="Seed of the search.",
+)
+@click.option("--out", type=OUT_FILE, metavar="FILE", help="Write the worst plant (.json).")
+@click.option(
+    "--certify",
+    type=OUT_FILE,
+    metavar="FILE",
+    help="Write the policy with this search as its certificate (.safetensors).",
+)
+@click.option("--overwrite", is_flag=True, help="Replace these files if they exist.")
+@plot_option
+@json_option
+@computing
+def falsify(
+    excitation: str, out: Path | None, certify: Path | None, overwrite: bool, plot: Path | None,
+    as_json: bool, **options: Any,
+) -> None:  # fmt: skip
+    """Search for the plant on which POLICY, or a signal, comes nearest to a critical level.
+
+    The search goes over the declared uncertainty and over sensor noise. What it finds is
+    found; what it does not find is not proved. Exit code 1 where a level is reached.
+    """
+    from ..study.falsify import falsify as falsified
+    from ..study.falsify import require_certifiable, require_plant_path
+
+    if out is not None:
+        require_plant_path(out, overwrite)
+    if certify is not None:
+        require_certifiable(excitation, certify, overwrite)
+    uncertain = merged(options.pop("uncertain")) or None
+    settings, noise = merged(options.pop("settings")), merged(options.pop("noise"))
+    with warnings_shown(), progress_bar(f"falsifying {excitation}") as progress:
+        found = falsified(
+            excitation, options=settings, uncertainty=uncertain, noise=noise, progress=progress,
+            **options,
+        )  # fmt: skip
+    if plot is not None:
+        from ..figure import save
+
+        save(found.plot(), plot)
+    if out is not None:
+        found.save(out, overwrite)
+    if certify is not None:
+        found.certified().save(certify, overwrite)
+    if as_json:
+        show_json(
+            {"excitation": found.excitation, "plant": found.plant.name, **found.certificate()}
+        )
+    else:
+        click.echo(found)
+        if out is not None:
+            click.echo(
+                f"replay: excite simulate {out} --excitation {excitation} --seed {found.worst_seed}"
+            )
+    click.get_current_context().exit(0 if found.is_safe else 1)

@@ -1,0 +1,241 @@
+"""What may differ from a plant's description: the declared uncertainty, a box.
+
+    parameters, J_p                 unknown parameters, all or one
+    d_S                             a known constant
+    delay_voltage, lag_voltage, ... an effect that the equations leave out (`plant.extension`)
+    initial_state, initial_pitch    where an experiment starts, all states or one
+    noise                           factor of the sensor's standard deviations
+
+A range is (low, high), or a text: `0:0.1`, `10%` of the nominal value (of a parameter's or a
+state's scale), or `factor:3` for a third to three times the nominal value.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from ..description import names_of, unknown, wrong_type
+from .contract import AbstractPlant, Params, Sensor
+from .extension import extended, extensions_of, plain_kind
+
+Range: TypeAlias = str | Sequence[float]
+"""Lowest and highest value, or a text: `0:0.1`, `10%`, `factor:3`."""
+
+_START, _ALL_PARAMETERS, _ALL_STATES, _NOISE = "initial_", "parameters", "initial_state", "noise"
+_ALLOWED = "two numbers LOW:HIGH, a percentage such as 10%, or factor:3"
+
+
+class Uncertainty(eqx.Module):
+    """A box of plants; a point of it has one coordinate in [-1, 1] for each quantity.
+
+    Attributes:
+        plant: with the extensions that the box needs.
+        lower, upper: of each quantity, in its unit.
+        names: of the quantities.
+        is_factor: whether the range of a quantity is symmetric in its logarithm.
+    """
+
+    plant: AbstractPlant
+    lower: Float[Array, " quantity"]
+    upper: Float[Array, " quantity"]
+    names: tuple[str, ...] = eqx.field(static=True)
+    is_factor: tuple[bool, ...] = eqx.field(static=True)
+
+    @classmethod
+    def of(
+        cls,
+        plant: AbstractPlant,
+        spread: float = 0.3,
+        ranges: Mapping[str, Range] | None = None,
+    ) -> Uncertainty:
+        """The box around a plant.
+
+        Args:
+            spread: of parameters without a range: nominal value ± spread times the scale.
+            ranges: by name, see the module.
+
+        Raises:
+            ValueError: for an unknown name, or a range that is empty, not finite, or beyond the
+                bounds of a parameter.
+        """
+        if not isinstance(ranges, Mapping | None):
+            raise wrong_type("uncertainty", ranges, "a dict of ranges by name")
+        given = {_ALL_PARAMETERS: f"{100 * spread}%", **(ranges or {})}
+        added = _extensions(plant, given)
+        whole = extended(plant, added) if added else plant
+        quantities = _quantities(whole, plant)
+        boxes: dict[str, _Interval] = {}
+        groups = {
+            _ALL_PARAMETERS: names_of(plant.definition.parameters),
+            _ALL_STATES: tuple(_START + name for name in names_of(plant.definition.states)),
+        }
+        for word, value in given.items():  # a group first, then what is named on its own
+            for name in groups.get(word, ()):
+                boxes[name] = _interval(name, value, quantities[name])
+        for word, value in given.items():
+            if word in groups:
+                continue
+            if word not in quantities:
+                known = [*quantities, *extensions_of(whole), *groups]
+                raise unknown(f"quantity in the uncertainty of {plant.definition.name!r}",
+                              word, known)  # fmt: skip
+            boxes[word] = _interval(word, value, quantities[word])
+        chosen = {name: box for name, box in boxes.items() if box.lower < box.upper or
+                  box.lower != quantities[name].nominal}  # fmt: skip
+        return cls(
+            whole,
+            jnp.asarray([box.lower for box in chosen.values()], float),
+            jnp.asarray([box.upper for box in chosen.values()], float),
+            tuple(chosen),
+            tuple(box.is_factor for box in chosen.values()),
+        )
+
+    def values(self, point: Float[Array, " quantity"]) -> Float[Array, " quantity"]:
+        """Of each quantity, in its unit."""
+        share, is_factor = (point + 1) / 2, np.array(self.is_factor, bool)
+        plain = self.lower + share * (self.upper - self.lower)
+        low, high = (jnp.where(is_factor, x, 1.0) for x in (self.lower, self.upper))
+        return jnp.where(is_factor, low * (high / low) ** share, plain)
+
+    def at(self, point: Float[Array, " quantity"]) -> tuple[AbstractPlant, Params]:
+        """The plant at a point of the box, and its parameters."""
+        value = dict(zip(self.names, self.values(point), strict=True))
+        plant, d = self.plant, self.plant.definition
+        params = plant.nominal._replace(
+            **{p.name: value[p.name] for p in d.parameters if p.name in value}
+        )
+        start = plant.initial_state
+        for i, state in enumerate(d.states):
+            if _START + state.name in value:
+                start = start.at[i].set(value[_START + state.name])
+        factor = value.get(_NOISE, 1.0)
+        sensor = Sensor(plant.sensor.noise_sd * factor, plant.sensor.resolution)
+        constants = {c.name: value[c.name] for c in d.constants if c.name in value}
+        return plant.changed(initial_state=start, sensor=sensor, **constants), params
+
+    def draw(self, key: PRNGKeyArray) -> Float[Array, " quantity"]:
+        """A point drawn at random."""
+        return jax.random.uniform(key, (len(self.names),), float, -1.0, 1.0)
+
+    def corners(self, key: PRNGKeyArray, most: int) -> Float[Array, "corner quantity"]:
+        """All corners of the box, or `most` of them drawn at random where there are more."""
+        count = len(self.names)
+        if 2**count <= most:
+            every = itertools.product((-1.0, 1.0), repeat=count)
+            return jnp.asarray(list(every)).reshape(-1, count)
+        return jax.random.rademacher(key, (most, count), float)
+
+    def ranges(self) -> dict[str, list[float]]:
+        """Lowest and highest value of each quantity, JSON-ready."""
+        ends = zip(self.lower.tolist(), self.upper.tolist(), strict=True)
+        return dict(zip(self.names, map(list, ends), strict=True))
+
+
+@dataclass(frozen=True)
+class _Quantity:
+    """What may differ: nominal value, what a percentage refers to, and bounds."""
+
+    nominal: float
+    size: float
+    unit: str
+    lower: float = -math.inf
+    upper: float = math.inf
+
+
+@dataclass(frozen=True)
+class _Interval:
+    lower: float
+    upper: float
+    is_factor: bool = False
+
+
+def _extensions(plant: AbstractPlant, ranges: Mapping[str, Range]) -> list[str]:
+    """Extensions that are named and that the plant does not have."""
+    possible = extensions_of(plant)
+    return [name for name in ranges if name in possible]
+
+
+def _quantities(whole: AbstractPlant, plant: AbstractPlant) -> dict[str, _Quantity]:
+    """All quantities of a plant with extensions that may differ, by name."""
+    d = whole.description
+    found = {
+        p.name: _Quantity(
+            p.nominal,
+            p.scale,
+            p.unit,
+            lower=p.lower if p.lower is not None else (0.0 if p.positive else -math.inf),
+            upper=math.inf if p.upper is None else p.upper,
+        )
+        for p in d.parameters
+    }
+    found |= {c.name: _Quantity(c.value, abs(c.value), c.unit) for c in d.constants}
+    own = plain_kind(plant).definition.states
+    found |= {_START + s.name: _Quantity(s.initial, s.scale, s.unit) for s in d.states[: len(own)]}
+    return found | {_NOISE: _Quantity(1.0, 1.0, "", lower=0.0)}
+
+
+def _interval(name: str, given: Range, about: _Quantity) -> _Interval:
+    """The range of one quantity; ValueError for one that is not allowed."""
+    found = _read(name, given, about)
+    if not (math.isfinite(found.lower) and math.isfinite(found.upper)):
+        raise ValueError(f"range of {name} must be finite: got {_shown(given)}")
+    if found.lower > found.upper:
+        raise ValueError(
+            f"range of {name} contains no plant: it goes from {found.lower:g} to {found.upper:g}"
+        )
+    if found.lower < about.lower or found.upper > about.upper:
+        raise ValueError(
+            f"range of {name} goes from {found.lower:g} to {found.upper:g} {about.unit}, beyond "
+            f"its bounds {about.lower:g} to {about.upper:g}"
+        )
+    return found
+
+
+def _read(name: str, given: Range, about: _Quantity) -> _Interval:
+    """A range as it is written."""
+    if isinstance(given, Sequence) and not isinstance(given, str):
+        if len(given) != 2:
+            raise ValueError(f"range of {name} must be {_ALLOWED}: got {list(given)}")
+        return _Interval(_as_number(name, given[0], given), _as_number(name, given[1], given))
+    if not isinstance(given, str):
+        raise ValueError(f"range of {name} must be {_ALLOWED}: got {given!r}")
+    text = given.strip()
+    if text.endswith("%"):
+        reach = _as_number(name, text[:-1], given) / 100 * about.size
+        return _Interval(about.nominal - reach, about.nominal + reach)
+    first, colon, second = text.partition(":")
+    if first == "factor":
+        factor = _as_number(name, second, given)
+        if not (factor >= 1 and about.nominal > 0):
+            raise ValueError(
+                f"range of {name}: a factor is 1 or more, for a quantity with a positive nominal "
+                f"value; got {given!r} and the nominal value {about.nominal:g}"
+            )
+        return _Interval(about.nominal / factor, about.nominal * factor, is_factor=True)
+    if not colon:
+        raise ValueError(f"range of {name} must be {_ALLOWED}: got {given!r}")
+    return _Interval(_as_number(name, first, given), _as_number(name, second, given))
+
+
+def _as_number(name: str, value: object, given: Range) -> float:
+    try:
+        if isinstance(value, bool):
+            raise ValueError
+        return float(value)  # pyright: ignore[reportArgumentType]
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"range of {name} must be {_ALLOWED}: got {_shown(given)}") from None
+
+
+def _shown(given: Range) -> str:
+    text = given if isinstance(given, str) else str(list(given))
+    return repr(text) if len(text) < 60 else repr(text[:60] + "...")
