@@ -150,15 +150,7 @@ def bounded(
             )
     limits = tuple((name, *pair) for name, pair in bounds.items())
     begin = tuple(float(getattr(start, name)) for name in bounds)
-    narrow = _narrowed(type(plant), limits, begin)
-    bounded = narrow(
-        sensor=plant.sensor,
-        initial_state=plant.initial_state,
-        dt=plant.dt,
-        **plant.constants._asdict(),
-    )
-    object.__setattr__(bounded, "substeps", plant.substeps)
-    return bounded
+    return plant.as_class(_narrowed(type(plant), limits, begin))
 
 
 @cache

@@ -18,7 +18,7 @@ import math
 from collections import namedtuple
 from collections.abc import Mapping
 from functools import cache
-from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
@@ -43,6 +43,7 @@ def require_double_precision() -> None:
         )
 
 
+_Plant = TypeVar("_Plant", bound="AbstractPlant")
 Params: TypeAlias = Any
 """The unknown parameters: a named tuple of scalars in the order of the description."""
 
@@ -218,8 +219,12 @@ class AbstractPlant(_Module):
 
         All but `dt` may be traced numbers.
         """
+        return self.as_class(type(self), **numbers)
+
+    def as_class(self, kind: type[_Plant], **numbers: Any) -> _Plant:
+        """The plant in another class with these constants: its own numbers, but those given."""
         own = {"sensor": self.sensor, "initial_state": self.initial_state}
-        plant = type(self)(**{**own, **self.constants._asdict(), **numbers})
+        plant = kind(**{**own, **self.constants._asdict(), **numbers})
         if "dt" not in numbers:
             plant = eqx.tree_at(lambda p: p.dt, plant, self.dt)
             object.__setattr__(plant, "substeps", self.substeps)
