@@ -356,6 +356,24 @@ def test_a_share_that_leaves_nothing_to_compare_is_refused():
         identify(noisy(), Ramp, validate=shifted(0.0), validate_state="99%")
 
 
+def test_a_record_too_short_for_a_share_reports_the_fit_of_all_of_it():
+    few = record_cut(shifted(2.0), 3)
+    few.outputs[0] = np.nan  # so that nothing but the rest tells the initial state
+    found = identify(noisy(), Ramp, validate=few).validation[0]
+    assert found.initial_state == "initial state estimated from the whole record"
+    assert np.nanmean(few.outputs - found.simulated) == pytest.approx(0.0, abs=1e-6)
+
+
+def record_cut(record: Record, count: int) -> Record:
+    """The first samples."""
+    return dataclasses.replace(
+        record,
+        time=record.time[:count],
+        inputs=record.inputs[:count],
+        outputs=record.outputs[:count].copy(),
+    )
+
+
 @pytest.mark.parametrize("state", ["0", "101%", "nan", "middle", 0.0, True])
 def test_a_share_that_is_none_is_refused(state):
     with pytest.raises(ValueError, match="validate_state must be auto, known, first or a share"):

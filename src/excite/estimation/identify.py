@@ -71,7 +71,7 @@ from .prior_knowledge import PriorLike, with_prior
 from .profile import profile_intervals
 from .remedies import Suspect, outliers, suspects
 from .result import Identification, Noise
-from .validation import fitted_all, require_state_word, state_from, validated
+from .validation import fitted_all, state_from, validated, way_to_state
 
 InitialState = Literal["auto", "free", "known"]
 Intervals = Literal["linear", "profile"]
@@ -196,8 +196,8 @@ def identify(
         initial_state == "auto" and all(starts_at(record, plant) for record in records)
     )
     require_enough(plant, records, int(np.sum(~known_parameters(plant, estimator))), known)
-    require_state_word(validate_state)
-    shares = [state_from(record, plant, validate_state) for record in validation]
+    way = way_to_state(validate_state)
+    shares = [state_from(record, plant, way) for record in validation]
     for record in validation:
         require_enough(plant, [record], 0, False)
     require_short_delays(plant, begin, records)
