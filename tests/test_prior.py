@@ -154,6 +154,7 @@ def test_a_uniform_prior_bounds_the_estimate():
     assert any("b ended at its bound 0.25" in sentence for sentence in found.verdict)
     wide, free = identify(noisy(), Ramp, prior={"b": "uniform:-5:5"}), identify(noisy(), Ramp)
     assert wide.params.b == pytest.approx(free.params.b, rel=1e-5)
+    assert found.plant == wide.plant == free.plant
 
 
 def test_the_profile_of_a_linear_plant_with_a_prior_is_its_interval():

@@ -67,6 +67,7 @@ from .from_records import (
 )
 from .held import told_of_held
 from .nls import NLS, Likelihood
+from .prior import unbounded
 from .prior_knowledge import PriorLike, with_prior
 from .profile import profile_intervals
 from .remedies import Suspect, outliers, suspects
@@ -230,7 +231,7 @@ def identify(
     found = _suspects(plant, records, experiments, estimator, begin, fit, linear, progress)
     large = _above_declared(plant, fit) if fit.is_successful else ()
     verdict = (*others, *wrong, *large, *_remedies(found), *_agreement(fit), *verdict)
-    names, d = names_of(plant.definition.parameters), plant.description
+    names = names_of(plant.definition.parameters)
     values = np.array([float(value) for value in fit.estimate.params])
     sd = np.where(fit.free, np.sqrt(np.maximum(np.diag(covariance), 0.0)), np.nan)
     half = np.where(fit.free, half_95(covariance, degrees), np.nan)
@@ -248,7 +249,7 @@ def identify(
         )
         verdict = (*verdict, *_open_sides(plant.definition, ends))
     return Identification(
-        plant=d,
+        plant=unbounded(plant).description,
         estimator=estimator.name,
         status=fit.status,
         params=Named(zip(names, values.tolist(), strict=True)),

@@ -100,7 +100,7 @@ class Identification:
         True
 
     Attributes:
-        plant: the plant as it was fitted, sampled as the records are.
+        plant: the plant, sampled as the records are.
         estimator: its name on the command line.
         status: in a few words; docs/reference/machine-readable.md lists them.
         params, std_error: by parameter, in its unit, as attribute or item; the error of a held

@@ -263,23 +263,19 @@ def params_from(plant: AbstractPlant, values: Mapping[str, float] | Params | Non
 
 def _allowed(plant: AbstractPlant, name: str, value: object) -> float:
     """The value of a parameter, within its bounds."""
-    parameters = {p.name: p for p in plant.definition.parameters}
-    if name not in parameters:
+    names = names_of(plant.definition.parameters)
+    if name not in names:
         raise ValueError(
-            f"plant {plant.definition.name!r} has no parameter {name!r}; "
-            f"it has {', '.join(parameters)}"
+            f"plant {plant.definition.name!r} has no parameter {name!r}; it has {', '.join(names)}"
         )
-    p, number = parameters[name], as_number(name, value)
-    lower = 0.0 if p.positive and p.lower is None else p.lower
-    if not (
-        math.isfinite(number)
-        and (lower is None or number > lower)
-        and (p.upper is None or number < p.upper)
-    ):
+    p, number = plant.definition.parameter(name), as_number(name, value)
+    lower, upper = p.support
+    if not lower < number < upper:
+        above, below = f"{lower:g}", f"{upper:g}"
         raise ValueError(
             f"{name} = {number:g} {p.unit} is not allowed; it must be finite, above "
-            f"{'minus infinity' if lower is None else format(lower, 'g')} and below "
-            f"{'infinity' if p.upper is None else format(p.upper, 'g')}"
+            f"{above.replace('-inf', 'minus infinity')} and below "
+            f"{below.replace('inf', 'infinity')}"
         )
     return number
 
