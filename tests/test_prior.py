@@ -157,6 +157,17 @@ def test_a_uniform_prior_bounds_the_estimate():
     assert found.plant == wide.plant == free.plant
 
 
+def test_an_interval_does_not_leave_a_uniform_prior():
+    free = identify(noisy(), Ramp)
+    (low, high), center = free.ci95("b"), free.params.b
+    bound = (center + high) / 2
+    found = identify(noisy(), Ramp, prior={"b": f"uniform:-1:{bound!r}"})
+    assert found.held == ()
+    np.testing.assert_allclose(found.ci95("b"), (low, bound), rtol=1e-4)
+    np.testing.assert_allclose(found.ci95("a"), free.ci95("a"), rtol=1e-4)
+    assert found.std_error.b == pytest.approx(free.std_error.b, rel=1e-3)
+
+
 def test_the_profile_of_a_linear_plant_with_a_prior_is_its_interval():
     prior = {"a": "normal:0.9:0.05", "b": "normal:0.25:10%"}
     linear, profile = (

@@ -67,7 +67,7 @@ from .from_records import (
 )
 from .held import told_of_held
 from .nls import NLS, Likelihood
-from .prior import unbounded
+from .prior import unbounded, within_support
 from .prior_knowledge import PriorLike, with_prior
 from .profile import profile_intervals
 from .remedies import Suspect, outliers, suspects
@@ -235,7 +235,8 @@ def identify(
     values = np.array([float(value) for value in fit.estimate.params])
     sd = np.where(fit.free, np.sqrt(np.maximum(np.diag(covariance), 0.0)), np.nan)
     half = np.where(fit.free, half_95(covariance, degrees), np.nan)
-    ends, profiles = np.stack([values - half, values + half], axis=1), {}
+    ends = within_support(plant, np.stack([values - half, values + half], axis=1))
+    profiles = {}
     if intervals == "profile" and isinstance(estimator, NLS) and fit.is_successful:
         estimate = jax.device_put(fit.estimate)
         ends, profiles = profile_intervals(

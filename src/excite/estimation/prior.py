@@ -171,6 +171,15 @@ def unbounded(plant: AbstractPlant) -> AbstractPlant:
     return plant.as_class(getattr(plant, "unbounded", type(plant)))
 
 
+def within_support(
+    plant: AbstractPlant, ends: Float[np.ndarray, "param end"]
+) -> Float[np.ndarray, "param end"]:
+    """Ends of intervals, not beyond a uniform prior."""
+    names, parts = uniform_names(plant), plant.definition.parameters
+    allowed = np.array([p.support if p.name in names else (-np.inf, np.inf) for p in parts])
+    return np.clip(ends, allowed[:, :1], allowed[:, 1:])
+
+
 def uniform_names(plant: AbstractPlant) -> tuple[str, ...]:
     """Parameters that have a uniform prior."""
     return getattr(plant, "uniform", ())

@@ -158,7 +158,8 @@ class Identification:
         """95 % interval of a parameter: estimate ± t standard errors, or by profile likelihood.
 
         t is 1.96 where the noise is known; where its size is estimated from the residual, it is
-        that of Student's distribution. An end where a profile stays open is infinite.
+        that of Student's distribution. No interval leaves a uniform prior. An end where a profile
+        stays open is infinite.
         """
         return self.intervals[name]
 
