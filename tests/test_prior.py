@@ -157,6 +157,33 @@ def test_a_uniform_prior_bounds_the_estimate():
     assert found.plant == wide.plant == free.plant
 
 
+def test_with_known_noise_a_normal_prior_counts_as_a_value():
+    few, known = record_cut(noisy(), 2), NLS(noise="known")
+    prior = {"a": "normal:0.9:0.05", "b": "normal:0.25:0.1"}
+    found = identify(few, Ramp, known, prior=prior)
+    precision = COLUMNS[:2].T @ COLUMNS[:2] / SD**2 + np.diag([0.05**-2, 0.1**-2])
+    told = COLUMNS[:2].T @ few.outputs[:, 0] / SD**2 + np.array([0.9 / 0.05**2, 0.25 / 0.1**2])
+    expected = np.linalg.solve(precision, told)
+    np.testing.assert_allclose(list(found.params.values()), expected, rtol=1e-6)
+    np.testing.assert_allclose(found.covariance, np.linalg.inv(precision), rtol=1e-6)
+    for estimator, own in ((known, {"b": "uniform:0:1"}), ("nls", prior)):
+        with pytest.raises(ValueError, match=r"2 measured values for 2 unknowns .*noise='known'"):
+            identify(few, Ramp, estimator, prior=own)
+    one = dataclasses.replace(few, outputs=np.array([[np.nan], [np.nan]]))
+    with pytest.raises(ValueError, match="0 measured values and 2 priors for 2 unknowns"):
+        identify(one, Ramp, known, prior=prior)
+
+
+def test_records_of_two_samples_are_enough_together():
+    """One alone has as many values as there are parameters, and would be fitted by chance."""
+    few = record_cut(record_with(0 * TIME), 2)
+    inputs = [np.full((2, 1), value) for value in (1.0, -1.0, 0.5)]
+    outputs = [np.array([[0.0], 0.1 * (TRUTH[0] * u[0] + TRUTH[1])]) for u in inputs]
+    pairs = zip(inputs, outputs, strict=True)
+    records = [dataclasses.replace(few, inputs=u, outputs=y) for u, y in pairs]
+    np.testing.assert_allclose(list(identify(records, Ramp).params.values()), TRUTH, rtol=1e-6)
+
+
 def test_an_interval_does_not_leave_a_uniform_prior():
     free = identify(noisy(), Ramp)
     (low, high), center = free.ci95("b"), free.params.b

@@ -196,7 +196,8 @@ def identify(
     known = initial_state == "known" or (
         initial_state == "auto" and all(starts_at(record, plant) for record in records)
     )
-    require_enough(plant, records, int(np.sum(~known_parameters(plant, estimator))), known)
+    num_free, num_priors = int(np.sum(~known_parameters(plant, estimator))), _priors(estimator)
+    require_enough(plant, records, num_free, known, num_priors)
     way = way_to_state(validate_state)
     shares = [state_from(record, plant, way) for record in validation]
     for record in validation:
@@ -214,7 +215,7 @@ def identify(
     fitted = fitted_all(plant, records, experiments, fit.estimate, residual)
     is_normal = isinstance(estimator, NLS) and estimator.likelihood == "normal"
     if is_normal and not fit.has_ended_in(Status.NOT_FINITE):
-        _require_explanation(records, residual, int(fit.free.sum()))
+        _require_explanation(records, residual, int(fit.free.sum()) - num_priors)
     whiteness = {
         name: whiteness_of([finite(r[:, i]) for r in residual], plant.definition.outputs[i].scale)
         for i, name in enumerate(names_of(plant.definition.outputs))
@@ -374,6 +375,16 @@ def _uncertain(
             raise ValueError(f"standard deviation of {name!r} must be above 0: got {spread}")
         sd[name] = number
     return np.array(list(sd.values()), float)
+
+
+def _priors(estimator: AbstractEstimator) -> int:
+    """How many free parameters have a normal prior that counts as a measured value.
+
+    None where the noise is found from the residual: a residual of priors alone would be zero.
+    """
+    if not isinstance(estimator, NLS) or estimator.prior is None or estimator.noise != "known":
+        return 0
+    return len({*estimator.prior.names} - {*estimator.known})
 
 
 def _open_sides(
@@ -590,11 +601,15 @@ def _agreement(fit: Fit) -> tuple[str, ...]:
 def _require_explanation(
     records: Sequence[Record], residual: Sequence[np.ndarray], unknowns: int
 ) -> None:
-    """Raises ValueError where the best simulation fits the outputs no better than chance."""
+    """Raises ValueError where the best simulation fits the outputs no better than chance.
+
+    What has no more values than unknowns cannot be tested.
+    """
     chances = [
         chance_of_fit(finite(record.outputs[:, i]), finite(r[:, i]), unknowns)
         for record, r in zip(records, residual, strict=True)
         for i in range(r.shape[1])
+        if np.isfinite(r[:, i]).sum() > unknowns > 0
     ]
-    if min(chances) > _BY_CHANCE:
+    if min(chances, default=0.0) > _BY_CHANCE:
         raise ValueError(NOTHING_SEEN)
