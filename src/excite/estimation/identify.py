@@ -38,7 +38,9 @@ from .diagnosis import (
     effect_of_constants,
     half_95,
     input_dependence,
+    is_more_than_rounding,
     robust_covariance,
+    whiteness_of,
     widened,
     with_independent,
 )
@@ -47,10 +49,8 @@ from .fit import (
     Fit,
     Progress,
     fit_of,
-    is_more_than_rounding,
     is_noise,
     known_parameters,
-    whiteness_of,
     with_initial_state,
 )
 from .from_records import (
