@@ -145,9 +145,11 @@ def require_density_of_slope(plant, record: Record, prior: str, slope: np.ndarra
     """The samples of a slope with a prior have the density on an even grid of slopes."""
     options = {"hold": {"a": 0.0}, "prior": {"b": prior}, "initial_state": "known"}
     result = ex.identify(record, plant, NLS(noise="known"), **options)
-    drawn = result.posterior(num_samples=600)["posterior"].dataset["b"]
+    samples = result.posterior(num_samples=600)
+    assert samples.attrs["plant_hash"] == result.plant.hash
     sd = plant.definition.outputs[0].noise_sd
     misfit = (record.outputs[:, 0] - slope[:, None] * reached(record)) / sd
+    drawn = samples["posterior"].dataset["b"]
     require_quantiles(drawn, quantiles(slope, log_prior - np.sum(misfit**2, axis=1) / 2))
 
 
