@@ -157,7 +157,7 @@ def test_defaults_that_follow_from_other_fields():
     (lambda: Parameter("k", "", 1.0, scale=-1.0), "scale of parameter 'k' must be positive"),
     (lambda: Parameter("k", "", -1.0), "parameter 'k' is positive, its nominal value -1.0 is not"),
     (lambda: Parameter("k", "", 1.0, lower=1.0), "inside its bounds: got 1.0 for 1.0 to inf"),
-    (lambda: Parameter("k", "", 3.0, upper=2.0), "inside its bounds: got 3.0 for -inf to 2.0"),
+    (lambda: Parameter("k", "", 3.0, upper=2.0), "inside its bounds: got 3.0 for 0.0 to 2.0"),
     (lambda: Input("u", "V", -1.0, 1.0, 10**400), "amplitude of 'u' is inf; a finite number"),
     (lambda: Parameter("k", "", 1.0, lower=-1.0), "lower bound of the positive parameter 'k'"),
 ])  # fmt: skip

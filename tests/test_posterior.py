@@ -141,38 +141,28 @@ def test_a_linear_plant_has_students_t():
     assert not result.posterior(seed=1)["posterior"].dataset.equals(posterior)
 
 
+def require_density_of_slope(plant, record: Record, prior: str, slope: np.ndarray, log_prior):
+    """The samples of a slope with a prior have the density on an even grid of slopes."""
+    options = {"hold": {"a": 0.0}, "prior": {"b": prior}, "initial_state": "known"}
+    result = ex.identify(record, plant, NLS(noise="known"), **options)
+    samples = result.posterior(num_samples=600)
+    assert samples.attrs["plant_hash"] == result.plant.hash
+    sd = plant.definition.outputs[0].noise_sd
+    misfit = (record.outputs[:, 0] - slope[:, None] * reached(record)) / sd
+    drawn = samples["posterior"].dataset["b"]
+    require_quantiles(drawn, quantiles(slope, log_prior - np.sum(misfit**2, axis=1) / 2))
+
+
 def test_a_normal_prior_counts_in_the_unit_of_the_parameter():
     """Of a positive parameter, too, which is searched by its logarithm."""
-    record = line(1.3)
-    result = ex.identify(
-        record,
-        Bounded,
-        NLS(noise="known"),
-        hold={"a": 0.0},
-        prior={"b": "normal:1.2:0.05"},
-        initial_state="known",
-    )
-    drawn = result.posterior(num_samples=600)["posterior"].dataset["b"]
     slope = np.linspace(1.0, 1.35, 4001)
-    misfit = (record.outputs[:, 0] - slope[:, None] * reached(record)) / 0.05
-    density = -np.sum(misfit**2, axis=1) / 2 - ((slope - 1.2) / 0.05) ** 2 / 2
-    require_quantiles(drawn, quantiles(slope, density))
+    log_prior = -(((slope - 1.2) / 0.05) ** 2) / 2
+    require_density_of_slope(Bounded, line(1.3), "normal:1.2:0.05", slope, log_prior)
 
 
 def test_a_uniform_prior_is_one_of_the_parameter():
-    record = line(0.7)
-    result = ex.identify(
-        record,
-        Loud,
-        NLS(noise="known"),
-        hold={"a": 0.0},
-        prior={"b": "uniform:0.2:1.2"},
-        initial_state="known",
-    )
-    drawn = result.posterior(num_samples=600)["posterior"].dataset["b"]
     slope = np.linspace(0.2, 1.2, 4001)
-    misfit = (record.outputs[:, 0] - slope[:, None] * reached(record)) / 0.5
-    require_quantiles(drawn, quantiles(slope, -np.sum(misfit**2, axis=1) / 2))
+    require_density_of_slope(Loud, line(0.7), "uniform:0.2:1.2", slope, 0.0)
 
 
 def test_initial_states_are_drawn_too():

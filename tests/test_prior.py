@@ -154,6 +154,45 @@ def test_a_uniform_prior_bounds_the_estimate():
     assert any("b ended at its bound 0.25" in sentence for sentence in found.verdict)
     wide, free = identify(noisy(), Ramp, prior={"b": "uniform:-5:5"}), identify(noisy(), Ramp)
     assert wide.params.b == pytest.approx(free.params.b, rel=1e-5)
+    assert found.plant == wide.plant == free.plant
+
+
+def test_with_known_noise_a_normal_prior_counts_as_a_value():
+    few, known = record_cut(noisy(), 2), NLS(noise="known")
+    prior = {"a": "normal:0.9:0.05", "b": "normal:0.25:0.1"}
+    found = identify(few, Ramp, known, prior=prior)
+    precision = COLUMNS[:2].T @ COLUMNS[:2] / SD**2 + np.diag([0.05**-2, 0.1**-2])
+    told = COLUMNS[:2].T @ few.outputs[:, 0] / SD**2 + np.array([0.9 / 0.05**2, 0.25 / 0.1**2])
+    expected = np.linalg.solve(precision, told)
+    np.testing.assert_allclose(list(found.params.values()), expected, rtol=1e-6)
+    np.testing.assert_allclose(found.covariance, np.linalg.inv(precision), rtol=1e-6)
+    for estimator, own in ((known, {"b": "uniform:0:1"}), ("nls", prior)):
+        with pytest.raises(ValueError, match=r"2 measured values for 2 unknowns .*noise='known'"):
+            identify(few, Ramp, estimator, prior=own)
+    one = dataclasses.replace(few, outputs=np.array([[np.nan], [np.nan]]))
+    with pytest.raises(ValueError, match="0 measured values and 2 priors for 2 unknowns"):
+        identify(one, Ramp, known, prior=prior)
+
+
+def test_records_of_two_samples_are_enough_together():
+    """One alone has as many values as there are parameters, and would be fitted by chance."""
+    few = record_cut(record_with(0 * TIME), 2)
+    inputs = [np.full((2, 1), value) for value in (1.0, -1.0, 0.5)]
+    outputs = [np.array([[0.0], 0.1 * (TRUTH[0] * u[0] + TRUTH[1])]) for u in inputs]
+    pairs = zip(inputs, outputs, strict=True)
+    records = [dataclasses.replace(few, inputs=u, outputs=y) for u, y in pairs]
+    np.testing.assert_allclose(list(identify(records, Ramp).params.values()), TRUTH, rtol=1e-6)
+
+
+def test_an_interval_does_not_leave_a_uniform_prior():
+    free = identify(noisy(), Ramp)
+    (low, high), center = free.ci95("b"), free.params.b
+    bound = (center + high) / 2
+    found = identify(noisy(), Ramp, prior={"b": f"uniform:-1:{bound!r}"})
+    assert found.held == ()
+    np.testing.assert_allclose(found.ci95("b"), (low, bound), rtol=1e-4)
+    np.testing.assert_allclose(found.ci95("a"), free.ci95("a"), rtol=1e-4)
+    assert found.std_error.b == pytest.approx(free.std_error.b, rel=1e-3)
 
 
 def test_the_profile_of_a_linear_plant_with_a_prior_is_its_interval():
@@ -354,6 +393,24 @@ def test_samples_that_the_initial_state_is_estimated_from_do_not_count():
 def test_a_share_that_leaves_nothing_to_compare_is_refused():
     with pytest.raises(ValueError, match="too little is left to compare; give a smaller share"):
         identify(noisy(), Ramp, validate=shifted(0.0), validate_state="99%")
+
+
+def test_a_record_too_short_for_a_share_reports_the_fit_of_all_of_it():
+    few = record_cut(shifted(2.0), 3)
+    few.outputs[0] = np.nan  # so that nothing but the rest tells the initial state
+    found = identify(noisy(), Ramp, validate=few).validation[0]
+    assert found.initial_state == "initial state estimated from the whole record"
+    assert np.nanmean(few.outputs - found.simulated) == pytest.approx(0.0, abs=1e-6)
+
+
+def record_cut(record: Record, count: int) -> Record:
+    """The first samples."""
+    return dataclasses.replace(
+        record,
+        time=record.time[:count],
+        inputs=record.inputs[:count],
+        outputs=record.outputs[:count].copy(),
+    )
 
 
 @pytest.mark.parametrize("state", ["0", "101%", "nan", "middle", 0.0, True])

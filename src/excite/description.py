@@ -210,8 +210,7 @@ class Parameter(_Named):
             not self.positive or self.nominal > 0,
             f"parameter {self.name!r} is positive, its nominal value {self.nominal} is not",
         )
-        lower = -math.inf if self.lower is None else self.lower
-        upper = math.inf if self.upper is None else self.upper
+        lower, upper = self.support
         _require(
             lower < self.nominal < upper,
             f"nominal value of parameter {self.name!r} must lie inside its bounds: "
@@ -220,6 +219,15 @@ class Parameter(_Named):
         _require(
             not self.positive or self.lower is None or self.lower > 0,
             f"lower bound of the positive parameter {self.name!r} must be positive",
+        )
+
+    @property
+    def support(self) -> tuple[float, float]:
+        """The values between these two are allowed; an end may be infinite."""
+        least = 0.0 if self.positive else -math.inf
+        return (
+            least if self.lower is None else self.lower,
+            math.inf if self.upper is None else self.upper,
         )
 
 
@@ -351,6 +359,10 @@ class PlantDescription:
         named = [f"{p.name} = {p.nominal:g} {p.unit}".rstrip() for p in self.parameters[:12]]
         rest = f", and {len(self.parameters) - 12} more" if len(self.parameters) > 12 else ""
         return "\n".join([*lines, f"  parameters {', '.join(named)}{rest}"])
+
+    def parameter(self, name: str) -> Parameter:
+        """One of the parameters, by name."""
+        return next(p for p in self.parameters if p.name == name)
 
     @property
     def columns(self) -> tuple[str, ...]:

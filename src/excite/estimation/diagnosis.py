@@ -54,6 +54,16 @@ def ljung_box(*residuals: Float[np.ndarray, " _sample"], num_lags: int = 25) -> 
     return chi2_tail(degrees, statistic) if degrees else math.nan
 
 
+def whiteness_of(residuals: list[np.ndarray], scale: float) -> float:
+    """p-value of white residuals; NaN where only rounding errors are left."""
+    return ljung_box(*(r for r in residuals if is_more_than_rounding(r, scale)))
+
+
+def is_more_than_rounding(residual: np.ndarray, scale: float) -> bool:
+    """Whether a residual is more than rounding errors of values of this size."""
+    return bool(np.any(np.abs(residual) > 1e-8 * scale))
+
+
 def input_dependence(
     residuals: Sequence[Float[np.ndarray, " _sample"]],
     inputs: Sequence[Float[np.ndarray, "_sample input"]],

@@ -23,7 +23,7 @@ from .contract import (
     quality,
     to_search,
 )
-from .diagnosis import ljung_box
+from .diagnosis import whiteness_of
 from .held import structure_of
 from .nls import NLS
 from .pem import PEM
@@ -124,12 +124,12 @@ def _fit_seen(
         free = free & (np.arange(len(names)) != chosen)
         reasons = (*reasons, why)
         if not free.any():
-            found = structure_of(plant, experiments, start, known)
-            groups = found.not_identifiable if found else ()
-            why = [f"{STRUCTURALLY_NOT}: {group.sentence}" for group in groups]
             if bound_reached(plant.definition, start) is not None:
                 raise ValueError(f"no parameter is left to estimate: {'; '.join(reasons)}")
-            raise ValueError("; ".join([*why, NOTHING_SEEN]))
+            tested = structure_of(plant, experiments, start, known)
+            groups = tested.not_identifiable if tested else ()
+            lost = [f"{STRUCTURALLY_NOT}: {group.sentence}" for group in groups]
+            raise ValueError("; ".join([*lost, NOTHING_SEEN]))
         found = _estimate(plant, experiments, estimator, start, free, progress, [last])
 
 
@@ -232,13 +232,3 @@ def with_initial_state(
     search = NLS(likelihood=estimator.likelihood) if is_nls else NLS()
     held = jax.device_put(np.zeros(len(params), bool))
     return jax.device_get(search(plant, experiments, jax.device_put(params), held))
-
-
-def whiteness_of(residuals: list[np.ndarray], scale: float) -> float:
-    """p-value of white residuals; NaN where only rounding errors are left."""
-    return ljung_box(*(r for r in residuals if is_more_than_rounding(r, scale)))
-
-
-def is_more_than_rounding(residual: np.ndarray, scale: float) -> bool:
-    """Whether a residual is more than rounding errors of values of this size."""
-    return bool(np.any(np.abs(residual) > 1e-8 * scale))

@@ -68,19 +68,25 @@ def require_complete(
 
 
 def require_enough(
-    plant: AbstractPlant, records: Sequence[Record], num_params: int, knows_state: bool
+    plant: AbstractPlant,
+    records: Sequence[Record],
+    num_params: int,
+    knows_state: bool,
+    num_priors: int = 0,
 ) -> None:
-    """Raises ValueError where there are not more measured values than unknowns."""
+    """Raises ValueError where there are not more measured values, and priors, than unknowns."""
     where = " and ".join(record.source or "the record" for record in records)
     if any(len(record.time) < 2 for record in records):
         raise ValueError(f"{where}: a record needs at least two samples")
     values = sum(int(np.isfinite(record.outputs).sum()) for record in records)
     parts = sum(len(parts_of(record)) for record in records)
     states = 0 if knows_state and parts == len(records) else parts * len(plant.definition.states)
-    if values <= num_params + states:
+    if values + num_priors <= num_params + states:
+        known = f"{values} measured values" + f" and {num_priors} priors" * bool(num_priors)
         raise ValueError(
-            f"{where}: {values} measured values for {num_params + states} unknowns ({num_params} "
-            f"parameters, {states} initial states); more values than unknowns are needed"
+            f"{where}: {known} for {num_params + states} unknowns ({num_params} parameters, "
+            f"{states} initial states); more values than unknowns are needed (with "
+            "NLS(noise='known') a normal prior of a parameter counts as a value)"
         )
 
 

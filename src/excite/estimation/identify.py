@@ -38,7 +38,9 @@ from .diagnosis import (
     effect_of_constants,
     half_95,
     input_dependence,
+    is_more_than_rounding,
     robust_covariance,
+    whiteness_of,
     widened,
     with_independent,
 )
@@ -47,10 +49,8 @@ from .fit import (
     Fit,
     Progress,
     fit_of,
-    is_more_than_rounding,
     is_noise,
     known_parameters,
-    whiteness_of,
     with_initial_state,
 )
 from .from_records import (
@@ -67,11 +67,12 @@ from .from_records import (
 )
 from .held import told_of_held
 from .nls import NLS, Likelihood
+from .prior import unbounded, within_support
 from .prior_knowledge import PriorLike, with_prior
 from .profile import profile_intervals
 from .remedies import Suspect, outliers, suspects
 from .result import Identification, Noise
-from .validation import fitted_all, require_state_word, state_from, validated
+from .validation import fitted_all, state_from, validated, way_to_state
 
 InitialState = Literal["auto", "free", "known"]
 Intervals = Literal["linear", "profile"]
@@ -195,9 +196,10 @@ def identify(
     known = initial_state == "known" or (
         initial_state == "auto" and all(starts_at(record, plant) for record in records)
     )
-    require_enough(plant, records, int(np.sum(~known_parameters(plant, estimator))), known)
-    require_state_word(validate_state)
-    shares = [state_from(record, plant, validate_state) for record in validation]
+    num_free, num_priors = int(np.sum(~known_parameters(plant, estimator))), _priors(estimator)
+    require_enough(plant, records, num_free, known, num_priors)
+    way = way_to_state(validate_state)
+    shares = [state_from(record, plant, way) for record in validation]
     for record in validation:
         require_enough(plant, [record], 0, False)
     require_short_delays(plant, begin, records)
@@ -213,7 +215,7 @@ def identify(
     fitted = fitted_all(plant, records, experiments, fit.estimate, residual)
     is_normal = isinstance(estimator, NLS) and estimator.likelihood == "normal"
     if is_normal and not fit.has_ended_in(Status.NOT_FINITE):
-        _require_explanation(records, residual, int(fit.free.sum()))
+        _require_explanation(records, residual, int(fit.free.sum()) - num_priors)
     whiteness = {
         name: whiteness_of([finite(r[:, i]) for r in residual], plant.definition.outputs[i].scale)
         for i, name in enumerate(names_of(plant.definition.outputs))
@@ -230,11 +232,12 @@ def identify(
     found = _suspects(plant, records, experiments, estimator, begin, fit, linear, progress)
     large = _above_declared(plant, fit) if fit.is_successful else ()
     verdict = (*others, *wrong, *large, *_remedies(found), *_agreement(fit), *verdict)
-    names, d = names_of(plant.definition.parameters), plant.description
+    names = names_of(plant.definition.parameters)
     values = np.array([float(value) for value in fit.estimate.params])
     sd = np.where(fit.free, np.sqrt(np.maximum(np.diag(covariance), 0.0)), np.nan)
     half = np.where(fit.free, half_95(covariance, degrees), np.nan)
-    ends, profiles = np.stack([values - half, values + half], axis=1), {}
+    ends = within_support(plant, np.stack([values - half, values + half], axis=1))
+    profiles = {}
     if intervals == "profile" and isinstance(estimator, NLS) and fit.is_successful:
         estimate = jax.device_put(fit.estimate)
         ends, profiles = profile_intervals(
@@ -248,7 +251,7 @@ def identify(
         )
         verdict = (*verdict, *_open_sides(plant.definition, ends))
     return Identification(
-        plant=d,
+        plant=unbounded(plant).description,
         estimator=estimator.name,
         status=fit.status,
         params=Named(zip(names, values.tolist(), strict=True)),
@@ -372,6 +375,16 @@ def _uncertain(
             raise ValueError(f"standard deviation of {name!r} must be above 0: got {spread}")
         sd[name] = number
     return np.array(list(sd.values()), float)
+
+
+def _priors(estimator: AbstractEstimator) -> int:
+    """How many free parameters have a normal prior that counts as a measured value.
+
+    None where the noise is found from the residual: a residual of priors alone would be zero.
+    """
+    if not isinstance(estimator, NLS) or estimator.prior is None or estimator.noise != "known":
+        return 0
+    return len({*estimator.prior.names} - {*estimator.known})
 
 
 def _open_sides(
@@ -588,11 +601,15 @@ def _agreement(fit: Fit) -> tuple[str, ...]:
 def _require_explanation(
     records: Sequence[Record], residual: Sequence[np.ndarray], unknowns: int
 ) -> None:
-    """Raises ValueError where the best simulation fits the outputs no better than chance."""
+    """Raises ValueError where the best simulation fits the outputs no better than chance.
+
+    What has no more values than unknowns cannot be tested.
+    """
     chances = [
         chance_of_fit(finite(record.outputs[:, i]), finite(r[:, i]), unknowns)
         for record, r in zip(records, residual, strict=True)
         for i in range(r.shape[1])
+        if np.isfinite(r[:, i]).sum() > unknowns > 0
     ]
-    if min(chances) > _BY_CHANCE:
+    if min(chances, default=0.0) > _BY_CHANCE:
         raise ValueError(NOTHING_SEEN)

@@ -40,7 +40,7 @@ from ..description import names_of
 from ..information import relative_size
 from .contract import Basis, residual_of, simulate_experiments, to_search
 from .nls import FAR, NLS, Problem
-from .prior import uniform_names
+from .prior import unbounded, uniform_names
 
 if TYPE_CHECKING:
     from xarray import DataTree
@@ -420,7 +420,7 @@ def _as_tree(
         "creation_library": "excite",
         "creation_library_version": __version__,
         "plant": d.name,
-        "plant_hash": basis.plant.description.hash,
+        "plant_hash": unbounded(basis.plant).description.hash,
         "coloured": " and ".join(coloured),
     }
     return tree

@@ -78,13 +78,9 @@ class Prior(eqx.Module):
 
     @classmethod
     def joined(cls, priors: Sequence[Prior]) -> Prior:
-        """Independent priors as one; ValueError where a parameter has two."""
-        names = tuple(name for prior in priors for name in prior.names)
-        for name in names:
-            if names.count(name) > 1:
-                raise ValueError(f"parameter {name!r} has two priors; give one")
+        """Independent priors of different parameters as one."""
         return cls(
-            names,
+            tuple(name for prior in priors for name in prior.names),
             tuple(kind for prior in priors for kind in prior.logarithmic),
             jax.device_put(np.concatenate([prior.mean for prior in priors])),
             jax.scipy.linalg.block_diag(*[prior.root for prior in priors]),
@@ -130,35 +126,21 @@ class Prior(eqx.Module):
         return tuple(told)
 
 
-def parameter_of(plant: AbstractPlant, name: str) -> Parameter:
-    """A plant's parameter by name."""
-    return next(p for p in plant.definition.parameters if p.name == name)
-
-
 def bounded(
-    plant: AbstractPlant, bounds: Mapping[str, tuple[float, float]], start: Params
+    plant: AbstractPlant, bounds: Sequence[tuple[str, float, float]], start: Params
 ) -> AbstractPlant:
     """The plant with bounds of parameters; ValueError where they exclude the start."""
     if not bounds:
         return plant
-    for name, (lower, upper) in bounds.items():
-        part, value = parameter_of(plant, name), float(getattr(start, name))
+    for name, lower, upper in bounds:
+        part, value = plant.definition.parameter(name), float(getattr(start, name))
         if not lower < value < upper:
             raise ValueError(
                 f"the search begins at {name} = {value:g} {part.unit}, outside its uniform prior "
                 f"{lower:g} to {upper:g}; give a start inside it ({name}={(lower + upper) / 2:g})"
             )
-    limits = tuple((name, *pair) for name, pair in bounds.items())
-    begin = tuple(float(getattr(start, name)) for name in bounds)
-    narrow = _narrowed(type(plant), limits, begin)
-    bounded = narrow(
-        sensor=plant.sensor,
-        initial_state=plant.initial_state,
-        dt=plant.dt,
-        **plant.constants._asdict(),
-    )
-    object.__setattr__(bounded, "substeps", plant.substeps)
-    return bounded
+    begin = tuple(float(getattr(start, name)) for name, *_ in bounds)
+    return plant.as_class(_narrowed(type(plant), tuple(bounds), begin))
 
 
 @cache
@@ -174,21 +156,28 @@ def _narrowed(
     def within(part: Parameter) -> Parameter:
         if part.name not in by_name:
             return part
-        lower, upper = by_name[part.name]
-        lowest = [x for x in (lower, part.lower) if x is not None and (x > 0 or not part.positive)]
-        highest = [x for x in (upper, part.upper) if x is not None]
-        usual = part.nominal if lower < part.nominal < upper else nominal[part.name]
-        return dataclasses.replace(
-            part,
-            lower=max(lowest, default=None),
-            upper=min(highest),
-            nominal=usual,
-            scale=part.scale,
-        )
+        (low, high), (least, most) = by_name[part.name], part.support
+        lower = None if part.positive and max(low, least) == 0 else max(low, least)
+        usual = part.nominal if low < part.nominal < high else nominal[part.name]
+        return dataclasses.replace(part, lower=lower, upper=min(high, most), nominal=usual)
 
     narrow = dataclasses.replace(d, parameters=tuple(map(within, d.parameters)))
-    own = {"definition": narrow, "uniform": tuple(by_name), "__module__": kind.__module__}
-    return type(kind.__name__, (kind,), own)
+    own = {"definition": narrow, "uniform": tuple(by_name), "unbounded": kind}
+    return type(kind.__name__, (kind,), {**own, "__module__": kind.__module__})
+
+
+def unbounded(plant: AbstractPlant) -> AbstractPlant:
+    """The plant without the bounds of uniform priors."""
+    return plant.as_class(getattr(plant, "unbounded", type(plant)))
+
+
+def within_support(
+    plant: AbstractPlant, ends: Float[np.ndarray, "param end"]
+) -> Float[np.ndarray, "param end"]:
+    """Ends of intervals, not beyond a uniform prior."""
+    names, parts = uniform_names(plant), plant.definition.parameters
+    allowed = np.array([p.support if p.name in names else (-np.inf, np.inf) for p in parts])
+    return np.clip(ends, allowed[:, :1], allowed[:, 1:])
 
 
 def uniform_names(plant: AbstractPlant) -> tuple[str, ...]:

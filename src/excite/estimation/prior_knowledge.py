@@ -13,7 +13,7 @@ from ..description import names_of, unknown, wrong_type
 from ..files import read_json
 from ..plant import AbstractPlant, Params, floats
 from ..report.rows import EstimateSummary
-from .prior import Prior, bounded, parameter_of
+from .prior import Prior, bounded
 from .result import Identification
 
 _FORMS = "normal:MEAN:SD, lognormal:MEDIAN:SD or uniform:LOWEST:HIGHEST"
@@ -50,7 +50,7 @@ def with_prior(
     if not is_one and not isinstance(given, Sequence):
         raise wrong_type("prior", given, _ALLOWED)
     normal: list[Prior] = []
-    bounds: dict[str, tuple[float, float]] = {}
+    bounds: list[tuple[str, float, float]] = []
     for one in [given] if is_one else given:
         if isinstance(one, Mapping):
             for name, text in one.items():
@@ -58,9 +58,7 @@ def with_prior(
                 if name in _names(hold):
                     raise ValueError(f"{name!r} is held and needs no prior; give one of the two")
                 if kind == "uniform":
-                    if name in bounds:
-                        raise ValueError(f"parameter {name!r} has two priors; give one")
-                    bounds[name] = a, b
+                    bounds.append((name, a, b))
                 else:
                     is_log = kind == "lognormal"
                     mean = math.log(a) if is_log else a
@@ -74,16 +72,15 @@ def with_prior(
             normal.append(one)
         else:
             raise wrong_type("prior", one, _ALLOWED)
-    joint = Prior.joined(normal) if normal else None
-    for name in joint.names if joint else ():
-        if name in bounds:
+    named = [*(name for name, *_ in bounds), *(name for one in normal for name in one.names)]
+    for name in named:
+        if named.count(name) > 1:
             raise ValueError(f"parameter {name!r} has two priors; give one")
+    joint = Prior.joined(normal) if normal else None
     chosen = {*_names(start), *_names(hold)}
     for name, mean in joint.center().items() if joint else ():
-        part = parameter_of(plant, name)
-        lower = 0.0 if part.positive and part.lower is None else part.lower
-        is_inside = (lower is None or mean > lower) and (part.upper is None or mean < part.upper)
-        if name not in chosen and is_inside:
+        lower, upper = plant.definition.parameter(name).support
+        if name not in chosen and lower < mean < upper:
             begin = begin._replace(**{name: floats(mean)})
     return bounded(plant, bounds, begin), joint, begin
 
@@ -118,7 +115,7 @@ def _parsed(name: str, text: object, plant: AbstractPlant) -> tuple[str, float, 
     is_allowed = first > 0 if kind == "lognormal" else not (is_part and kind == "uniform")
     if not (math.isfinite(first) and math.isfinite(second) and is_ordered and is_allowed):
         raise wrong
-    if kind == "lognormal" and not parameter_of(plant, name).positive:
+    if kind == "lognormal" and not plant.definition.parameter(name).positive:
         raise ValueError(f"{name!r} may be negative and has no lognormal prior; give a normal one")
     return kind, first, second
 
@@ -145,7 +142,7 @@ def _from_run(plant: AbstractPlant, result: EstimateSummary, where: str) -> Prio
         raise ValueError(f"{where} has no estimated parameter of plant {plant.definition.name!r}")
     names = [list(result.params)[i] for i in index]
     values = np.array([result.params[name].estimate for name in names])
-    is_log = [parameter_of(plant, name).positive for name in names]
+    is_log = [plant.definition.parameter(name).positive for name in names]
     if np.any(values[is_log] <= 0):
         raise ValueError(f"{where} has a parameter below 0 that is positive in this plant")
     size = np.where(is_log, values, 1.0)

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..description import RARE, Parameter, names_of
+from ..description import RARE, names_of
 from ..plant import AbstractPlant, Params
 from ..plant.extension import extended, extensions_of
 from .contract import (
@@ -170,7 +170,7 @@ def suspects(
         value, std_error, after = search.best(trial)
         remedy, freedoms = f"--plant {plant_word}+{trial.name}", 1 + trial.name.startswith("drift_")
         named = suspect(trial.name, after, remedy, freedoms)
-        unit = _parameter(whole, trial.name).unit
+        unit = whole.definition.parameter(trial.name).unit
         found.append(dataclasses.replace(named, value=value, std_error=std_error, unit=unit))
     likely = [s for s in found if s.log_likelihood > 0 and s.p_value * tests <= RARE]
     return tuple(sorted(likely, key=lambda s: -s.evidence(int(valid.sum()))))
@@ -243,7 +243,7 @@ class _Search:
             moved[..., self.states] = points[:, num_free:-1].reshape(count, len(self.valid), -1)
         for lane, name in enumerate(names):
             if name:
-                scale = _parameter(self.whole, name).scale
+                scale = self.whole.definition.parameter(name).scale
                 added[lane, fields.index(name)] = points[lane, -1] * scale
         found = []
         for first in range(0, count, _LANES):
@@ -274,13 +274,13 @@ class _Search:
         """The few trials that explain most if everything were linear, one for each suspect."""
         before, S = self.slopes(np.append(self.begin, 0.0), "")
         basis, _ = np.linalg.qr(S[:, :-1])
-        scale = [_parameter(self.whole, trial.name).scale for trial in trials]
+        scale = [self.whole.definition.parameter(trial.name).scale for trial in trials]
         points = [np.append(self.begin, t.value / s) for t, s in zip(trials, scale, strict=True)]
         changed = self.misfits(np.stack(points), [trial.name for trial in trials])
         best: dict[str, tuple[float, _Trial]] = {}
         for trial, change in zip(trials, changed - before, strict=True):
             change = change - basis @ (basis.T @ change)
-            parameter = _parameter(self.whole, trial.name)
+            parameter = self.whole.definition.parameter(trial.name)
             factor = -float(change @ before) / max(float(change @ change), 1e-300)
             factor = factor if parameter.lower is None else max(factor, 0.0)
             explained = factor**2 * float(change @ change)
@@ -301,7 +301,7 @@ class _Search:
 
     def fitted(self, trial: _Trial, own: np.ndarray) -> tuple[float, float, Residual]:
         """As `best`, from one point."""
-        parameter = _parameter(self.whole, trial.name)
+        parameter = self.whole.definition.parameter(trial.name)
         begin = np.append(own, trial.value / parameter.scale)
         lower = np.full(len(begin), -np.inf)
         lower[-1] = -np.inf if parameter.lower is None else 0.0
@@ -353,14 +353,10 @@ def _require_least_squares() -> Callable[..., OptimizeResult]:
     return least_squares
 
 
-def _parameter(whole: AbstractPlant, name: str) -> Parameter:
-    return next(p for p in whole.definition.parameters if p.name == name)
-
-
 def _tried(whole: AbstractPlant, name: str, inputs: Array) -> list[float]:
     """Values of a suspect's parameter that are tried."""
     kind = next(k for k in _TRIED if name.startswith(f"{k}_"))
-    parameter, names = _parameter(whole, name), names_of(whole.definition.inputs)
+    parameter, names = whole.definition.parameter(name), names_of(whole.definition.inputs)
     size = parameter.nominal or 0.1 * parameter.scale
     if kind in ("delay", "lag"):
         size = float(whole.dt)

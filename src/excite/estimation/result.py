@@ -100,7 +100,7 @@ class Identification:
         True
 
     Attributes:
-        plant: the plant as it was fitted, sampled as the records are.
+        plant: the plant, sampled as the records are.
         estimator: its name on the command line.
         status: in a few words; docs/reference/machine-readable.md lists them.
         params, std_error: by parameter, in its unit, as attribute or item; the error of a held
@@ -158,7 +158,8 @@ class Identification:
         """95 % interval of a parameter: estimate ± t standard errors, or by profile likelihood.
 
         t is 1.96 where the noise is known; where its size is estimated from the residual, it is
-        that of Student's distribution. An end where a profile stays open is infinite.
+        that of Student's distribution. No interval leaves a uniform prior. An end where a profile
+        stays open is infinite.
         """
         return self.intervals[name]
 

@@ -105,33 +105,32 @@ def _inside(record: Record, predicted: np.ndarray, sd: np.ndarray) -> list[float
     ]
 
 
-def state_from(record: Record, plant: AbstractPlant, word: str | float) -> float | None:
-    """Share of a held-out record that gives its initial state, 0 its first sample; None: known."""
+def state_from(record: Record, plant: AbstractPlant, way: str | float) -> float | None:
+    """Share of a held-out record that gives its initial state, 0 its first sample; None: known.
+
+    `way`: see `way_to_state`.
+    """
     where, parts = record.source or "the record", parts_of(record)
-    if word == "known" and len(parts) > 1:
+    if way == "known" and len(parts) > 1:
         raise ValueError(f"{where} has gaps in time; the state after a gap is not known")
-    if word == "known" or (word == "auto" and len(parts) == 1 and starts_at(record, plant)):
+    if way == "known" or (way == "auto" and len(parts) == 1 and starts_at(record, plant)):
         return None
     is_measured = all(np.isfinite(record.outputs[part.start]).all() for part in parts)
-    if word in ("first", "auto") and is_measured and _outputs_give_state(plant):
+    if way in ("first", "auto") and is_measured and _outputs_give_state(plant):
         return 0.0
-    if word == "first":
+    if way == "first":
         raise ValueError(
             f"the first outputs of {where} do not determine the state of plant "
             f"{plant.definition.name!r}; give the share of the record from which it is estimated, "
             "such as 10%"
         )
-    return 1.0 if word == "auto" else _share_of(word)
+    return way if isinstance(way, float) else 1.0
 
 
-def require_state_word(word: str | float) -> None:
-    """Raises ValueError where a word is no way to an initial state."""
-    if word not in ("auto", "known", "first"):
-        _share_of(word)
-
-
-def _share_of(word: str | float) -> float:
-    """A share of a record, given as a number or in percent."""
+def way_to_state(word: str | float) -> str | float:
+    """How the initial state is found: a word, or a share given as a number or in percent."""
+    if word in ("auto", "known", "first"):
+        return word
     try:
         is_part = isinstance(word, str) and word.endswith("%")
         share = float(str(word).removesuffix("%")) * (0.01 if is_part else 1.0)
@@ -165,9 +164,34 @@ def validated(
     if isinstance(estimator, PEM) and estimate.prediction is not None:
         found = jax.device_put((estimate.params, estimate.prediction))
         prediction = jax.device_get(estimator.predict(plant, experiments, *found))
-    begun, valid = experiments, np.asarray(experiments.valid)
-    used = np.zeros(valid.shape, bool)
+    residual, fits = _begun(plant, record, experiments, estimator, estimate, share)
+    if fits is None:
+        raise ValueError(
+            f"{record.source or 'the record'}: with {100 * (share or 0.0):.4g} % for the initial "
+            "state too little is left to compare; give a smaller share"
+        )
+    words = _in_words(share)
+    if share == 1:
+        _, rest = _begun(plant, record, experiments, estimator, estimate, _SHARE)
+        if rest is not None:
+            percent = " and ".join(f"{fit:.4g} %" for fit in rest.values())
+            words += f" (from its first {100 * _SHARE:.0f} %, the rest fits {percent})"
+    fitted = _fitted(plant.definition, record, residual, *_predicted(plant, [record], prediction))
+    return dataclasses.replace(fitted, fit_percent=fits, initial_state=words)
+
+
+def _begun(
+    plant: AbstractPlant,
+    record: Record,
+    experiments: Experiments,
+    estimator: AbstractEstimator,
+    estimate: Estimate,
+    share: float | None,
+) -> tuple[Float[np.ndarray, "sample output"], dict[str, float] | None]:
+    """The residual of a held-out record, and its fits; None where too little is left to compare."""
+    begun, used = experiments, np.zeros(experiments.valid.shape, bool)
     if share is not None:
+        valid = np.asarray(experiments.valid)
         counts = valid.any(2).cumsum(1)
         used = valid & (counts <= np.ceil(counts[:, -1:] * share).clip(1))[..., None]
         begun = dataclasses.replace(experiments, valid=jax.device_put(used))
@@ -175,20 +199,12 @@ def validated(
         begun = dataclasses.replace(experiments, initial_state=jax.device_put(initial))
     begun = dataclasses.replace(begun, initial_state_known=True)
     (residual,) = by_record([record], _simulation_error(plant, begun, estimate.params))
-    (spent,) = by_record([record], (used if share != 1 else ~valid).astype(float))
-    fitted = _fitted(plant.definition, record, residual, *_predicted(plant, [record], prediction))
-    if share != 1 and np.any(np.sum(np.isfinite(record.outputs) & (spent == 0), axis=0) < 2):
-        raise ValueError(
-            f"{record.source or 'the record'}: with {100 * (share or 0.0):.4g} % for the initial "
-            "state too little is left to compare; give a smaller share"
-        )
-    scored = dataclasses.replace(record, outputs=np.where(spent == 0, record.outputs, np.nan))
-    fits, words = _fits(plant.definition, scored, fitted.simulated), _in_words(share)
-    if share == 1:
-        begun = validated(plant, record, linear, estimator, estimate, _SHARE).fit_percent.values()
-        percent = " and ".join(f"{fit:.4g} %" for fit in begun)
-        words += f" (from its first {100 * _SHARE:.0f} %, the rest fits {percent})"
-    return dataclasses.replace(fitted, fit_percent=fits, initial_state=words)
+    (spent,) = by_record([record], used.astype(float))
+    left = record.outputs if share == 1 else np.where(spent == 0, record.outputs, np.nan)
+    if share != 1 and np.any(np.isfinite(left).sum(axis=0) < 2):
+        return residual, None
+    scored = dataclasses.replace(record, outputs=left)
+    return residual, _fits(plant.definition, scored, record.outputs - residual)
 
 
 def _in_words(share: float | None) -> str:

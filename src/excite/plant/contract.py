@@ -18,7 +18,7 @@ import math
 from collections import namedtuple
 from collections.abc import Mapping
 from functools import cache
-from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
@@ -43,6 +43,7 @@ def require_double_precision() -> None:
         )
 
 
+_Plant = TypeVar("_Plant", bound="AbstractPlant")
 Params: TypeAlias = Any
 """The unknown parameters: a named tuple of scalars in the order of the description."""
 
@@ -218,8 +219,12 @@ class AbstractPlant(_Module):
 
         All but `dt` may be traced numbers.
         """
+        return self.as_class(type(self), **numbers)
+
+    def as_class(self, kind: type[_Plant], **numbers: Any) -> _Plant:
+        """The plant in another class with these constants: its own numbers, but those given."""
         own = {"sensor": self.sensor, "initial_state": self.initial_state}
-        plant = type(self)(**{**own, **self.constants._asdict(), **numbers})
+        plant = kind(**{**own, **self.constants._asdict(), **numbers})
         if "dt" not in numbers:
             plant = eqx.tree_at(lambda p: p.dt, plant, self.dt)
             object.__setattr__(plant, "substeps", self.substeps)
@@ -258,23 +263,19 @@ def params_from(plant: AbstractPlant, values: Mapping[str, float] | Params | Non
 
 def _allowed(plant: AbstractPlant, name: str, value: object) -> float:
     """The value of a parameter, within its bounds."""
-    parameters = {p.name: p for p in plant.definition.parameters}
-    if name not in parameters:
+    names = names_of(plant.definition.parameters)
+    if name not in names:
         raise ValueError(
-            f"plant {plant.definition.name!r} has no parameter {name!r}; "
-            f"it has {', '.join(parameters)}"
+            f"plant {plant.definition.name!r} has no parameter {name!r}; it has {', '.join(names)}"
         )
-    p, number = parameters[name], as_number(name, value)
-    lower = 0.0 if p.positive and p.lower is None else p.lower
-    if not (
-        math.isfinite(number)
-        and (lower is None or number > lower)
-        and (p.upper is None or number < p.upper)
-    ):
+    p, number = plant.definition.parameter(name), as_number(name, value)
+    lower, upper = p.support
+    if not lower < number < upper:
+        above, below = f"{lower:g}", f"{upper:g}"
         raise ValueError(
             f"{name} = {number:g} {p.unit} is not allowed; it must be finite, above "
-            f"{'minus infinity' if lower is None else format(lower, 'g')} and below "
-            f"{'infinity' if p.upper is None else format(p.upper, 'g')}"
+            f"{above.replace('-inf', 'minus infinity')} and below "
+            f"{below.replace('inf', 'infinity')}"
         )
     return number
 

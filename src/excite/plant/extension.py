@@ -96,14 +96,8 @@ def extended(plant: AbstractPlant, extensions: Sequence[str]) -> AbstractPlant:
         chosen |= {found[0]}
     whole = _class_of(kind, tuple(e for e in possible if e.name in chosen))
     num_own, start = len(kind.definition.states), whole().initial_state
-    longer = whole(
-        sensor=plant.sensor,
-        initial_state=start.at[:num_own].set(plant.initial_state[:num_own]),
-        dt=plant.dt,
-        **plant.constants._asdict(),
-    )
-    object.__setattr__(longer, "substeps", plant.substeps)
-    return longer
+    initial_state = start.at[:num_own].set(plant.initial_state[:num_own])
+    return plant.as_class(whole, initial_state=initial_state)
 
 
 class Extended(AbstractPlant):

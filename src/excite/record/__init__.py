@@ -4,6 +4,7 @@
 cells mean. Nothing here needs JAX, and to write and read excite's own CSV NumPy is enough.
 """
 
+from .formats import column_lengths as column_lengths
 from .formats import columns_in as columns_in
 from .prepare import is_even as is_even
 from .prepare import require_columns as require_columns

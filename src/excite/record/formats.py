@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from .bags import is_bag, read_bag
+from .bags import columns_of_bag, is_bag, read_bag
 from .damage import MAX_UNPACKED, damage_reported, require_size
 from .record import TEXT_ENDINGS, read_sidecar, require_matlab, require_readable
 from .text import read_text
@@ -47,6 +47,17 @@ def columns_in(
     except OSError as error:
         raise ValueError(f"{path}: cannot be read ({error.strerror})") from None
     return dict(sorted(columns.items(), key=lambda column: column[1].size == 1))  # vectors first
+
+
+def column_lengths(path: Path) -> dict[str, int]:
+    """The columns of a file by name, and how many samples each has.
+
+    Raises:
+        ValueError: one sentence for a file that cannot be read.
+    """
+    if is_bag(path):
+        return columns_of_bag(path)
+    return {name: len(values) for name, values in columns_in(path).items()}
 
 
 def _by_observable(path: Path, table: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

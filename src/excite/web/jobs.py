@@ -48,8 +48,7 @@ from ..information import (
 from ..plant import AbstractPlant
 from ..plant.catalogue import PLANTS
 from ..policy import Policy, mismatch, read_policy, shipped_policies
-from ..record import columns_in
-from ..record.bags import columns_of_bag, is_bag
+from ..record import column_lengths
 from ..report.html import report_html
 from ..safety import critical_levels, is_violation, max_abs_output
 from ..simulation import Experiment, Trajectory
@@ -293,12 +292,7 @@ def _by_name(parts: Sequence[Parameter | Output], values: Iterable[ArrayLike]) -
 def columns(folder: str, name: str) -> Iterator[Event]:
     """The columns of an uploaded file, and how many samples each has."""
     with contextlib.chdir(folder):  # so that messages have the file's name without its folder
-        path = Path(name)
-        counts = (
-            columns_of_bag(path)
-            if is_bag(path)
-            else {word: len(values) for word, values in columns_in(path).items()}
-        )
+        counts = column_lengths(Path(name))
     if not counts:
         raise ValueError(f"{name} has no column of numbers")
     if len(counts) > _MAX_COLUMNS or max(map(len, counts)) > _MAX_NAME:
