@@ -23,14 +23,25 @@ from excite.environment import (
     WeightedSum,
     prior_sd_of,
 )
+from excite.environment.falsification import Cases, OnPlant
 from excite.estimation import NLS, stack_experiments
 from excite.excitation import Chirp
 from excite.information import a_optimality, d_optimality, e_optimality, experiment_information
 from excite.plant import AbstractPlant, Aero2
+from excite.plant.uncertainty import Uncertainty
 from excite.policy import Layout, Weights, forward, observe
 from excite.simulation import response, step
 from excite.training.checkpoint import Checkpoint
-from excite.training.gradient import GradientSettings, Network, experiments, train, train_all
+from excite.training.gradient import (
+    GradientSettings,
+    Network,
+    Optimisation,
+    experiments,
+    rank,
+    train,
+    train_all,
+    update,
+)
 
 ALL = (True, True, True)
 KEYS = jax.random.split(jax.random.key(1), 3)
@@ -333,3 +344,76 @@ def test_several_seeds_side_by_side_are_those_trained_alone():
         ):
             np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5)
         assert [row["steps"] for row in trained.curve] == [row["steps"] for row in alone.curve]
+
+
+# ----------------------------------------------------------------------- declared uncertainty
+
+
+def uncertain_env(num_steps: int = 60) -> Env:
+    """A decision process whose policy is also made safe in a declared uncertainty."""
+    env = env_of(InformationGain(ALL, prior_sd_of(0.3), dense=False), num_steps=num_steps)
+    ranges = {"delay_voltage": (0, 0.1), "initial_state": "2%"}
+    box = Uncertainty.of(env.plant, 0.3, ranges)
+    return dataclasses.replace(env, uncertainty=box)
+
+
+AGAINST = dataclasses.replace(
+    FEW, num_adversaries=6, adversary_steps=2, adversaries_from=0.3, watch_every=6
+)
+
+
+def test_adversaries_come_nearer_than_plants_drawn_at_random_and_are_kept():
+    env = uncertain_env()
+    now = Optimisation.start(Network(weights_of(env), env.layout), AGAINST, env.uncertainty)
+    after, _ = update(env, AGAINST, now, KEYS, True)
+    assert env.uncertainty is not None
+    assert after.adversaries is not None
+    play = OnPlant(env.uncertainty, now.player.excitation(), 60)
+    worst = np.asarray(jax.vmap(play)(after.adversaries))
+    points = jax.vmap(env.uncertainty.draw)(jax.random.split(jax.random.key(9), 6))
+    drawn = np.asarray(jax.vmap(play)(Cases(points, jnp.arange(6))))
+    assert np.mean(worst) > np.mean(drawn)
+    np.testing.assert_array_equal(np.argsort(-worst), np.arange(6))
+    same, _ = update(env, AGAINST, now, KEYS)
+    assert same.adversaries is not None
+    np.testing.assert_array_equal(same.adversaries.point, 0.0)
+
+
+def test_the_penalty_of_adversaries_lowers_the_nearness_in_the_declared_uncertainty():
+    env = uncertain_env()
+    heavy = dataclasses.replace(AGAINST, penalty_weight=1e6, adversary_margin=0.05)
+    now = Optimisation.start(Network(weights_of(env), env.layout), heavy, env.uncertainty)
+    box = env.uncertainty
+    assert box is not None
+    cases = Cases(jnp.ones((1, len(box.names))), jnp.zeros(1, int))
+
+    def nearest(player: Network) -> float:
+        return float(jax.vmap(OnPlant(box, player.excitation(), 60))(cases)[0])
+
+    before, step = nearest(now.player), eqx.filter_jit(update)
+    for i in range(10):
+        now, _ = step(env, heavy, now, jax.random.split(jax.random.key(i), 3), True)
+    assert nearest(now.player) < 0.9 * before
+
+
+def test_an_interrupted_training_against_an_uncertainty_ends_with_the_same_policy():
+    env, kept = uncertain_env(20), []
+    settings = dataclasses.replace(AGAINST, allowed_nearness=0.5)
+
+    def keep(checkpoint, row):
+        kept.append(checkpoint().to_bytes())
+
+    whole = train(env, settings, 0, on_boundary=keep)
+    resumed = train(env, settings, 0, resume=Checkpoint.from_bytes(kept[4], "kept"))
+    for (a, b), (c, d) in zip(whole.weights, resumed.weights, strict=True):
+        np.testing.assert_array_equal(a, c)
+        np.testing.assert_array_equal(b, d)
+    assert "worst_nearness" in whole.validation
+
+
+def test_a_policy_that_a_search_finds_too_near_ranks_below_a_safe_one_of_less_worth():
+    row = {"steps": 1.0, "violation_rate": 0.0, "worth": 9.0}
+    settings = GradientSettings(allowed_nearness=0.975)
+    near, far = {**row, "worst_nearness": 0.99}, {**row, "worth": 1.0, "worst_nearness": 0.9}
+    assert rank(settings, far) > rank(settings, near)
+    assert rank(settings, {**row, "worst_nearness": 0.9}) == rank(settings, row)

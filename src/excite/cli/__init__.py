@@ -49,7 +49,7 @@ _SECTIONS: dict[str, dict[click.Command, str]] = {
         design: "excite design aero2 --out signal.csv",
         train: "excite train aero2 --out runs/first",
         evaluate: "excite evaluate aero2 --episodes 100",
-        falsify: "excite falsify dc_motor --uncertain initial_state=2% --out worst.json",
+        falsify: "excite falsify dc_motor --uncertainty initial_state=2% --out worst.json",
         export: "excite export aero2 --onnx aero2.onnx",
     },
     "Experiment on a rig": {

@@ -18,7 +18,7 @@ from .options import (
     plot_option,
     progress_bar,
     show_json,
-    uncertain_option,
+    uncertainty_option,
     warnings_shown,
 )
 
@@ -38,7 +38,7 @@ from .options import (
     type=click.FloatRange(0, 1, max_open=True),
     help="Spread of the parameters; default that of the policy's training, or 0.3.",
 )
-@uncertain_option("What else may differ; default that of the policy's training.")
+@uncertainty_option("What else may differ; default that of the policy's training.")
 @click.option("--noise", type=NUMBERS, multiple=True, help="Noise sd of an output, in its unit.")
 @click.option(
     "--steps",
@@ -88,12 +88,11 @@ def falsify(
         require_plant_path(out, overwrite)
     if certify is not None:
         require_certifiable(excitation, certify, overwrite)
-    uncertain = merged(options.pop("uncertain")) or None
+    options["uncertainty"] = merged(options["uncertainty"]) or None
     settings, noise = merged(options.pop("settings")), merged(options.pop("noise"))
     with warnings_shown(), progress_bar(f"falsifying {excitation}") as progress:
         found = falsified(
-            excitation, options=settings, uncertainty=uncertain, noise=noise, progress=progress,
-            **options,
+            excitation, options=settings, noise=noise, progress=progress, **options,
         )  # fmt: skip
     if plot is not None:
         from ..figure import save

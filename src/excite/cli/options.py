@@ -106,10 +106,10 @@ def merged(pairs: Iterable[dict[str, Value]]) -> dict[str, Value]:
     return {name: value for part in pairs for name, value in part.items()}
 
 
-def uncertain_option(help: str) -> Callable[[Callback], Callback]:
-    """`--uncertain NAME=RANGE,...`, with this help in front of the notation."""
+def uncertainty_option(help: str) -> Callable[[Callback], Callback]:
+    """`--uncertainty NAME=RANGE,...`, with this help in front of the notation."""
     return click.option(
-        "--uncertain", type=NAMES, multiple=True, metavar="NAME=RANGE,...",
+        "--uncertainty", type=NAMES, multiple=True, metavar="NAME=RANGE,...",
         help=f"{help} A range is LOW:HIGH, a percentage or factor:3, as in "
         "delay_voltage=0:0.1,d_S=10%,initial_state=2%.",
     )  # fmt: skip

@@ -15,7 +15,7 @@ from .options import (
     progress_bar,
     show_json,
     show_table,
-    uncertain_option,
+    uncertainty_option,
     warnings_shown,
 )
 from .study import show_comparison
@@ -66,7 +66,7 @@ def policies(as_json: bool) -> None:
     "--seed", type=WholeNumber(0), default=0, show_default=True, help="Seed of the plants."
 )
 @click.option("--spread", type=float, default=0.3, show_default=True, help="Spread of the plants.")
-@uncertain_option("What else may differ, as in 'excite falsify'.")
+@uncertainty_option("What else may differ, as in 'excite falsify'.")
 @click.option("--noise", type=NUMBERS, multiple=True, help="Noise sd of an output, in its unit.")
 @click.option("--estimators", metavar="NAME,...", help="Default nls, and arx-rls if possible.")
 @click.option("--rig", "on_rig", is_flag=True, help="Use the plant's simulated rig.")
@@ -79,7 +79,7 @@ def evaluate(policy: str, as_json: bool, **options: Any) -> None:
     from ..study.evaluate import evaluate as evaluated
 
     on_rig, filtered, noise = (options.pop(n) for n in ("on_rig", "filtered", "noise"))
-    options["uncertainty"] = merged(options.pop("uncertain"))
+    options["uncertainty"] = merged(options["uncertainty"])
     with warnings_shown(), progress_bar(f"evaluating {policy}") as progress:
         found = evaluated(
             policy, rig=on_rig, filter=filtered, noise=merged(noise), progress=progress, **options

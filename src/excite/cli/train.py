@@ -15,7 +15,7 @@ from .options import (
     computing,
     json_option,
     merged,
-    uncertain_option,
+    uncertainty_option,
 )
 from .study import running, show_comparison
 
@@ -47,7 +47,7 @@ def _options(command: Any) -> Any:
             click.option("--spread", type=click.FloatRange(0, 1, max_open=True), default=0.3,
                          show_default=True,
                          help="Plants are drawn from nominal values ± this fraction."),
-            uncertain_option("What else may differ: the policy is made safe there too."),
+            uncertainty_option("What else may differ: the policy is made safe there too."),
             click.option("--steps", type=WholeNumber(2, 1_000_000), default=500,
                          show_default=True, metavar="T", help="Length of an experiment."),
             click.option("--noise", type=NUMBERS, multiple=True,
@@ -77,7 +77,7 @@ def train(plant: str, out: Path, as_json: bool, **options: Any) -> None:
 
     for name in ("goal", "training", "noise", "output_scale"):
         options[name] = merged(options[name])
-    options["uncertainty"] = merged(options.pop("uncertain"))
+    options["uncertainty"] = merged(options["uncertainty"])
     options["objective"] = options["objective"] or "D"
     with running(plant, out) as told:
         trained(plant, out, workers=None, **told, **options)

@@ -31,7 +31,7 @@ _FIRST_STEP = 0.25  # of an ascent, in half widths of the box
 def nearness(plant: AbstractPlant, outputs: Float[Array, "time output"]) -> Float[Array, ""]:
     """Largest output over its critical level; infinite for an experiment that diverged."""
     watched, _, critical = watched_levels(plant.definition)
-    size = jnp.max(jnp.abs(outputs[:, np.array(watched, int)]) / critical, initial=0.0)
+    size = jnp.max(jnp.abs(outputs[:, np.array(watched, int)]) / critical[None], initial=0.0)
     return jnp.where(jnp.all(jnp.isfinite(outputs)), size, jnp.inf)
 
 

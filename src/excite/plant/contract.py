@@ -294,14 +294,7 @@ def with_nominal(plant: AbstractPlant, values: Mapping[str, float]) -> AbstractP
             raise unknown(f"parameter of {plant.definition.name!r}", name, names)
     usual = zip(names, plant.nominal, strict=True)
     nominal = tuple(as_number(name, values.get(name, value)) for name, value in usual)
-    tuned = _tuned(type(plant), nominal)(
-        sensor=plant.sensor,
-        initial_state=plant.initial_state,
-        dt=plant.dt,
-        **plant.constants._asdict(),
-    )
-    object.__setattr__(tuned, "substeps", plant.substeps)
-    return tuned
+    return plant.as_class(_tuned(type(plant), nominal))
 
 
 @cache

@@ -12,6 +12,7 @@ state's scale), or `factor:3` for a third to three times the nominal value.
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Mapping, Sequence
@@ -27,11 +28,12 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from ..description import names_of, unknown, wrong_type
 from .contract import AbstractPlant, Params, Sensor
 from .extension import extended, extensions_of, plain_kind
+from .fields import floats
 
 Range: TypeAlias = str | Sequence[float]
 """Lowest and highest value, or a text: `0:0.1`, `10%`, `factor:3`."""
 
-_START, _ALL_PARAMETERS, _ALL_STATES, _NOISE = "initial_", "parameters", "initial_state", "noise"
+_PARAMETERS, _STATES, _START, _NOISE = "parameters", "initial_state", "initial_", "noise"
 _ALLOWED = "two numbers LOW:HIGH, a percentage such as 10%, or factor:3"
 
 
@@ -70,34 +72,31 @@ class Uncertainty(eqx.Module):
         """
         if not isinstance(ranges, Mapping | None):
             raise wrong_type("uncertainty", ranges, "a dict of ranges by name")
-        given = {_ALL_PARAMETERS: f"{100 * spread}%", **(ranges or {})}
-        added = _extensions(plant, given)
+        if not 0 <= spread < 1:
+            raise ValueError(f"spread must be 0 or more and below 1: got {spread:g}")
+        given = {_PARAMETERS: f"{100 * spread}%", **(ranges or {})}
+        possible = extensions_of(plant)
+        added = [name for name in given if name in possible]
         whole = extended(plant, added) if added else plant
-        quantities = _quantities(whole, plant)
-        boxes: dict[str, _Interval] = {}
         groups = {
-            _ALL_PARAMETERS: names_of(plant.definition.parameters),
-            _ALL_STATES: tuple(_START + name for name in names_of(plant.definition.states)),
+            _PARAMETERS: names_of(plant.definition.parameters),
+            _STATES: tuple(_START + name for name in names_of(plain_kind(plant).definition.states)),
         }
-        for word, value in given.items():  # a group first, then what is named on its own
-            for name in groups.get(word, ()):
-                boxes[name] = _interval(name, value, quantities[name])
-        for word, value in given.items():
-            if word in groups:
-                continue
-            if word not in quantities:
-                known = [*quantities, *extensions_of(whole), *groups]
-                raise unknown(f"quantity in the uncertainty of {plant.definition.name!r}",
-                              word, known)  # fmt: skip
-            boxes[word] = _interval(word, value, quantities[word])
-        chosen = {name: box for name, box in boxes.items() if box.lower < box.upper or
-                  box.lower != quantities[name].nominal}  # fmt: skip
+        by_name = {n: given[word] for word, names in groups.items() if word in given for n in names}
+        by_name |= {word: value for word, value in given.items() if word not in groups}
+        quantities = _quantities(whole, groups[_STATES])
+        for name in by_name:
+            if name not in quantities:
+                known = [*quantities, *possible, *groups]
+                where = f"quantity in the uncertainty of {plant.definition.name!r}"
+                raise unknown(where, name, known)
+        boxes = {name: _interval(name, value, quantities[name]) for name, value in by_name.items()}
         return cls(
             whole,
-            jnp.asarray([box.lower for box in chosen.values()], float),
-            jnp.asarray([box.upper for box in chosen.values()], float),
-            tuple(chosen),
-            tuple(box.is_factor for box in chosen.values()),
+            floats([box.lower for box in boxes.values()]),
+            floats([box.upper for box in boxes.values()]),
+            tuple(boxes),
+            tuple(box.is_factor for box in boxes.values()),
         )
 
     def values(self, point: Float[Array, " quantity"]) -> Float[Array, " quantity"]:
@@ -159,29 +158,17 @@ class _Interval:
     is_factor: bool = False
 
 
-def _extensions(plant: AbstractPlant, ranges: Mapping[str, Range]) -> list[str]:
-    """Extensions that are named and that the plant does not have."""
-    possible = extensions_of(plant)
-    return [name for name in ranges if name in possible]
-
-
-def _quantities(whole: AbstractPlant, plant: AbstractPlant) -> dict[str, _Quantity]:
-    """All quantities of a plant with extensions that may differ, by name."""
-    d = whole.description
-    found = {
-        p.name: _Quantity(
-            p.nominal,
-            p.scale,
-            p.unit,
-            lower=p.lower if p.lower is not None else (0.0 if p.positive else -math.inf),
-            upper=math.inf if p.upper is None else p.upper,
-        )
-        for p in d.parameters
-    }
+def _quantities(plant: AbstractPlant, starts: Sequence[str]) -> dict[str, _Quantity]:
+    """All quantities of a plant that may differ, by name; `starts` are those of its states."""
+    d = plant.description
+    found = {p.name: _Quantity(p.nominal, p.scale, p.unit, *p.support) for p in d.parameters}
+    for name in names_of(d.inputs):  # an input cannot act before it is chosen
+        if (delay := f"delay_{name}") in found:
+            found[delay] = dataclasses.replace(found[delay], lower=0.0)
     found |= {c.name: _Quantity(c.value, abs(c.value), c.unit) for c in d.constants}
-    own = plain_kind(plant).definition.states
-    found |= {_START + s.name: _Quantity(s.initial, s.scale, s.unit) for s in d.states[: len(own)]}
-    return found | {_NOISE: _Quantity(1.0, 1.0, "", lower=0.0)}
+    states = zip(starts, d.states, strict=False)  # those of extensions come last
+    found |= {name: _Quantity(s.initial, s.scale, s.unit) for name, s in states}
+    return {**found, _NOISE: _Quantity(1.0, 1.0, "", lower=0.0)}
 
 
 def _interval(name: str, given: Range, about: _Quantity) -> _Interval:
@@ -195,8 +182,8 @@ def _interval(name: str, given: Range, about: _Quantity) -> _Interval:
         )
     if found.lower < about.lower or found.upper > about.upper:
         raise ValueError(
-            f"range of {name} goes from {found.lower:g} to {found.upper:g} {about.unit}, beyond "
-            f"its bounds {about.lower:g} to {about.upper:g}"
+            f"range of {name} goes from {found.lower:g} to {found.upper:g}, beyond its bounds "
+            f"{about.lower:g} to {about.upper:g} {about.unit}".rstrip()
         )
     return found
 

@@ -214,7 +214,10 @@ def falsify(
     made = {} if policy is None else policy.provenance
     if plant is None:
         if policy is None:
-            raise ValueError("a signal names no plant: give its plant (--plant)")
+            raise ValueError(
+                f"{_word(excitation)} is no policy, which would name its plant: give the plant "
+                "(--plant)"
+            )
         plant = policy.plant.name
     chosen = with_sensor(plant_from(plant), noise)
     require_inputs(chosen)
@@ -227,7 +230,7 @@ def falsify(
     if budget < MIN_BUDGET:
         raise ValueError(f"budget must be at least {MIN_BUDGET} experiments: got {budget}")
     found, origin = excitation_and_origin(excitation, options or {}, chosen)
-    name = excitation if isinstance(excitation, str) else name_of(excitation)
+    name = _word(excitation)
     num_steps = experiment_length(found, name, steps, isinstance(excitation, Record))
     own = {} if spread is None and uncertainty is not None else made.get("uncertainty", {})
     box = Uncertainty.of(
@@ -256,6 +259,10 @@ def falsify(
         record=experiment.record(experiment.run()),
         seed=seed,
     )
+
+
+def _word(excitation: ExcitationLike) -> str:
+    return str(excitation) if isinstance(excitation, str | Path) else name_of(excitation)
 
 
 def _policy_of(excitation: ExcitationLike) -> Policy | None:

@@ -180,11 +180,13 @@ def _adversaries(
 ) -> Cases:
     """Plants and noise with which the policy comes near to a level, the nearest first.
 
-    Half of the ascents begin with the worst cases of the last update, half with new ones.
+    Half of the ascents begin with the worst cases of the last update, the others with new
+    plants: every second at a corner of the box.
     """
     count = settings.num_adversaries
-    is_kept = jnp.arange(count) < count // 2
+    is_kept, is_corner = jnp.arange(count) < count // 2, jnp.arange(count) % 2 == 0
     points = jax.vmap(play.uncertainty.draw)(jax.random.split(key, count))
+    points = jnp.where(is_corner[:, None], jnp.sign(points), points)
     seeds = jax.random.randint(key, (count,), 0, 2**31 - 1)
     starts = Cases(
         jnp.where(is_kept[:, None], last.point, points), jnp.where(is_kept, last.seed, seeds)
