@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import textwrap
+from collections.abc import Mapping
 from typing import Any
 
 import click
@@ -41,19 +43,31 @@ def policies(as_json: bool) -> None:
                 "study": policy.provenance.get("study"),
                 "bytes": path.stat().st_size,
                 "hash": policy.hash,
+                "certificate": policy.certificate,
                 "file": str(path),
             }
         )
     if as_json:
         show_json({"policies": found})
         return
-    header = ["name", "plant", "default", "steps", "agent", "study"]
+    header = ["name", "plant", "default", "steps", "agent", "study", "worst found"]
     rows = [
         [p["name"], p["plant"], "yes" if p["default"] else "", str(p["num_steps"]),
-         str(p["agent"]), str(p["study"])]
+         str(p["agent"]), str(p["study"]), _worst(p["certificate"])]
         for p in found
     ]  # fmt: skip
     show_table("shipped policies; use a name as --excitation", header, rows)
+    click.echo(
+        "worst found: largest output over its critical level that a search found in the "
+        "uncertainty\ndeclared in the policy's file (--json shows it; excite falsify)"
+    )
+
+
+def _worst(certificate: Mapping[str, Any] | None) -> str:
+    if certificate is None:
+        return "-"
+    sizes = [certificate["nearness"], certificate["noise_nearness"]]
+    return "diverged" if None in sizes else f"{max(sizes):.3f}"
 
 
 @click.command()
@@ -86,7 +100,10 @@ def evaluate(policy: str, as_json: bool, **options: Any) -> None:
         )
     if as_json:
         settings = found.study.data()
-        show_json({"policy_hash": read_policy(policy).hash, "study": settings, **found.data()})
+        own = read_policy(policy)
+        known = {"policy_hash": own.hash, "certificate": own.certificate}
+        show_json({**known, "study": settings, **found.data()})
     else:
         show_comparison(found)
         click.echo(f"log det of the Fisher information: {found.rows[0].log_det_information:.2f}")
+        click.echo(textwrap.fill(read_policy(policy).claim, 80))

@@ -237,6 +237,7 @@ class Policy:
             f"  observes {layout.window} samples, for {layout.num_steps} steps of "
             f"{self.plant.dt:g} s; network {'-'.join(map(str, widths))}\n"
             f"  trained by {', '.join(words) or 'unknown'}\n"
+            f"  {self.claim}\n"
             f"  hash {self.hash}"
         )
 
@@ -244,6 +245,22 @@ class Policy:
     def hash(self) -> str:
         """SHA-256 of the policy's file content without its certificate."""
         return hashlib.sha256(self.certified(None).to_bytes()).hexdigest()
+
+    @property
+    def claim(self) -> str:
+        """What a search for violations found, with its conditions, as a sentence."""
+        c = self.certificate
+        if c is None:
+            return "no certificate: no search for violations (excite falsify)"
+        largest, with_noise = (
+            "a simulation diverged" if c[name] is None else f"{c[name]:.3f} of the critical level"
+            for name in ("nearness", "noise_nearness")
+        )
+        box = ", ".join(f"{n} {a:.3g} to {b:.3g}" for n, (a, b) in c["uncertainty"].items())
+        return (
+            f"largest output found in {c['experiments']:,} experiments: {largest}, {with_noise} "
+            f"with noise searched within {c['noise_bound']:g} sd; plants: {box}; found, not proved"
+        )
 
     def certified(self, certificate: Mapping[str, Any] | None) -> Policy:
         """The same policy with another certificate."""
@@ -334,10 +351,12 @@ def _check_layout(layout: Layout, plant: PlantDescription) -> None:
 
 def _check_certificate(certificate: Any) -> None:
     """Raises ValueError for a certificate without its numbers."""
-    numbers = [certificate[name] for name in ("nearness", "noise_nearness", "experiments")]
+    names = "nearness", "noise_nearness", "experiments", "noise_bound"
+    numbers = [certificate[name] for name in names]
     if not all(n is None or (isinstance(n, int | float) and n >= 0) for n in numbers):
         raise ValueError("the certificate of the policy is malformed")
-    if not isinstance(certificate["uncertainty"], dict):
+    ends = certificate["uncertainty"].values()
+    if not all(len(pair) == 2 and all(isinstance(n, int | float) for n in pair) for pair in ends):
         raise ValueError("the certificate of the policy is malformed")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -123,7 +124,8 @@ class Falsification:
     def __repr__(self) -> str:
         """The stages as a table, the verdict, and the worst plant."""
         title, header, rows = self._table()
-        return "\n".join([text_table(title, header, rows), *self._sentences()])
+        lines = [textwrap.fill(line, 80) for line in self._sentences()]
+        return "\n".join([text_table(title, header, rows), *lines])
 
     def _repr_html_(self) -> str:
         """The same for a notebook."""

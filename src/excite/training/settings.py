@@ -88,8 +88,8 @@ class GradientSettings(_Checked):
     watch_every: Count = 50
     watch_episodes: Count = 500
     num_adversaries: Count = 48
-    adversary_steps: Count = 4
-    adversary_margin: Fraction = 0.9
+    adversary_steps: Count = 3
+    adversary_margin: Fraction = 0.93
     adversaries_from: Fraction = 0.4
     allowed_nearness: Fraction = 0.975
 
