@@ -18,7 +18,7 @@ from excite.files import csv_text
 from excite.plant import Aero2, Aero2Detailed
 from excite.policy import read_policy
 from excite.record import read_record
-from excite.rig import session
+from excite.rig import Recorder, Stop, session
 from excite.rig.live_estimate import LiveEstimate
 
 AERO = Aero2Detailed.definition
@@ -63,6 +63,28 @@ class Foreign(Still):
     def __init__(self):
         from excite.plant import DCMotor
         self.description = DCMotor().description
+
+
+class Loud(Still):
+    def open(self):
+        raise ZeroDivisionError("it was touched")
+
+
+class Ended(Still):
+    def read(self):
+        if self.n == 20:
+            raise SystemExit(3)
+        return super().read()
+
+
+class EndedTwice(Ended):
+    def close(self):
+        raise RigError("the card does not answer")
+
+
+class Stopped(Still):
+    def close(self):
+        raise GeneratorExit
 
 
 class Half(AbstractRig):
@@ -267,6 +289,60 @@ def test_a_rig_that_is_not_released_hides_no_outcome(call):
     assert told["reason"] == expected
     assert told["num_samples"] == 29
     assert read_record("r.csv", AERO).metadata["ended"]["reason"] == expected
+
+
+@pytest.mark.parametrize(("name", "reason", "code"), [
+    ("Ended", "SystemExit: 3", 3),
+    ("EndedTwice", "SystemExit: 3; the rig was not released: the card does not answer", 3),
+])  # fmt: skip
+def test_who_ends_the_program_ends_it_after_the_record(call, name, reason, code):
+    assert call("--rig", f"own.py:{name}", *SIGNAL, "--out", "r.csv")[0] == code
+    record = read_record("r.csv", AERO)
+    assert record.metadata["ended"]["reason"] == reason
+    assert record.metadata["ended"]["num_samples"] == len(record.time) == 11
+
+
+def test_an_end_of_the_program_while_the_rig_is_released_goes_on(call):
+    with pytest.raises(GeneratorExit):
+        session.run("own.py:Stopped", signal="u.csv", out="r.csv")
+    reason = read_record("r.csv", AERO).metadata["ended"]["reason"]
+    assert reason == "complete; the rig was not released: GeneratorExit"
+
+
+@pytest.mark.parametrize("error", [SystemExit(0), GeneratorExit()])
+def test_an_excitation_that_ends_the_program_is_recorded(call, error):
+    def end(sample):
+        if sample.k == 4:
+            raise error
+
+    with pytest.raises(type(error)):
+        session.run("own.py:Still", signal="u.csv", out="r.csv", on_sample=end)
+    ended = read_record("r.csv", AERO).metadata["ended"]
+    assert ended["reason"].startswith(type(error).__name__)
+    assert ended["num_samples"] == 5
+
+
+def test_a_program_can_ask_for_the_end(call):
+    stop = Stop()
+
+    def ask(sample):
+        if sample.k == 4:
+            stop.ask("the door was opened")
+
+    result = session.run("own.py:Still", signal="u.csv", out="r.csv", on_sample=ask, stop=stop)
+    assert result.outcome.reason == "the door was opened"
+    assert result.outcome.num_samples == 5
+
+
+def test_the_second_process_on_a_record_is_refused(call, tmp_path):
+    first = Recorder(Path("r.csv"), AERO, {})
+    with first:
+        first.begin()
+        before = (tmp_path / "r.csv").read_bytes(), (tmp_path / "r.json").read_bytes()
+        code, out, err = call("--rig", "own.py:Loud", *SIGNAL, "--out", "r.csv", "--overwrite")
+        assert (code, out) == (2, "")
+        assert err == "excite: r.csv: another process records into this file\n"
+        assert before == ((tmp_path / "r.csv").read_bytes(), (tmp_path / "r.json").read_bytes())
 
 
 def test_a_filter_says_how_often_it_intervened(call):

@@ -227,12 +227,17 @@ def _duration(seconds: float) -> str:
     return f"{minutes} min" if seconds >= 90 else f"{seconds:.0f} s"
 
 
+def show_warning(message: Warning | str, *_: object, **__: object) -> None:
+    """A warning as a sentence on stderr."""
+    click.echo(f"warning: {message}", err=True)
+
+
 @contextlib.contextmanager
 def warnings_shown() -> Iterator[None]:
-    """Warnings as sentences on stderr."""
+    """Every warning as a sentence on stderr, also one that was shown before."""
     with warnings.catch_warnings():
         warnings.simplefilter("always", UserWarning)
-        warnings.showwarning = lambda message, *_, **__: click.echo(f"warning: {message}", err=True)
+        warnings.showwarning = show_warning
         yield
 
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 _EXIT_CODES = {
     "interrupted by SIGINT": 130,
-    "interrupted": 130,  # by a second Ctrl-C
+    "interrupted": 130,  # by a second Ctrl-C, where the rig hangs
     "interrupted by SIGTERM": 143,
     "interrupted by SIGHUP": 129,
 }
@@ -93,6 +93,19 @@ def run(
     filter are then off.
     """
     _prepare()
+    from ..rig.loop import ignore_signals, interruptible
+
+    with interruptible(has_begun=False) as stop:
+        try:
+            given = {**options, "options": merged(settings), "fault": merged(faults)}
+            return _run_and_show(as_json, stop=stop, **given)
+        finally:
+            if stop.reason:
+                ignore_signals()  # until the process has ended
+
+
+def _run_and_show(as_json: bool, **options: Any) -> int:
+    """The experiment and its result; the exit code."""
     from ..rig import RigError
     from ..rig.session import DryRun
     from ..rig.session import run as run_on_rig
@@ -102,8 +115,6 @@ def run(
     try:
         result = run_on_rig(
             **options,
-            options=merged(settings),
-            fault=merged(faults),
             on_sample=view,
             on_warning=lambda sentence: click.echo(f"warning: {sentence}", err=True),
         )
