@@ -1,7 +1,9 @@
 """`excite run`: exit codes, what is written and what is not, refusals, and life without JAX."""
 
 import json
+import math
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -16,13 +18,14 @@ from excite.estimation.identify import identify
 from excite.excitation import Chirp
 from excite.files import csv_text
 from excite.plant import Aero2, Aero2Detailed
-from excite.policy import read_policy
+from excite.policy import read_policy, shipped_policies
 from excite.record import read_record
 from excite.rig import Recorder, Stop, session
 from excite.rig.live_estimate import LiveEstimate
 
 AERO = Aero2Detailed.definition
 TESTS = Path(__file__).parent
+POLICIES = shipped_policies()
 
 OWN_RIG = """
 import numpy as np
@@ -265,6 +268,45 @@ def test_a_bad_option_is_one_sentence_and_exit_code_2(call, tmp_path, name):
     assert sentence in lines[0]
     assert not (tmp_path / "r.csv").exists()
     assert not (tmp_path / "r.json").exists()
+
+
+@pytest.mark.parametrize(("numbers", "sentence"), [
+    ({"spread": math.nan}, "spread must lie in [0, 1): got nan"),
+    ({"spread": math.inf}, "spread must lie in [0, 1): got inf"),
+    ({"spread": -0.1}, "spread must lie in [0, 1): got -0.1"),
+    ({"seed": -1}, "seed must be a whole number from 0 to 9223372036854775807: got -1"),
+    ({"seed": 10**30}, "seed must be a whole number"),
+    ({"steps": 0}, "steps must be a whole number from 2 to 10000000: got 0"),
+    ({"steps": 10**30}, "steps must be a whole number"),
+    ({"slew": math.nan}, "the slew limit must be positive: got nan"),
+    ({"slew": 0.0}, "the slew limit must be positive: got 0"),
+    ({"fault": {"latency": math.inf}}, "--fault latency=inf is not allowed"),
+])  # fmt: skip
+def test_a_number_that_is_none_is_refused_by_the_function_too(call, tmp_path, numbers, sentence):
+    with pytest.raises(ValueError, match=re.escape(sentence)):
+        session.run("simulated", signal="u.csv", fast=True, out="r.csv", **numbers)
+    assert not list(tmp_path.glob("r.*"))
+
+
+def test_a_policy_without_a_checksum_is_played_with_a_warning(call, tmp_path):
+    content = POLICIES["aero2_detailed"].read_bytes()
+    entry = f',"sha256":"{read_policy("aero2_detailed").hash}"'.encode()
+    old = content.replace(entry, b" " * len(entry))
+    assert len(old) == len(content) > len(entry)
+    (tmp_path / "old.safetensors").write_bytes(old)
+    done = bare(tmp_path, "--rig", "quanser", "--policy", "old.safetensors", "--dry-run", "--json")
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.splitlines() == [
+        JAX_IS_MISSING.strip(),
+        "warning: old.safetensors: has no checksum, so that damage is not seen; saved again it "
+        "has one",
+    ]
+    (tmp_path / "flipped.safetensors").write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    code, out, err = call("--policy", "flipped.safetensors", *FAST)
+    assert (code, out) == (2, "")
+    assert err == (
+        "excite: flipped.safetensors: damaged: its content does not match its checksum\n"
+    )
 
 
 def test_a_class_of_ones_own_is_a_rig(call):

@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from .options import (
+    FRACTION,
     NUMBERS,
     OUT_FILE,
+    SEED,
     VALUES,
     RunFailedError,
     WholeNumber,
@@ -63,10 +65,10 @@ def _options(command: Callable[..., int]) -> Callable[..., int]:
         click.option("--fast", is_flag=True,
                      help="Run a simulated rig or an FMU as fast as it can."),
         click.option("--dry-run", is_flag=True, help="Show the inputs; send nothing."),
-        click.option("--seed", type=WholeNumber(0), default=0, show_default=True,
+        click.option("--seed", type=SEED, default=0, show_default=True,
                      help="Seed of a simulated rig's hidden parameters, noise and jitter, and of "
                      "random signals."),
-        click.option("--spread", type=click.FloatRange(0, 1, max_open=True), default=0.3,
+        click.option("--spread", type=FRACTION, default=0.3,
                      show_default=True,
                      help="Spread of these parameters and of the filter's prior, as a fraction of "
                      "their scales."),

@@ -18,7 +18,15 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 
 from .. import __version__
-from ..description import PlantDescription, display_unit, path_from, wrong_type
+from ..description import (
+    LARGEST_SEED,
+    PlantDescription,
+    display_unit,
+    path_from,
+    require_spread,
+    require_whole,
+    wrong_type,
+)
 from ..policy import Policy, mismatch, policy_path, read_policy
 from ..record import Record, read_record, read_signal, require_record_path
 from ..record.read import SIGNAL_ENDINGS
@@ -241,6 +249,10 @@ def run(
         >>> ex.run(policy="aero2", dry_run=True).inputs.shape
         (500, 1)
     """
+    require_whole("seed", seed, 0, LARGEST_SEED)
+    require_spread(spread)
+    if steps is not None:
+        require_whole("steps", steps, 2)
     path = None if out is None else path_from("out", out)
     if path is not None:
         require_record_path(path, overwrite)
