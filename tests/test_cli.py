@@ -23,7 +23,7 @@ from experiments import NUM_STEPS
 
 from excite.cli import cli, completion, main
 from excite.cli.options import Lines, progress_bar
-from excite.cli.study import running
+from excite.cli.study import running, study
 from excite.estimation.catalogue import ESTIMATORS
 from excite.excitation.catalogue import EXCITATIONS
 from excite.plant import Aero2
@@ -917,13 +917,13 @@ NOT_FINITE = "nan", "inf", "-inf", "1e400", DIGITS
 
 def numeric_options() -> dict[str, click.ParamType[Any, Any]]:
     """The type of every option that takes a number, by command and option."""
-    commands = cli.commands | {f"study {n}": c for n, c in cli.commands["study"].commands.items()}
+    commands = {**cli.commands, **{f"study {n}": c for n, c in study.commands.items()}}
     kinds = click.types.FloatParamType, click.types.IntParamType
     return {
         f"{name} {option.opts[0]}": option.type
         for name, command in commands.items()
         for option in command.params
-        if isinstance(option.type, kinds) and option.name != "slew"  # inf: no limit
+        if isinstance(option.type, kinds)
     }
 
 
@@ -940,7 +940,8 @@ def test_a_number_that_is_not_finite_or_too_large_is_refused_everywhere(option, 
 @pytest.mark.parametrize("text", NOT_FINITE)
 @pytest.mark.parametrize("words", [
     "run --fast --out r.csv --spread {}", "run --fast --filter --dry-run --spread {}",
-    "run --fast --out r.csv --seed {}", "run --fast --out r.csv --steps {}",
+    "run --fast --out r.csv --seed {}", "run --fast --out r.csv --slew {}",
+    "run --fast --out r.csv --steps {}",
     "train aero2 --out runs --spread {}", "train aero2 --out runs --clock {}",
     "design aero2 --out s.csv --spread {}", "evaluate aero2 --spread {}",
     "identify good.csv --plant aero2 --dt {}",

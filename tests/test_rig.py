@@ -365,6 +365,15 @@ def test_signals_are_given_back():
     assert [signal.getsignal(n) for n in numbers] == before
 
 
+@pytest.fixture
+def _usual_interrupt():
+    """A process that was started in the background ignores SIGINT."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("_usual_interrupt")
 def test_before_an_experiment_signals_act_as_usual():
     with interruptible(has_begun=False) as stop:
         with pytest.raises(KeyboardInterrupt):

@@ -4,6 +4,7 @@ import json
 import math
 import os
 import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -374,6 +375,18 @@ def test_a_program_can_ask_for_the_end(call):
     result = session.run("own.py:Still", signal="u.csv", out="r.csv", on_sample=ask, stop=stop)
     assert result.outcome.reason == "the door was opened"
     assert result.outcome.num_samples == 5
+
+
+def test_after_an_experiment_a_signal_does_not_change_the_exit_code(call):
+    assert call("--rig", "own.py:Still", *SIGNAL, "--out", "r.csv")[0] == 0
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        assert signal.getsignal(number) == signal.SIG_IGN
+
+
+def test_a_function_gives_signals_back(call):
+    before = signal.getsignal(signal.SIGTERM)
+    session.run("own.py:Still", signal="u.csv", out="s.csv")
+    assert signal.getsignal(signal.SIGTERM) == before
 
 
 def test_the_second_process_on_a_record_is_refused(call, tmp_path):

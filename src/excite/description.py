@@ -20,7 +20,6 @@ import sys
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
-from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -453,18 +452,18 @@ def wrong_type(what: str, value: object, allowed: str) -> TypeError:
 LARGEST_SEED = 2**63 - 1
 
 
-def require_whole(what: str, value: object, least: int, most: int = 10_000_000) -> None:
+def require_whole(what: str, value: Any, least: int, most: int = 10_000_000) -> None:
     """Raises ValueError for anything but a whole number in a range."""
-    is_whole = isinstance(value, Integral) and not isinstance(value, bool)
-    if not (is_whole and least <= value <= most):
+    is_whole = hasattr(value, "__index__") and not isinstance(value, bool)
+    if not (is_whole and least <= int(value) <= most):
         raise ValueError(
             f"{what} must be a whole number from {least} to {most}: got {reprlib.repr(value)}"
         )
 
 
-def require_spread(value: object) -> None:
+def require_spread(value: Any) -> None:
     """Raises ValueError for a spread of plants that is not allowed."""
-    if not (isinstance(value, Real) and 0 <= value < 1):  # also NaN
+    if not (hasattr(value, "__float__") and 0 <= float(value) < 1):  # also NaN
         raise ValueError(f"spread must lie in [0, 1): got {reprlib.repr(value)}")
 
 

@@ -15,6 +15,7 @@ from .options import (
     OUT_FILE,
     SEED,
     VALUES,
+    Number,
     RunFailedError,
     WholeNumber,
     json_option,
@@ -54,7 +55,7 @@ def _options(command: Callable[..., int]) -> Callable[..., int]:
         click.option("--overwrite", is_flag=True, help="Replace the record if it exists."),
         click.option("--steps", type=WholeNumber(2), metavar="T",
                      help="Number of samples; default all of a policy or file, else 500."),
-        click.option("--slew", type=float, default=math.inf, metavar="RATE",
+        click.option("--slew", type=Number(), metavar="RATE",
                      help="Largest change of an input per second, in its unit; default no limit."),
         click.option("--filter", is_flag=True,
                      help="Predictive safety filter: changes an input where a plant of the prior "
@@ -100,9 +101,10 @@ def run(
     with interruptible(has_begun=False) as stop:
         try:
             given = {**options, "options": merged(settings), "fault": merged(faults)}
+            given["slew"] = math.inf if given["slew"] is None else given["slew"]
             return _run_and_show(as_json, stop=stop, **given)
         finally:
-            if stop.reason:
+            if stop.has_begun:
                 ignore_signals()  # until the process has ended
 
 
