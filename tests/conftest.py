@@ -8,6 +8,7 @@ the runs that follow: what one test compiles, no other compiles again.
 import ctypes
 import gc
 import os
+import signal
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -66,3 +67,14 @@ MEMORY = Memory()
 def bounded_memory() -> Iterator[None]:
     yield
     MEMORY.bound()
+
+
+HANDLERS = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+
+
+@pytest.fixture(autouse=True)
+def _handlers_of_signals() -> Iterator[None]:
+    """`excite run` in this process leaves signals ignored, as a program does that ends."""
+    yield
+    for number, handler in HANDLERS.items():
+        signal.signal(number, handler)

@@ -225,8 +225,12 @@ def test_a_recorder_refuses_what_it_would_destroy(tmp_path):
 STUCK = {n: 0.012 * min(n, 5) for n in range(30)}
 RISING = {8: 0.25, 9: 0.45, 10: 0.60, LEVEL_AT: 0.70}
 SHAKEN = {LEVEL_AT: raising(RigError("the cable is out"))}
+UNLICENSED = {LEVEL_AT: raising(SystemExit("no licence"))}
 ENDINGS = {
     "player fails": ({}, raising(ZeroDivisionError("oh")), "ZeroDivisionError: oh", None, 4),
+    "player ends the program": ({}, raising(SystemExit(3)), "SystemExit: 3", None, 4),
+    "player is closed": ({}, raising(GeneratorExit()), "GeneratorExit", None, 4),
+    "the rig ends the program": ({"script": UNLICENSED}, None, "no licence", None, 6),
     "player is interrupted": ({}, raising(KeyboardInterrupt()), "interrupted", None, 4),
     "player without a number": ({}, lambda: math.nan, "asked for an input", "input_not_finite", 5),
     "SIGINT": ({}, kill(signal.SIGINT), "interrupted by SIGINT", None, 5),
@@ -334,9 +338,12 @@ def interrupted_once(rig):
     return said
 
 
-def test_a_second_interrupt_ends_a_rig_that_hangs(tmp_path):
+def test_a_second_interrupt_ends_a_rig_that_hangs(tmp_path, monkeypatch):
+    monkeypatch.setattr(loop, "_PATIENCE", 0.05)
+
     def hang():
         kill(signal.SIGINT)()
+        time.sleep(0.1)
         kill(signal.SIGINT)()
         raise AssertionError("a second Ctrl-C must not wait for the next reading")
 
@@ -353,9 +360,65 @@ def test_signals_are_given_back():
     with interruptible() as stop:
         os.kill(os.getpid(), signal.SIGTERM)
         assert stop.reason == "interrupted by SIGTERM"
-        with pytest.raises(KeyboardInterrupt):  # of who cannot wait
-            os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), signal.SIGINT)
+        assert stop.reason == "interrupted by SIGTERM"
     assert [signal.getsignal(n) for n in numbers] == before
+
+
+@pytest.fixture
+def _usual_interrupt():
+    """A process that was started in the background ignores SIGINT."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("_usual_interrupt")
+def test_before_an_experiment_signals_act_as_usual():
+    with interruptible(has_begun=False) as stop:
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+        assert not stop.reason
+        stop.has_begun = True
+        os.kill(os.getpid(), signal.SIGINT)
+    assert stop.reason == "interrupted by SIGINT"
+
+
+AT_THE_END = ["write", "facts", "close"]
+
+
+@pytest.mark.parametrize("at", AT_THE_END)
+def test_a_second_signal_while_it_ends_changes_nothing(tmp_path, monkeypatch, at):
+    """Also one that comes after a while: a slow end is no rig that hangs."""
+    monkeypatch.setattr(loop, "_PATIENCE", 0.0)
+
+    class Rig(ScriptedRig):
+        def write(self, input):
+            super().write(input)
+            self.interrupt("write" if float(input[0]) == 0 else "")
+
+        def facts(self):
+            self.interrupt("facts")
+            return {"own": 1}
+
+        def close(self):
+            self.interrupt("close")
+            super().close()
+
+        def interrupt(self, word):
+            if word == at and stop.is_ending:
+                for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+                    os.kill(os.getpid(), number)
+
+    rig, path = Rig(), tmp_path / "a.csv"
+    with interruptible() as stop, rig, Recorder(path, AERO, {}) as recorder:
+        player = ScriptedPlayer(kill(signal.SIGINT))
+        outcome = run_loop(rig, player, RULES, recorder, stop=stop)
+    assert outcome.reason == "interrupted by SIGINT"
+    assert outcome.rig == {"own": 1}
+    assert ended(path) == outcome.to_dict()
+    assert len(read_record(path, AERO).time) == 5
+    assert rig.log[-3:] == ["write 0", "write 0", "close"]
 
 
 class FullDisk:
@@ -379,10 +442,9 @@ class FullDisk:
 class FullRecorder(Recorder):
     part = 0
 
-    def __enter__(self):
-        super().__enter__()
+    def begin(self):
+        super().begin()
         self._file = FullDisk(self._file, 5, self.part)
-        return self
 
 
 @pytest.mark.parametrize("part", [0, 7])
@@ -840,13 +902,163 @@ def test_a_full_disk_does_not_lose_the_reason(tmp_path, monkeypatch):
     def full(path, content):
         raise ValueError(f"{path}: cannot be written (No space left on device)")
 
-    path = tmp_path / "a.csv"
-    with ScriptedRig() as rig, Recorder(path, AERO, {}) as recorder:
+    path, sizes = tmp_path / "a.csv", []
+
+    def fill():
+        sizes.append(path.with_suffix(".json").stat().st_size)
         monkeypatch.setattr("excite.rig.recorder.write_bytes", full)
-        before = path.with_suffix(".json").stat().st_size
-        run_loop(rig, ScriptedPlayer(), Supervision.of(AERO), recorder)
+        return 5.0
+
+    experiment(path, ScriptedRig(), ScriptedPlayer(fill))
     assert ended(path)["reason"] == "complete"
-    assert path.with_suffix(".json").stat().st_size <= before
+    assert path.with_suffix(".json").stat().st_size <= sizes[0]
+
+
+def limited(folder: Path, size: int, *words: str) -> subprocess.CompletedProcess[str]:
+    """A program of a rig, in which no file can grow beyond a size."""
+    program = (
+        "import resource, sys\n"
+        "import numpy as np\n"
+        "from excite.rig import Recorder, SignalPlayer, run_loop\n"
+        "from excite.safety import Supervision\n"
+        "from still import Still, AERO\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]), resource.RLIM_INFINITY))\n"
+        "from pathlib import Path\n"
+        "recorder = Recorder(Path('a.csv'), AERO, {}, overwrite='again' in sys.argv)\n"
+        "player = SignalPlayer(np.full((2000, 1), 5.0))\n"
+        "with recorder, Still() as rig:\n"
+        "    outcome = run_loop(rig, player, Supervision.of(AERO), recorder)\n"
+        "print(outcome.reason)\n"
+    )
+    (folder / "still.py").write_text(STILL)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([SOURCE, str(folder)])}
+    return subprocess.run(
+        [sys.executable, "-c", program, str(size), *words], cwd=folder, env=environment,
+        capture_output=True, text=True, check=False, timeout=PATIENCE,
+    )  # fmt: skip
+
+
+SOURCE = str(Path(excite.__file__).parent.parent)
+
+STILL = """
+import numpy as np
+from excite.policy import read_policy
+from excite.rig import AbstractRig, Reading
+
+AERO = read_policy("aero2_detailed").plant
+
+
+class Still(AbstractRig):
+    description, is_real_time, num_readings = AERO, False, 2
+
+    def open(self):
+        self.n = -1
+
+    def read(self):
+        self.n += 1
+        return Reading(self.n * AERO.dt / 2, np.array([0.0001 * (self.n % 7)]))
+
+    def write(self, input):
+        print("write", input[0], flush=True)
+
+    def close(self):
+        print("close", flush=True)
+"""
+
+
+def test_a_disk_that_is_full_at_once_leaves_nothing(tmp_path):
+    for size in (0, 100):  # of which the second is enough for a header, not for a sidecar
+        done = limited(tmp_path, size)
+        assert "a.json: cannot be written (File too large)" in done.stderr
+        assert done.stdout.splitlines() == ["write 0.0", "close"]
+        assert [p.name for p in tmp_path.glob("*a.*")] == []
+
+
+def test_a_disk_that_is_full_at_the_header_leaves_nothing(tmp_path, monkeypatch):
+    class Full(Recorder):
+        def _write_sidecar(self, more, reserve=0):
+            super()._write_sidecar(more, reserve)
+            self._file = FullDisk(self._file, 0, 0)
+
+    rig = ScriptedRig()
+    with pytest.raises(OSError, match=r"a\.csv: cannot be written \(No space left on device\)"):
+        experiment(tmp_path / "a.csv", rig, recorder=Full(tmp_path / "a.csv", AERO, {}))
+    assert rig.log == ["open", "write 0", "close"]
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_disk_that_is_full_later_leaves_whole_lines_and_the_reason(tmp_path):
+    done = limited(tmp_path, 21_500)  # the sidecar fits
+    *_, last, closed, reason = done.stdout.splitlines()
+    assert (last, closed) == ("write 0.0", "close"), done.stderr
+    assert reason == ended(tmp_path / "a.csv")["reason"]
+    assert "a.csv: the disk is full" in reason or "File too large" in reason
+    record = read_record(tmp_path / "a.csv", AERO)
+    assert 100 < len(record.time) < 2000
+    before = (tmp_path / "a.csv").read_bytes(), (tmp_path / "a.json").read_bytes()
+    assert "cannot be written" in limited(tmp_path, 0, "again").stderr
+    assert before == ((tmp_path / "a.csv").read_bytes(), (tmp_path / "a.json").read_bytes())
+
+
+# -------------------------------------------------------------------- one process alone
+
+
+def test_two_recorders_of_one_file_are_one_too_many(tmp_path):
+    path = tmp_path / "a.csv"
+    seen = []
+
+    def second():
+        for overwrite in (False, True):
+            try:
+                with Recorder(path, AERO, {}, overwrite):
+                    pytest.fail("two recorders")
+            except ValueError as error:
+                seen.append(str(error))
+        return 5.0
+
+    outcome, _ = experiment(path, ScriptedRig(), ScriptedPlayer(second))
+    assert outcome.is_complete, outcome.reason
+    assert "exists; choose another name" in seen[0]
+    assert seen[1].endswith("a.csv: another process records into this file")
+    assert len(read_record(path, AERO).time) == 9
+    with Recorder(path, AERO, {}, overwrite=True):  # and then it is free again
+        pass
+    assert len(read_record(path, AERO).time) == 9
+
+
+def test_a_record_made_meanwhile_is_not_replaced(tmp_path):
+    path = tmp_path / "a.csv"
+    late = Recorder(path, AERO, {})  # when there is none yet
+    experiment(path, ScriptedRig())
+    content = path.read_bytes()
+    rig = ScriptedRig()
+    with pytest.raises(ValueError, match="exists; choose another name"), late, rig:
+        pass
+    assert path.read_bytes() == content
+    assert rig.log == []  # the second does not touch the rig
+
+
+def test_a_file_that_was_there_is_kept_where_no_experiment_begins(tmp_path):
+    path = tmp_path / "a.csv"
+    path.touch()
+    rig = ScriptedRig(failing={"open": RigError("no card")})
+    experiment(path, rig, recorder=Recorder(path, AERO, {}, overwrite=True))
+    assert [p.name for p in tmp_path.iterdir()] == ["a.csv"]
+    experiment(tmp_path / "b.csv", rig)
+    assert [p.name for p in tmp_path.iterdir()] == ["a.csv"]
+
+
+def test_the_lock_of_a_process_that_was_killed_is_gone(tmp_path):
+    with experiment_under_way(tmp_path, 3) as process:
+        with (
+            pytest.raises(ValueError, match="another process records into this file"),
+            Recorder(tmp_path / "r.csv", IDEAL.description, {}, overwrite=True),
+        ):
+            pass
+        process.kill()
+        process.wait()
+        with Recorder(tmp_path / "r.csv", IDEAL.description, {}, overwrite=True):
+            pass
 
 
 def test_a_record_is_never_a_folder(tmp_path):
@@ -902,9 +1114,32 @@ def test_a_killed_process_leaves_a_record_that_identifies(tmp_path):
         assert abs(result.params[name] / float(nominal) - 1) < 0.5
 
 
+CODES = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGHUP: 129}
+
+
 @pytest.mark.parametrize(
-    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)]
+    ("first", "second", "wait"),
+    [
+        (signal.SIGINT, signal.SIGINT, 0.0),
+        (signal.SIGTERM, signal.SIGINT, 0.005),
+        (signal.SIGINT, signal.SIGTERM, 0.01),
+    ],
 )
+def test_two_signals_are_an_end_as_one_is(first, second, wait, tmp_path):
+    with experiment_under_way(tmp_path, 5) as process:
+        for number in (first, second, second, second):
+            process.send_signal(number)
+            time.sleep(wait)
+        out, _ = process.communicate(timeout=PATIENCE)
+    ended = json.loads((tmp_path / "r.json").read_text())["ended"]
+    codes = {f"interrupted by {n.name}": CODES[n] for n in (first, second)}
+    assert process.returncode == codes[ended["reason"]]
+    assert "Traceback" not in out
+    assert "record: r.csv" in out
+    assert len(read_record(tmp_path / "r.csv", IDEAL.description).time) >= ended["num_samples"] > 3
+
+
+@pytest.mark.parametrize(("number", "code"), CODES.items())
 def test_a_signal_ends_it_with_its_own_code_and_a_whole_record(number, code, tmp_path):
     with experiment_under_way(tmp_path, 5) as process:
         process.send_signal(number)

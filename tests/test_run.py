@@ -1,7 +1,10 @@
 """`excite run`: exit codes, what is written and what is not, refusals, and life without JAX."""
 
 import json
+import math
 import os
+import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -16,13 +19,14 @@ from excite.estimation.identify import identify
 from excite.excitation import Chirp
 from excite.files import csv_text
 from excite.plant import Aero2, Aero2Detailed
-from excite.policy import read_policy
+from excite.policy import read_policy, shipped_policies
 from excite.record import read_record
-from excite.rig import session
+from excite.rig import Recorder, Stop, session
 from excite.rig.live_estimate import LiveEstimate
 
 AERO = Aero2Detailed.definition
 TESTS = Path(__file__).parent
+POLICIES = shipped_policies()
 
 OWN_RIG = """
 import numpy as np
@@ -63,6 +67,28 @@ class Foreign(Still):
     def __init__(self):
         from excite.plant import DCMotor
         self.description = DCMotor().description
+
+
+class Loud(Still):
+    def open(self):
+        raise ZeroDivisionError("it was touched")
+
+
+class Ended(Still):
+    def read(self):
+        if self.n == 20:
+            raise SystemExit(3)
+        return super().read()
+
+
+class EndedTwice(Ended):
+    def close(self):
+        raise RigError("the card does not answer")
+
+
+class Stopped(Still):
+    def close(self):
+        raise GeneratorExit
 
 
 class Half(AbstractRig):
@@ -245,6 +271,45 @@ def test_a_bad_option_is_one_sentence_and_exit_code_2(call, tmp_path, name):
     assert not (tmp_path / "r.json").exists()
 
 
+@pytest.mark.parametrize(("numbers", "sentence"), [
+    ({"spread": math.nan}, "spread must lie in [0, 1): got nan"),
+    ({"spread": math.inf}, "spread must lie in [0, 1): got inf"),
+    ({"spread": -0.1}, "spread must lie in [0, 1): got -0.1"),
+    ({"seed": -1}, "seed must be a whole number from 0 to 9223372036854775807: got -1"),
+    ({"seed": 10**30}, "seed must be a whole number"),
+    ({"steps": 0}, "steps must be a whole number from 2 to 10000000: got 0"),
+    ({"steps": 10**30}, "steps must be a whole number"),
+    ({"slew": math.nan}, "the slew limit must be positive: got nan"),
+    ({"slew": 0.0}, "the slew limit must be positive: got 0"),
+    ({"fault": {"latency": math.inf}}, "--fault latency=inf is not allowed"),
+])  # fmt: skip
+def test_a_number_that_is_none_is_refused_by_the_function_too(call, tmp_path, numbers, sentence):
+    with pytest.raises(ValueError, match=re.escape(sentence)):
+        session.run("simulated", signal="u.csv", fast=True, out="r.csv", **numbers)
+    assert not list(tmp_path.glob("r.*"))
+
+
+def test_a_policy_without_a_checksum_is_played_with_a_warning(call, tmp_path):
+    content = POLICIES["aero2_detailed"].read_bytes()
+    entry = f',"sha256":"{read_policy("aero2_detailed").hash}"'.encode()
+    old = content.replace(entry, b" " * len(entry))
+    assert len(old) == len(content) > len(entry)
+    (tmp_path / "old.safetensors").write_bytes(old)
+    done = bare(tmp_path, "--rig", "quanser", "--policy", "old.safetensors", "--dry-run", "--json")
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.splitlines() == [
+        JAX_IS_MISSING.strip(),
+        "warning: old.safetensors: has no checksum, so that damage is not seen; saved again it "
+        "has one",
+    ]
+    (tmp_path / "flipped.safetensors").write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    code, out, err = call("--policy", "flipped.safetensors", *FAST)
+    assert (code, out) == (2, "")
+    assert err == (
+        "excite: flipped.safetensors: damaged: its content does not match its checksum\n"
+    )
+
+
 def test_a_class_of_ones_own_is_a_rig(call):
     code, out, err = call("--rig", "own.py:Still", *SIGNAL, "--out", "r.csv", "--json")
     assert (code, err) == (0, "")
@@ -267,6 +332,72 @@ def test_a_rig_that_is_not_released_hides_no_outcome(call):
     assert told["reason"] == expected
     assert told["num_samples"] == 29
     assert read_record("r.csv", AERO).metadata["ended"]["reason"] == expected
+
+
+@pytest.mark.parametrize(("name", "reason", "code"), [
+    ("Ended", "SystemExit: 3", 3),
+    ("EndedTwice", "SystemExit: 3; the rig was not released: the card does not answer", 3),
+])  # fmt: skip
+def test_who_ends_the_program_ends_it_after_the_record(call, name, reason, code):
+    assert call("--rig", f"own.py:{name}", *SIGNAL, "--out", "r.csv")[0] == code
+    record = read_record("r.csv", AERO)
+    assert record.metadata["ended"]["reason"] == reason
+    assert record.metadata["ended"]["num_samples"] == len(record.time) == 11
+
+
+def test_an_end_of_the_program_while_the_rig_is_released_goes_on(call):
+    with pytest.raises(GeneratorExit):
+        session.run("own.py:Stopped", signal="u.csv", out="r.csv")
+    reason = read_record("r.csv", AERO).metadata["ended"]["reason"]
+    assert reason == "complete; the rig was not released: GeneratorExit"
+
+
+@pytest.mark.parametrize("error", [SystemExit(0), GeneratorExit()])
+def test_an_excitation_that_ends_the_program_is_recorded(call, error):
+    def end(sample):
+        if sample.k == 4:
+            raise error
+
+    with pytest.raises(type(error)):
+        session.run("own.py:Still", signal="u.csv", out="r.csv", on_sample=end)
+    ended = read_record("r.csv", AERO).metadata["ended"]
+    assert ended["reason"].startswith(type(error).__name__)
+    assert ended["num_samples"] == 5
+
+
+def test_a_program_can_ask_for_the_end(call):
+    stop = Stop()
+
+    def ask(sample):
+        if sample.k == 4:
+            stop.ask("the door was opened")
+
+    result = session.run("own.py:Still", signal="u.csv", out="r.csv", on_sample=ask, stop=stop)
+    assert result.outcome.reason == "the door was opened"
+    assert result.outcome.num_samples == 5
+
+
+def test_after_an_experiment_a_signal_does_not_change_the_exit_code(call):
+    assert call("--rig", "own.py:Still", *SIGNAL, "--out", "r.csv")[0] == 0
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        assert signal.getsignal(number) == signal.SIG_IGN
+
+
+def test_a_function_gives_signals_back(call):
+    before = signal.getsignal(signal.SIGTERM)
+    session.run("own.py:Still", signal="u.csv", out="s.csv")
+    assert signal.getsignal(signal.SIGTERM) == before
+
+
+def test_the_second_process_on_a_record_is_refused(call, tmp_path):
+    first = Recorder(Path("r.csv"), AERO, {})
+    with first:
+        first.begin()
+        before = (tmp_path / "r.csv").read_bytes(), (tmp_path / "r.json").read_bytes()
+        code, out, err = call("--rig", "own.py:Loud", *SIGNAL, "--out", "r.csv", "--overwrite")
+        assert (code, out) == (2, "")
+        assert err == "excite: r.csv: another process records into this file\n"
+        assert before == ((tmp_path / "r.csv").read_bytes(), (tmp_path / "r.json").read_bytes())
 
 
 def test_a_filter_says_how_often_it_intervened(call):

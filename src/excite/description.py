@@ -461,6 +461,24 @@ def wrong_type(what: str, value: object, allowed: str) -> TypeError:
     return TypeError(f"{what} must be {allowed}: got {kind}{shown * (not isinstance(value, type))}")
 
 
+LARGEST_SEED = 2**63 - 1
+
+
+def require_whole(what: str, value: Any, least: int, most: int = 10_000_000) -> None:
+    """Raises ValueError for anything but a whole number in a range."""
+    is_whole = hasattr(value, "__index__") and not isinstance(value, bool)
+    if not (is_whole and least <= int(value) <= most):
+        raise ValueError(
+            f"{what} must be a whole number from {least} to {most}: got {reprlib.repr(value)}"
+        )
+
+
+def require_spread(value: Any) -> None:
+    """Raises ValueError for a spread of plants that is not allowed."""
+    if not (hasattr(value, "__float__") and 0 <= float(value) < 1):  # also NaN
+        raise ValueError(f"spread must lie in [0, 1): got {reprlib.repr(value)}")
+
+
 def told(error: BaseException) -> str:
     """The type of an error of a user's code and what it says, in one short line."""
     try:

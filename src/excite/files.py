@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import hashlib
 import importlib.util
 import io
 import json
@@ -17,6 +18,7 @@ import re
 import shutil
 import sys
 import tempfile
+import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
@@ -199,13 +201,21 @@ def new_run_folder(path: Path, overwrite: bool = False) -> Iterator[Path]:
         shutil.rmtree(unfinished, ignore_errors=True)
 
 
-def took_lock(file: IO[str]) -> bool:
-    """Locks an open file for this process until it is closed; whether that succeeded."""
+_LOCKED_BYTE = 2**30  # beyond the end of a file: on Windows, nobody can read a locked byte
+
+
+def took_lock(file: IO[Any]) -> bool:
+    """Locks an open file until it is closed, or its process ends; whether that succeeded."""
     try:
         if fcntl is not None:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         elif msvcrt is not None:
-            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+            place = file.tell()
+            file.seek(_LOCKED_BYTE)
+            try:
+                msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+            finally:
+                file.seek(place)
     except OSError:
         return False
     return True
@@ -222,13 +232,14 @@ def class_at(path: Path, word: str, base: type, kind: str) -> Any:
     """
     if not path.is_file():
         raise ValueError(f"{path}: no such file")
-    found = getattr(_module_at(path), word, None)
+    found = getattr(module_at(path), word, None)
     if not (isinstance(found, type) and issubclass(found, base)):
         raise ValueError(f"{path} has no {kind} class {word!r}")
     return found
 
 
-def _module_at(path: Path) -> Any:
+def module_at(path: Path) -> Any:
+    """The module in a user's file, whose code is run; ValueError where it cannot be imported."""
     name = f"excite_file_{path.stem}"
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
@@ -245,19 +256,32 @@ def _module_at(path: Path) -> Any:
 
 
 _NUM_HEADER_BYTES = 8  # a safetensors file begins with the length of its JSON header
+_ABOUT = "__metadata__"  # texts by name in this header
+_OLD = {"format", "data"}  # such texts of files that were written without a checksum
 
 
 def tensors_to_bytes(
     tensors: Mapping[str, np.ndarray], file_format: str, data: Mapping[str, Any]
 ) -> bytes:
-    """Tensors and JSON-ready data as the content of one safetensors file."""
+    """Tensors and JSON-ready data as the content of one safetensors file, with a checksum."""
     arrays = {name: np.ascontiguousarray(array) for name, array in tensors.items()}
     metadata = {"format": file_format, "data": json_text(data)}
     header, rest = _split(safetensors.numpy.save(arrays, metadata=metadata))
-    # The library's order of metadata varies; equal policies must give equal files.
-    text = json.dumps(json.loads(header), sort_keys=True, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % _NUM_HEADER_BYTES)
-    return len(text).to_bytes(_NUM_HEADER_BYTES, "little") + text + rest
+    return with_checksum(_packed(json.loads(header), rest))
+
+
+def with_checksum(content: bytes) -> bytes:
+    """A safetensors file with its SHA-256 in the header: that of the content without it."""
+    header, rest = _split(content)
+    about = json.loads(header)
+    about[_ABOUT].pop("sha256", None)
+    about[_ABOUT]["sha256"] = hashlib.sha256(_packed(about, rest)).hexdigest()
+    return _packed(about, rest)
+
+
+def checksum_of(content: bytes) -> str | None:
+    """The checksum in a file's header, None where it has none."""
+    return (json.loads(_split(content)[0]).get(_ABOUT) or {}).get("sha256")
 
 
 def _split(content: bytes) -> tuple[bytes, bytes]:
@@ -266,26 +290,44 @@ def _split(content: bytes) -> tuple[bytes, bytes]:
     return content[_NUM_HEADER_BYTES:end], content[end:]
 
 
+def _packed(header: Mapping[str, Any], rest: bytes) -> bytes:
+    """Their file. The library's order of metadata varies; equal policies give equal files."""
+    text = json.dumps(header, sort_keys=True, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % _NUM_HEADER_BYTES)
+    return len(text).to_bytes(_NUM_HEADER_BYTES, "little") + text + rest
+
+
 def tensors_from_bytes(
     content: bytes, file_format: str, where: str
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Tensors and data written by `tensors_to_bytes`.
 
+    A file of an older version, which has no checksum, is read with a warning.
+
     Raises:
-        ValueError: one sentence for content that is truncated or of another format.
+        ValueError: one sentence for content that is truncated, changed, or of another format.
     """
     kind = file_format.rpartition(" ")[0]
     try:
         tensors = safetensors.numpy.load(content)
-        metadata = json.loads(_split(content)[0]).get("__metadata__") or {}
+        metadata = json.loads(_split(content)[0]).get(_ABOUT) or {}
         found = metadata.get("format", "none")
         if found != file_format:
             raise ValueError(f"{where}: format {found!r}; this version reads {file_format!r} files")
+        is_old = metadata.keys() == _OLD
+        # The whole content is compared: a bit that changes no meaning is found as well.
+        if metadata.keys() > _OLD and content != with_checksum(content):
+            raise ValueError(f"{where}: damaged: its content does not match its checksum")
         data = json.loads(metadata["data"])
         if not isinstance(data, dict):
             raise TypeError("its data are not a JSON object")
-        return tensors, data
     except (
         safetensors.SafetensorError, KeyError, TypeError, RecursionError, json.JSONDecodeError
     ) as error:  # fmt: skip
         raise ValueError(f"{where}: truncated, or no {kind} file ({error})") from None
+    if is_old:
+        warnings.warn(
+            f"{where}: has no checksum, so that damage is not seen; saved again it has one",
+            stacklevel=3,
+        )
+    return tensors, data

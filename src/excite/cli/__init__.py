@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 import sys
 import traceback
+import warnings
 
 import click
 
@@ -24,7 +25,7 @@ from .export import export
 from .falsify import falsify
 from .identify import identify
 from .information import information
-from .options import RememberingGroup, RunFailedError
+from .options import RememberingGroup, RunFailedError, show_warning
 from .plants import plants
 from .policies import evaluate, policies
 from .report import report
@@ -119,7 +120,9 @@ def main() -> None:
             stream.reconfigure(errors="backslashreplace")
     code: object = 0
     try:
-        code = cli(standalone_mode=False)
+        with warnings.catch_warnings():
+            warnings.showwarning = show_warning
+            code = cli(standalone_mode=False)
     except click.exceptions.NoArgsIsHelpError as error:
         click.echo(error.format_message())
         sys.exit(0)

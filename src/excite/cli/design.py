@@ -9,6 +9,7 @@ import click
 
 from .completion import signals
 from .options import (
+    FRACTION,
     NUMBERS,
     OUT_FILE,
     WholeNumber,
@@ -50,7 +51,9 @@ from .options import (
     metavar="T",
     help="Length in samples.",
 )
-@click.option("--spread", type=float, default=0.3, show_default=True, help="Spread of the plants.")
+@click.option(
+    "--spread", type=FRACTION, default=0.3, show_default=True, help="Spread of the plants."
+)
 @click.option("--noise", type=NUMBERS, multiple=True, help="Noise sd of an output, in its unit.")
 @click.option(
     "--seed",

@@ -35,7 +35,7 @@ from .options import (
 )
 @click.option(
     "--spread",
-    type=click.FloatRange(0, 1, max_open=True),
+    type=FRACTION,
     help="Spread of the parameters; default that of the policy's training, or 0.3.",
 )
 @uncertainty_option("What else may differ; default that of the policy's training.")
@@ -56,7 +56,7 @@ from .options import (
 )
 @click.option(
     "--seed",
-    type=WholeNumber(0, 2**63 - 1),
+    type=SEED,
     default=0,
     show_default=True,
     help="Seed of the search.",

@@ -14,6 +14,7 @@ from .options import (
     NUMBERS,
     OUT_FILE,
     Callback,
+    Number,
     WholeNumber,
     command_line,
     computing,
@@ -74,7 +75,7 @@ _OF_RECORDS = (
         help="Constant inputs that the file does not have: voltage=5.",
     ),
     click.option(
-        "--dt", type=float, metavar="SECONDS", help="Sampling time of a file without time."
+        "--dt", type=Number(), metavar="SECONDS", help="Sampling time of a file without time."
     ),
     click.option(
         "--rows",
@@ -184,7 +185,7 @@ def _priors(words: Sequence[str]) -> list[dict[str, str] | Path] | None:
 )
 @click.option(
     "--samples",
-    type=WholeNumber(min=10),
+    type=WholeNumber(10),
     default=1000,
     show_default=True,
     help="Posterior samples of each of four chains.",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import json
+import math
 import os
 import re
 import shlex
@@ -16,7 +17,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Generic, ParamSpec, Self, TypeVar
+from typing import Any, Generic, ParamSpec, Self, TypeVar
 
 import click
 
@@ -78,10 +79,39 @@ class Assignments(click.ParamType, Generic[Value]):
         return result
 
 
+MOST = 10_000_000
+"""Largest count: samples, episodes, updates, ..."""
+
+
 class WholeNumber(click.IntRange):
     """A whole number in a range, with this word in its messages."""
 
     name = "whole number"
+
+    def __init__(self, min: int, max: int = MOST) -> None:
+        """The range, both ends included."""
+        super().__init__(min, max)
+
+
+SEED = WholeNumber(0, 2**63 - 1)
+
+
+class Number(click.FloatRange):
+    """A finite number in a range."""
+
+    name = "number"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        """The number; a comparison alone would let NaN pass."""
+        number = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"{value!r} is not a finite number", param, ctx)
+        return number
+
+
+FRACTION = Number(0, 1, max_open=True)
 
 
 def _option_value(text: str) -> bool | float | list[object]:
@@ -236,12 +266,17 @@ def _duration(seconds: float) -> str:
     return f"{minutes} min" if seconds >= 90 else f"{seconds:.0f} s"
 
 
+def show_warning(message: Warning | str, *_: object, **__: object) -> None:
+    """A warning as a sentence on stderr."""
+    click.echo(f"warning: {message}", err=True)
+
+
 @contextlib.contextmanager
 def warnings_shown() -> Iterator[None]:
-    """Warnings as sentences on stderr."""
+    """Every warning as a sentence on stderr, also one that was shown before."""
     with warnings.catch_warnings():
         warnings.simplefilter("always", UserWarning)
-        warnings.showwarning = lambda message, *_, **__: click.echo(f"warning: {message}", err=True)
+        warnings.showwarning = show_warning
         yield
 
 

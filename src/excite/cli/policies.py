@@ -9,7 +9,9 @@ from typing import Any
 import click
 
 from .options import (
+    FRACTION,
     NUMBERS,
+    SEED,
     WholeNumber,
     computing,
     json_option,
@@ -76,10 +78,10 @@ def _worst(certificate: Mapping[str, Any] | None) -> str:
 @click.option(
     "--episodes", type=WholeNumber(1), default=1000, show_default=True, help="Plants drawn."
 )
+@click.option("--seed", type=SEED, default=0, show_default=True, help="Seed of the plants.")
 @click.option(
-    "--seed", type=WholeNumber(0), default=0, show_default=True, help="Seed of the plants."
+    "--spread", type=FRACTION, default=0.3, show_default=True, help="Spread of the plants."
 )
-@click.option("--spread", type=float, default=0.3, show_default=True, help="Spread of the plants.")
 @uncertainty_option("What else may differ, as in 'excite falsify'.")
 @click.option("--noise", type=NUMBERS, multiple=True, help="Noise sd of an output, in its unit.")
 @click.option("--estimators", metavar="NAME,...", help="Default nls, and arx-rls if possible.")

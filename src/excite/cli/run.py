@@ -10,9 +10,12 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from .options import (
+    FRACTION,
     NUMBERS,
     OUT_FILE,
+    SEED,
     VALUES,
+    Number,
     RunFailedError,
     WholeNumber,
     json_option,
@@ -27,7 +30,7 @@ if TYPE_CHECKING:
 
 _EXIT_CODES = {
     "interrupted by SIGINT": 130,
-    "interrupted": 130,  # by a second Ctrl-C
+    "interrupted": 130,  # by a second Ctrl-C, where the rig hangs
     "interrupted by SIGTERM": 143,
     "interrupted by SIGHUP": 129,
 }
@@ -52,7 +55,7 @@ def _options(command: Callable[..., int]) -> Callable[..., int]:
         click.option("--overwrite", is_flag=True, help="Replace the record if it exists."),
         click.option("--steps", type=WholeNumber(2), metavar="T",
                      help="Number of samples; default all of a policy or file, else 500."),
-        click.option("--slew", type=float, default=math.inf, metavar="RATE",
+        click.option("--slew", type=Number(), metavar="RATE",
                      help="Largest change of an input per second, in its unit; default no limit."),
         click.option("--filter", is_flag=True,
                      help="Predictive safety filter: changes an input where a plant of the prior "
@@ -63,10 +66,10 @@ def _options(command: Callable[..., int]) -> Callable[..., int]:
         click.option("--fast", is_flag=True,
                      help="Run a simulated rig or an FMU as fast as it can."),
         click.option("--dry-run", is_flag=True, help="Show the inputs; send nothing."),
-        click.option("--seed", type=WholeNumber(0), default=0, show_default=True,
+        click.option("--seed", type=SEED, default=0, show_default=True,
                      help="Seed of a simulated rig's hidden parameters, noise and jitter, and of "
                      "random signals."),
-        click.option("--spread", type=click.FloatRange(0, 1, max_open=True), default=0.3,
+        click.option("--spread", type=FRACTION, default=0.3,
                      show_default=True,
                      help="Spread of these parameters and of the filter's prior, as a fraction of "
                      "their scales."),
@@ -93,6 +96,20 @@ def run(
     filter are then off.
     """
     _prepare()
+    from ..rig.loop import ignore_signals, interruptible
+
+    with interruptible(has_begun=False) as stop:
+        try:
+            given = {**options, "options": merged(settings), "fault": merged(faults)}
+            given["slew"] = math.inf if given["slew"] is None else given["slew"]
+            return _run_and_show(as_json, stop=stop, **given)
+        finally:
+            if stop.has_begun:
+                ignore_signals()  # until the process has ended
+
+
+def _run_and_show(as_json: bool, **options: Any) -> int:
+    """The experiment and its result; the exit code."""
     from ..rig import RigError
     from ..rig.session import DryRun
     from ..rig.session import run as run_on_rig
@@ -102,8 +119,6 @@ def run(
     try:
         result = run_on_rig(
             **options,
-            options=merged(settings),
-            fault=merged(faults),
             on_sample=view,
             on_warning=lambda sentence: click.echo(f"warning: {sentence}", err=True),
         )

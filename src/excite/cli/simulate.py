@@ -13,6 +13,7 @@ from .options import (
     NAMES,
     NUMBERS,
     OUT_FILE,
+    SEED,
     VALUES,
     RunFailedError,
     WholeNumber,
@@ -40,7 +41,7 @@ def excitation_options(command: Callable[..., Any]) -> Callable[..., Any]:
             click.option("--set", "settings", type=VALUES, multiple=True,
                          help="Options of the excitation, such as amplitude=5 (the message about "
                          "an unknown one lists them); of a loop also gain, damping."),
-            click.option("--steps", type=WholeNumber(2, 10_000_000), metavar="T",
+            click.option("--steps", type=WholeNumber(2), metavar="T",
                          help="Length in samples; default 500, that of a policy, or all of a "
                          "file."),
             click.option("--params", type=NUMBERS, multiple=True,
@@ -49,7 +50,7 @@ def excitation_options(command: Callable[..., Any]) -> Callable[..., Any]:
                          help="Standard deviation of an output's noise, in its unit."),
             click.option("--resolution", type=NUMBERS, multiple=True,
                          help="Step of an output's encoder, in its unit."),
-            click.option("--seed", type=WholeNumber(0, 2**63 - 1), default=0, show_default=True),
+            click.option("--seed", type=SEED, default=0, show_default=True),
             click.option("--column", type=NAMES, multiple=True,
                          help="Columns of the input file with another name: voltage=u."),
             click.option("--scale", type=NUMBERS, multiple=True,

@@ -12,6 +12,7 @@ import click
 
 from .options import (
     OUT_FILE,
+    SEED,
     RunFailedError,
     WholeNumber,
     command_line,
@@ -39,7 +40,7 @@ def changes(command: Callable[..., Any]) -> Callable[..., Any]:
     for option in (
         click.option("--overwrite", is_flag=True, help="Replace the run folder if it exists."),
         click.option("--estimators", metavar="NAME,...", help="Instead of the study's."),
-        click.option("--seed", type=WholeNumber(0, 2**63 - 1), help="Instead of the study's."),
+        click.option("--seed", type=SEED, help="Instead of the study's."),
         click.option("--episodes", type=WholeNumber(1), help="Instead of the study's."),
     ):
         command = option(command)

@@ -8,9 +8,11 @@ from typing import Any
 import click
 
 from .options import (
+    FRACTION,
     NUMBERS,
     OUT_FILE,
     VALUES,
+    Number,
     WholeNumber,
     computing,
     json_option,
@@ -38,13 +40,13 @@ def _options(command: Any) -> Any:
                          help="Scale by which an observed output is divided, in its unit."),
             click.option("--window", type=WholeNumber(1, 10_000),
                          help="Number of samples observed; default 80."),
-            click.option("--clock", type=float, multiple=True, metavar="HZ",
+            click.option("--clock", type=Number(), multiple=True, metavar="HZ",
                          help="Also observe sine and cosine of this frequency."),
             click.option("--set", "training", type=VALUES, multiple=True,
                          help="Hyper-parameters of the method, for instance num_updates=300."),
             click.option("--seeds", type=WholeNumber(1, 1000), default=1, show_default=True,
                          help="Number of independent trainings."),
-            click.option("--spread", type=click.FloatRange(0, 1, max_open=True), default=0.3,
+            click.option("--spread", type=FRACTION, default=0.3,
                          show_default=True,
                          help="Plants are drawn from nominal values ± this fraction."),
             uncertainty_option("What else may differ: the policy is made safe there too."),

@@ -10,7 +10,6 @@ training and simulation. Nothing is unpickled.
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,7 +20,13 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from ..description import Input, Output, PlantDescription
-from ..files import require_new_file, tensors_from_bytes, tensors_to_bytes, write_bytes
+from ..files import (
+    checksum_of,
+    require_new_file,
+    tensors_from_bytes,
+    tensors_to_bytes,
+    write_bytes,
+)
 
 FORMAT = "excite policy 1"
 _MAX_COUNT = 2**31  # of samples, in a file of unknown origin
@@ -243,8 +248,8 @@ class Policy:
 
     @property
     def hash(self) -> str:
-        """SHA-256 of the policy's file content without its certificate."""
-        return hashlib.sha256(self.certified(None).to_bytes()).hexdigest()
+        """SHA-256 of contract and weights, without the certificate: what the policy does."""
+        return str(checksum_of(self.certified(None).to_bytes()))
 
     @property
     def claim(self) -> str:
@@ -300,7 +305,7 @@ class Policy:
         """The policy in the content of a file.
 
         Raises:
-            ValueError: one sentence for content that is truncated, of another version,
+            ValueError: one sentence for content that is truncated, changed, of another version,
                 inconsistent, or with numbers that are not finite.
         """
         tensors, contract = tensors_from_bytes(content, FORMAT, where)

@@ -19,6 +19,7 @@ import numpy as np
 
 from ..description import PlantDescription
 from ..safety import safe_input
+from .watchdog import Watchdog, WatchdogProcess
 
 
 class RigError(Exception):
@@ -77,6 +78,7 @@ class AbstractRig(abc.ABC):
             `num_readings`. The record holds the reading at which the input takes effect.
         is_real_time: whether readings come in real time.
         starts_at_rest: whether the plant is at its initial state when the rig is opened.
+        watchdog: how another process sends the safe input when this one was killed or hangs.
     """
 
     description: PlantDescription
@@ -84,6 +86,8 @@ class AbstractRig(abc.ABC):
     num_latency: int = 0
     is_real_time: bool = True
     starts_at_rest: bool = False
+    watchdog: Watchdog | None = None
+    _watching: WatchdogProcess | None = None
 
     @abc.abstractmethod
     def open(self) -> None:
@@ -114,22 +118,47 @@ class AbstractRig(abc.ABC):
         """Facts about the rig for the record, JSON-ready; called after the experiment."""
         return {}
 
+    def alive(self) -> None:
+        """Tells the watchdog that the experiment goes on; RigError if it has ended."""
+        if self._watching is not None and (sentence := self._watching.beat()):
+            raise RigError(sentence)
+
+    def make_safe(self) -> None:
+        """Applies the safe input, and tells the watchdog."""
+        self.write(self.safe_input)
+        if self._watching is not None:
+            self._watching.rest()
+
     def __enter__(self) -> Self:
-        """Opens the rig; closes it if that fails."""
+        """Starts the watchdog and opens the rig; closes it if that fails."""
+        if self.watchdog is not None:
+            interval = self.description.dt / self.num_readings
+            self._watching = WatchdogProcess(self.watchdog, self.safe_input, interval)
         try:
             self.open()
         except BaseException:
-            with contextlib.suppress(Exception):
+            with contextlib.suppress(BaseException):
                 self.close()
+            self._end_watching(is_safe=True)  # no input was written
             raise
         return self
 
     def __exit__(self, *_: object) -> None:
         """Applies the safe input, and releases the hardware even if that fails."""
+        is_safe = False
         try:
-            self.write(self.safe_input)
+            self.make_safe()
+            is_safe = True
         finally:
-            self.close()
+            try:
+                self.close()
+            finally:
+                self._end_watching(is_safe)
+
+    def _end_watching(self, is_safe: bool) -> None:
+        watching, self._watching = self._watching, None
+        if watching is not None:
+            watching.end(is_safe)
 
 
 class Pacer:

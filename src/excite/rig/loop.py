@@ -3,8 +3,9 @@
 At every sampling instant: read, check the reading, ask the player for an input, limit it,
 apply it, record the sample. Every reading in between is checked too. An experiment ends
 when it is complete, by a trip of the supervisor, by a signal (Ctrl-C), or by an error of
-the player, the rig or the disk. In each case the safe input is applied, the hardware is
-released (the rig is a context manager), and the record is readable and has the reason.
+the player, the rig or the disk, also one that ends the program (`SystemExit`). In each case
+the safe input is applied, the hardware is released (the rig is a context manager), and the
+record is readable and has the reason.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from types import FrameType
 
 import numpy as np
 
@@ -25,8 +27,13 @@ from ..safety import Supervision, Trip, Watch, allowed, check_reading, check_sam
 from .contract import AbstractRig, Reading, RigError, Sample
 from .player import AbstractPlayer
 from .recorder import Recorder
+from .watchdog import SIGNALS
 
 COMPLETE = "complete"
+ENDS_OF_PROGRAM = (SystemExit, GeneratorExit)
+"""They end the experiment, are recorded, and are then raised again by `session.run`."""
+
+_PATIENCE = 2.0  # seconds after a first signal in which another one changes nothing
 _PERCENTILES = (50, 90, 99, 100)
 
 # After these trips the last reading is not a measurement of the plant, and is not recorded.
@@ -87,7 +94,8 @@ class Outcome:
     def failed(self, what: str, error: BaseException) -> None:
         """Adds an error that came after the experiment's end."""
         self.reason += f"; {what}: {_sentence(error)}"
-        self.error = self.error or error
+        if self.error is None or isinstance(error, ENDS_OF_PROGRAM):
+            self.error = error
 
 
 class Stop:
@@ -95,35 +103,69 @@ class Stop:
 
     Attributes:
         reason: one sentence; empty without a request.
+        has_begun: whether the experiment has begun; before, signals act as usual.
+        is_ending: whether it ends already; a request then changes nothing.
     """
 
-    reason = ""
+    def __init__(self, has_begun: bool = True) -> None:
+        """No request."""
+        self.reason, self.has_begun, self.is_ending = "", has_begun, False
+        self._since = 0.0
+
+    def ask(self, reason: str) -> None:
+        """Asks for the end: the first reason counts.
+
+        Raises:
+            KeyboardInterrupt: where rig or player did not react to a request for two seconds.
+        """
+        now = time.perf_counter()
+        if not self.reason:
+            self.reason, self._since = reason, now
+        elif not self.is_ending and now - self._since > _PATIENCE:
+            raise KeyboardInterrupt
 
 
 @contextlib.contextmanager
-def interruptible() -> Iterator[Stop]:
+def interruptible(has_begun: bool = True) -> Iterator[Stop]:
     """A signal (Ctrl-C, a closed terminal) ends the experiment at its next reading.
 
-    A second signal interrupts at once. Outside the main thread, signals are not handled.
+    More signals change nothing, unless the rig or the player hangs. A handler that is set
+    within stays. Outside the main thread, signals are not handled.
+
+    Args:
+        has_begun: False where the experiment sets `Stop.has_begun` when it begins.
     """
-    stop, before = Stop(), {}
+    stop, before = Stop(has_begun), {}
     if threading.current_thread() is not threading.main_thread():
         yield stop
         return
 
-    def ask(number: int, _: object) -> None:
-        if stop.reason:
-            raise KeyboardInterrupt
-        stop.reason = f"interrupted by {signal.Signals(number).name}"
+    def ask(number: int, frame: FrameType | None) -> None:
+        if stop.has_begun:
+            stop.ask(f"interrupted by {signal.Signals(number).name}")
+        elif callable(usual := before[number]):
+            usual(number, frame)
+        elif usual == signal.SIG_DFL:
+            signal.signal(number, signal.SIG_DFL)
+            signal.raise_signal(number)
 
-    for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK"):
+    for name in SIGNALS:
         if (number := getattr(signal, name, None)) is not None:
-            before[number] = signal.signal(number, ask)
+            before[number] = signal.getsignal(number)
+            signal.signal(number, ask)
     try:
         yield stop
     finally:
         for number, handler in before.items():
-            signal.signal(number, handler)
+            if signal.getsignal(number) is ask:
+                signal.signal(number, handler)
+
+
+def ignore_signals() -> None:
+    """For the end of a program: a request to end it changes nothing, not even its exit code."""
+    for name in SIGNALS:
+        if (number := getattr(signal, name, None)) is not None:
+            signal.signal(number, signal.SIG_IGN)
 
 
 @dataclass
@@ -153,6 +195,7 @@ class _Run:
                 f"{rig.num_readings} of one sampling time"
             )
         first, now = rig.read(), time.perf_counter()
+        rig.alive()
         watch = Watch.start(np, rules, first.outputs)
         run = cls(rig, rules, outcome, stop, watch, first, first, now, num_steps)
         run.look(first)
@@ -266,22 +309,28 @@ def run_loop(
         recorder: open; it writes to the sidecar how the experiment ended.
         stop: a request to end.
         on_sample: called at every sampling instant, after the input was applied.
+
+    Raises:
+        ValueError, OSError: where the record cannot be begun; nothing was played.
     """
+    recorder.begin()
     outcome = Outcome(max_abs_output=np.zeros(len(rules.critical)))
+    stop = stop or Stop()
     try:
-        under_way = _Run.begin(rig, rules, outcome, stop or Stop(), player.num_steps)
+        under_way = _Run.begin(rig, rules, outcome, stop, player.num_steps)
         _play(under_way, player, recorder, on_sample)
         under_way.ended()
-    except (Exception, KeyboardInterrupt) as error:
+    except BaseException as error:  # also of who ends the program
         outcome.reason, outcome.error = _sentence(error), error
+    stop.is_ending = True
     try:
-        rig.write(rig.safe_input)
-    except (Exception, KeyboardInterrupt) as error:
+        rig.make_safe()
+    except BaseException as error:
         outcome.failed("the safe input could not be applied", error)
     outcome.rig, outcome.player = _facts(rig), _facts(player)
     try:
         recorder.end(outcome.to_dict())
-    except (Exception, KeyboardInterrupt) as error:  # a full disk, for example
+    except BaseException as error:  # a full disk, for example
         outcome.failed("the end was not recorded", error)
     return outcome
 
@@ -290,7 +339,7 @@ def _facts(part: AbstractRig | AbstractPlayer) -> Mapping[str, object]:
     """The facts, or the error in calling for them, so that the end is recorded in any case."""
     try:
         return json.loads(json_text(part.facts()))
-    except (Exception, KeyboardInterrupt) as error:
+    except BaseException as error:
         return {"error": _sentence(error)}
 
 
@@ -308,6 +357,7 @@ def _play(
         proposed = rig.safe_input if is_last or run.is_over else player(k, run.last.outputs)
         run.look_at_player()
         run.watch, input = allowed(np, run.rules, run.watch, proposed)
+        rig.alive()
         rig.write(input)
         if not is_last:
             player.applied(input)
@@ -319,6 +369,7 @@ def _play(
                 return
             if i < rig.num_readings:
                 run.look(rig.read())
+                rig.alive()
         planned = (k + 1) * run.rules.dt
         if abs(run.time - planned) > 0.02 * planned + 2 * run.rules.dt:
             run.trip(Trip.DURATION)
@@ -330,4 +381,4 @@ def _sentence(error: BaseException) -> str:
         return str(error)
     if isinstance(error, KeyboardInterrupt):
         return "interrupted"
-    return f"{type(error).__name__}: {error}"
+    return f"{type(error).__name__}: {error}".removesuffix(": ")

@@ -18,7 +18,15 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 
 from .. import __version__
-from ..description import PlantDescription, display_unit, path_from, wrong_type
+from ..description import (
+    LARGEST_SEED,
+    PlantDescription,
+    display_unit,
+    path_from,
+    require_spread,
+    require_whole,
+    wrong_type,
+)
 from ..policy import Policy, mismatch, policy_path, read_policy
 from ..record import Record, read_record, read_signal, require_record_path
 from ..record.read import SIGNAL_ENDINGS
@@ -26,7 +34,7 @@ from ..report.tables import html_table, text_table
 from ..safety import Supervision, Watch, allowed
 from .catalogue import HAS_JAX, RigOptions, rig_named
 from .contract import AbstractRig, Interval, Sample
-from .loop import Outcome, interruptible, run_loop
+from .loop import ENDS_OF_PROGRAM, Outcome, Stop, interruptible, run_loop
 from .player import AbstractPlayer, PolicyPlayer, SignalPlayer, step_seconds
 from .recorder import Recorder
 
@@ -195,6 +203,7 @@ def run(
     fault: Mapping[str, float] | None = None,
     on_sample: OnSample = lambda _: None,
     on_warning: Callable[[str], None] = lambda _: None,
+    stop: Stop | None = None,
 ) -> RunResult | DryRun:
     """One experiment on a rig: supervised, recorded as it happens, ended by the safe input.
 
@@ -222,6 +231,8 @@ def run(
         on_sample: called with every sample, after its input was applied.
         on_warning: called with a sentence, before the experiment, where the policy was trained
             on another plant.
+        stop: a request to end, which a program can make at any time; without it, signals
+            (Ctrl-C) end the experiment.
 
     Returns:
         How it ended, with the path of the record; for a dry run, its inputs. An experiment
@@ -231,12 +242,17 @@ def run(
         ValueError: one sentence for what does not exist, does not fit together, needs JAX, or
             is too slow for the sampling time.
         RigError: for a rig that cannot be opened.
+        SystemExit, GeneratorExit: of a rig or an excitation, after the end was recorded.
 
     Example:
         >>> import excite as ex
         >>> ex.run(policy="aero2", dry_run=True).inputs.shape
         (500, 1)
     """
+    require_whole("seed", seed, 0, LARGEST_SEED)
+    require_spread(spread)
+    if steps is not None:
+        require_whole("steps", steps, 2)
     path = None if out is None else path_from("out", out)
     if path is not None:
         require_record_path(path, overwrite)
@@ -287,7 +303,7 @@ def run(
         "fault": [dict(fault)] if fault else [],
         **({"options": dict(options)} if options else {}),
     }
-    outcome, live = session.run(path, overwrite, asked, on_sample)
+    outcome, live = session.run(path, overwrite, asked, on_sample, stop)
     return RunResult(description, source.name, outcome, path, live, warnings)
 
 
@@ -431,7 +447,12 @@ class _Session:
         return np.array(inputs)
 
     def run(
-        self, path: Path, overwrite: bool, asked: Mapping[str, object], on_sample: OnSample
+        self,
+        path: Path,
+        overwrite: bool,
+        asked: Mapping[str, object],
+        on_sample: OnSample,
+        stop: Stop | None,
     ) -> tuple[Outcome, Mapping[str, Interval]]:
         """The experiment: how it ended, and the estimate from all its samples."""
         self._check_latency()
@@ -443,25 +464,37 @@ class _Session:
                 sample = replace(sample, live_estimate=live.latest)
             on_sample(sample)
 
+        recorder = Recorder(path, self._rig.description, self._metadata(asked), overwrite)
+        with interruptible() if stop is None else contextlib.nullcontext(stop) as stop:
+            stop.has_begun = True
+            try:
+                with recorder:
+                    outcome = self._play(recorder, stop, show)
+            finally:
+                stop.is_ending = True
+                # The record is complete: an error of the live estimate does not change the outcome.
+                with contextlib.suppress(Exception, KeyboardInterrupt):
+                    if live is not None:
+                        live.close()
+        if isinstance(outcome.error, ENDS_OF_PROGRAM):
+            raise outcome.error
+        return outcome, {} if live is None else live.latest
+
+    def _play(self, recorder: Recorder, stop: Stop, on_sample: OnSample) -> Outcome:
+        """The experiment, with a rig that is released."""
         rig, outcome = self._rig, None
-        recorder = Recorder(path, rig.description, self._metadata(asked), overwrite)
         try:
-            with interruptible() as stop, rig, recorder as record:
+            with rig:
                 outcome = run_loop(
-                    rig, self._player, self._rules, record, stop=stop, on_sample=show
+                    rig, self._player, self._rules, recorder, stop=stop, on_sample=on_sample
                 )
-        except (Exception, KeyboardInterrupt) as error:
+        except BaseException as error:
             if outcome is None:
                 raise
             outcome.failed("the rig was not released", error)
             with contextlib.suppress(OSError, ValueError):
                 recorder.end(outcome.to_dict())
-        finally:
-            # The record is complete: an error of the live estimate does not change the outcome.
-            with contextlib.suppress(Exception, KeyboardInterrupt):
-                if live is not None:
-                    live.close()
-        return outcome, {} if live is None else live.latest
+        return outcome
 
     def _live_estimate(self) -> LiveEstimate | None:
         if self._plant is None:
@@ -470,6 +503,7 @@ class _Session:
 
     def _metadata(self, asked: Mapping[str, object]) -> dict[str, object]:
         """Content of the sidecar before the experiment."""
+        watchdog = self._rig.watchdog
         return {
             "starts_at_initial_state": self._rig.starts_at_rest,
             "provenance": {
@@ -480,6 +514,7 @@ class _Session:
                 **asked,
                 "num_readings": self._rig.num_readings,
                 "num_latency": self._rig.num_latency,
+                **({} if watchdog is None else {"watchdog": watchdog.to_dict()}),
             },
         }
 

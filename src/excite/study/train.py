@@ -91,7 +91,7 @@ def train(
     agent = {
         "targets": ([target] if isinstance(target, str) else list(target)) or None,
         "method": method,
-        "decision": {name: value for name, value in decision.items() if value},
+        "decision": {n: v for n, v in decision.items() if v not in (None, [], {})},
         "training": dict(training or {}),
     }
     settings = {"episodes": episodes, "num_steps": steps, "spread": spread, "seeds": seeds}

@@ -18,7 +18,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .. import __version__
-from ..description import PlantDescription, unknown, wrong_type
+from ..description import (
+    LARGEST_SEED,
+    PlantDescription,
+    require_spread,
+    require_whole,
+    unknown,
+    wrong_type,
+)
 from ..environment import Env, run_episodes
 from ..excitation import Replay
 from ..excitation.catalogue import EXCITATIONS, LOOP, excitation_named
@@ -217,14 +224,13 @@ def _check(
     trials: int | None,
 ) -> None:  # fmt: skip
     """Raises ValueError for a number that is not allowed."""
-    counts = {"steps": (steps, 2), "seed": (seed, 0), "starts": (starts, 1)}
+    counts = {"steps": (steps, 2), "starts": (starts, 1)}
     counts |= {"updates": (updates, 1), "trials": (trials, 1)}
     for name, (value, least) in counts.items():
-        is_count = isinstance(value, int) and not isinstance(value, bool) and value >= least
-        if value is not None and not is_count:
-            raise ValueError(f"{name} must be a whole number, at least {least}: got {value!r}")
-    if not (isinstance(spread, int | float) and 0 <= spread < 1):
-        raise ValueError(f"spread must lie in [0, 1): got {spread!r}")
+        if value is not None:
+            require_whole(name, value, least)
+    require_whole("seed", seed, 0, LARGEST_SEED - 1)  # the next one judges the signal
+    require_spread(spread)
 
 
 def _searched(
