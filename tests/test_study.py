@@ -709,7 +709,9 @@ def test_a_plant_file_that_is_not_there_is_said(name, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("name", ["Aero2", "aero3", "tank.py", "tank.txt:Tank", ""])
 def test_a_name_that_is_no_plant_is_said(name):
-    with pytest.raises(ValueError, match=r"unknown plant .* \(there is aero2, .*ClassName\)"):
+    with pytest.raises(
+        ValueError, match=r"unknown plant .* \(there is aero2, .*ClassName, .*json\)"
+    ):
         plant_named(name)
 
 

@@ -8,8 +8,10 @@ from typing import Any
 import click
 
 from .options import (
+    FRACTION,
     NUMBERS,
     OUT_FILE,
+    SEED,
     VALUES,
     WholeNumber,
     computing,
