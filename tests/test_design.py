@@ -14,6 +14,7 @@ from excite.environment import prior_sd_of, run_episodes
 from excite.excitation import Chirp, Replay
 from excite.excitation.catalogue import EXCITATIONS, LOOP
 from excite.plant import AbstractPlant, Aero2
+from excite.plant.uncertainty import Uncertainty
 from excite.record import read_record
 from excite.training.design import design
 from excite.training.signals import (
@@ -197,3 +198,27 @@ def test_a_design_is_saved_shown_and_played(tmp_path):
 def test_an_argument_of_a_design_that_is_not_allowed_is_a_sentence(arguments, sentence):
     with pytest.raises(ValueError, match=re.escape(sentence)):
         design("aero2", **arguments)
+
+
+class Limited(Amplifier):
+    """With |y| below 9 V: at gain 2 and parameter 3.9 the input must stay below 1.154 V."""
+
+    definition = dataclasses.replace(
+        Amplifier.definition, outputs=(Output("y", "V", 10.0, noise_sd=0.1, critical_level=9.0),)
+    )
+
+
+def test_a_robust_signal_is_made_safe_in_a_declared_uncertainty():
+    plant, few = Limited(), dataclasses.replace(ROBUST, num_updates=200, num_plants=4)
+    box = Uncertainty.of(plant, 0.3, {"gain_u": (0.5, 2.0)})
+    found = robust_signal(signal_env(plant, 12, 0.3, uncertainty=box), 0, 2, few)
+    usual = robust_signal(signal_env(plant, 12, 0.3), 0, 2, few)
+    highest = 9.0 / (2 * 1.3 * 3.0)
+    assert 0.9 * highest < np.max(np.abs(found.inputs)) < highest
+    assert np.max(np.abs(usual.inputs)) > 1.5 * highest
+    assert found.worth[0] < usual.worth[0]
+
+
+def test_only_a_robust_design_takes_an_uncertainty():
+    with pytest.raises(ValueError, match="only a robust design takes an uncertainty"):
+        design("aero2", "clairvoyant", uncertainty={"d_S": "10%"})

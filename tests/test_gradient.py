@@ -368,7 +368,7 @@ def test_adversaries_come_nearer_than_plants_drawn_at_random_and_are_kept():
     after, _ = update(env, AGAINST, now, KEYS, True)
     assert env.uncertainty is not None
     assert after.adversaries is not None
-    play = OnPlant(env.uncertainty, now.player.excitation(), 60)
+    play = OnPlant(env.uncertainty, now.player.excitation(env.layout), 60)
     worst = np.asarray(jax.vmap(play)(after.adversaries))
     points = jax.vmap(env.uncertainty.draw)(jax.random.split(jax.random.key(9), 6))
     drawn = np.asarray(jax.vmap(play)(Cases(points, jnp.arange(6))))
@@ -388,7 +388,7 @@ def test_the_penalty_of_adversaries_lowers_the_nearness_in_the_declared_uncertai
     cases = Cases(jnp.ones((1, len(box.names))), jnp.zeros(1, int))
 
     def nearest(player: Network) -> float:
-        return float(jax.vmap(OnPlant(box, player.excitation(), 60))(cases)[0])
+        return float(jax.vmap(OnPlant(box, player.excitation(env.layout), 60))(cases)[0])
 
     before, step = nearest(now.player), eqx.filter_jit(update)
     for i in range(10):

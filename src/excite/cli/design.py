@@ -19,6 +19,7 @@ from .options import (
     plot_option,
     progress_bar,
     show_json,
+    uncertainty_option,
 )
 
 
@@ -54,6 +55,7 @@ from .options import (
 @click.option(
     "--spread", type=FRACTION, default=0.3, show_default=True, help="Spread of the plants."
 )
+@uncertainty_option("What else may differ: a robust design is made safe there too.")
 @click.option("--noise", type=NUMBERS, multiple=True, help="Noise sd of an output, in its unit.")
 @click.option(
     "--seed",
@@ -79,6 +81,7 @@ def design(
     from ..figure import save
     from ..training.design import design as designed
 
+    options["uncertainty"] = merged(options["uncertainty"])
     with progress_bar(f"designing for {plant}") as progress:
         made = designed(plant, noise=merged(noise), out=out, progress=progress, **options)
     if plot is not None:

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from ..description import names_of, unknown, wrong_type
+from ..description import names_of, require_spread, unknown, wrong_type
 from .contract import AbstractPlant, Params, Sensor
 from .extension import extended, extensions_of, plain_kind
 from .fields import floats
@@ -72,8 +72,7 @@ class Uncertainty(eqx.Module):
         """
         if not isinstance(ranges, Mapping | None):
             raise wrong_type("uncertainty", ranges, "a dict of ranges by name")
-        if not 0 <= spread < 1:
-            raise ValueError(f"spread must be 0 or more and below 1: got {spread:g}")
+        require_spread(spread)
         given = {_PARAMETERS: f"{100 * spread}%", **(ranges or {})}
         possible = extensions_of(plant)
         added = [name for name in given if name in possible]

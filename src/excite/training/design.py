@@ -32,6 +32,7 @@ from ..excitation.catalogue import EXCITATIONS, LOOP, excitation_named
 from ..information import d_optimality, require_noise
 from ..plant import AbstractPlant
 from ..plant.catalogue import PlantLike, plant_from, require_inputs, with_sensor
+from ..plant.uncertainty import Range, Uncertainty
 from ..record import Record, require_record_path, write_record
 from ..report.tables import html_table
 from ..simulation import response, run_episode
@@ -137,6 +138,7 @@ def design(
     criterion: str = "D",
     steps: int = 500,
     spread: float = 0.3,
+    uncertainty: Mapping[str, Range] | None = None,
     noise: Mapping[str, float] | None = None,
     seed: int = 0,
     starts: int | None = None,
@@ -163,6 +165,8 @@ def design(
             (`A`), or its smallest eigenvalue (`E`).
         steps: samples of the experiment.
         spread: parameters are uniform in nominal value ± spread times their scale.
+        uncertainty: what else may differ, as in `falsify`: a robust input is made safe there
+            too, and tested on plants drawn from it.
         noise: standard deviation by output, in its unit, where it differs from the plant's.
         seed: of the search, and of the plants on which the input is tested.
         starts: of a search by gradient, default 4.
@@ -183,7 +187,10 @@ def design(
     chosen = with_sensor(plant_from(plant), noise)
     require_inputs(chosen)
     require_noise(chosen)
-    env = signal_env(chosen, steps, spread, criterion)
+    if uncertainty and kind != "robust":
+        raise ValueError(f"only a robust design takes an uncertainty (--uncertainty); got {kind!r}")
+    box = Uncertainty.of(chosen, spread, uncertainty) if uncertainty else None
+    env = signal_env(chosen, steps, spread, criterion, box)
     worth_by_start: tuple[float, ...] = ()
     tuned = None
     if kind in BY_GRADIENT:
@@ -199,7 +206,7 @@ def design(
         inputs, tuned = _tuned(env, kind, criterion, seed, trials, progress)
     count = 1 if kind == "clairvoyant" else NUM_FRESH
     keys = jax.random.split(jax.random.key(seed + 1), count)
-    judged = run_episodes(chosen, Replay(inputs), steps, float(env.spread), keys)
+    judged = run_episodes(chosen, Replay(inputs), steps, float(env.spread), keys, box)
     found = _found(kind, criterion, seed, worth_by_start, tuned)
     made = Design(
         plant=chosen.description,

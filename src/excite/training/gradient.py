@@ -47,9 +47,9 @@ class Network(eqx.Module):
         """The policy's action in this state."""
         return act(jnp, self.layout, self.weights, state.window, state.k)
 
-    def excitation(self) -> PolicyExcitation:
+    def excitation(self, layout: Layout) -> PolicyExcitation:
         """The same policy, to be played on any plant."""
-        return PolicyExcitation(self.weights, self.layout)
+        return PolicyExcitation(self.weights, layout)
 
 
 class Scores(eqx.Module):
@@ -151,7 +151,7 @@ def update(
     """
     box, adversaries = env.uncertainty, now.adversaries
     if is_adversarial and box is not None and adversaries is not None:
-        play = OnPlant(box, now.player.excitation(), env.layout.num_steps)
+        play = OnPlant(box, now.player.excitation(env.layout), env.layout.num_steps)
         key = jax.random.fold_in(keys[0], 1)
         adversaries = _adversaries(play, settings, adversaries, key)
 
@@ -159,7 +159,7 @@ def update(
         batch = experiments(env, player, keys, settings.margin)
         excess, nearest = jnp.mean(batch.excess), batch.nearness
         if is_adversarial and box is not None and adversaries is not None:
-            play = OnPlant(box, player.excitation(), env.layout.num_steps)
+            play = OnPlant(box, player.excitation(env.layout), env.layout.num_steps)
             more, size = _excess(play, adversaries, settings.adversary_margin)
             excess, nearest = excess + jnp.mean(more), jnp.concatenate([nearest, size])
         worth = env.objective.of_batch(batch.outcome)
@@ -264,8 +264,7 @@ def train_all(
             _require_computable(row)
         on_boundary(partial(course.checkpoint, steps), row)
         if i < settings.num_updates:
-            is_adversarial = i >= settings.adversaries_from * settings.num_updates
-            is_adversarial = is_adversarial and env.uncertainty is not None
+            is_adversarial = settings.has_adversaries(i) and env.uncertainty is not None
             course.now, _ = update_all(env, settings, course.now, keys(i), is_adversarial)
             course.num_updates += 1
     best = course.best.weights
@@ -368,7 +367,7 @@ def _falsified(env: Env, player: Network) -> dict[str, float]:
     """The largest nearness that a short search in the declared uncertainty finds."""
     if env.uncertainty is None:
         return {}
-    play = OnPlant(env.uncertainty, player.excitation(), env.layout.num_steps)
+    play = OnPlant(env.uncertainty, player.excitation(env.layout), env.layout.num_steps)
     found = search(play, _LOOK, VALIDATION_SEED)
     return {"worst_nearness": max(stage.nearness for stage in found.stages)}
 

@@ -93,6 +93,10 @@ class GradientSettings(_Checked):
     adversaries_from: Fraction = 0.4
     allowed_nearness: Fraction = 0.975
 
+    def has_adversaries(self, update: int) -> bool:
+        """Whether they have joined at this update."""
+        return update >= self.adversaries_from * self.num_updates
+
 
 AGAINST_UNCERTAINTY = (
     "num_adversaries", "adversary_steps", "adversary_margin", "adversaries_from",

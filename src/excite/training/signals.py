@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -20,14 +21,22 @@ import numpy as np
 from jaxtyping import Array, Float, Key, PRNGKeyArray
 
 from ..environment import Env, EnvState, InformationGain, prior_sd_of
-from ..excitation import Multisine
+from ..environment.falsification import Cases, OnPlant
+from ..excitation import Multisine, Replay
 from ..plant import AbstractPlant
-from ..policy import Layout
+from ..plant.uncertainty import Uncertainty
+from ..policy import Layout, scaled_action
 from .checkpoint import Progress
 from .gradient import GradientSettings, Optimisation, Scores, experiments, update_all
 
 
-def signal_env(plant: AbstractPlant, num_steps: int, spread: float, criterion: str = "D") -> Env:
+def signal_env(
+    plant: AbstractPlant,
+    num_steps: int,
+    spread: float,
+    criterion: str = "D",
+    uncertainty: Uncertainty | None = None,
+) -> Env:
     """The decision process for signals that do not use the measurements.
 
     All parameters have the same weight.
@@ -35,7 +44,7 @@ def signal_env(plant: AbstractPlant, num_steps: int, spread: float, criterion: s
     every = (True,) * len(plant.definition.parameters)
     objective = InformationGain(every, prior_sd_of(spread), criterion=criterion, dense=False)
     layout = Layout.of(plant.description, window=1, num_steps=num_steps)
-    return Env.of(plant, objective=objective, layout=layout, spread=spread)
+    return Env.of(plant, objective=objective, layout=layout, spread=spread, uncertainty=uncertainty)
 
 
 CLAIRVOYANT = GradientSettings(num_updates=1500, learning_rate=0.03, margin=0.97, near=0.9975)
@@ -59,6 +68,10 @@ class OpenLoop(eqx.Module):
         """The action of this step."""
         return jnp.tanh(self.latent[state.k])
 
+    def excitation(self, layout: Layout) -> Replay:
+        """The same signal in input units, to be played on any plant."""
+        return _replayed(layout, jnp.tanh(self.latent))
+
 
 class _Played(eqx.Module):
     """A fixed signal within the input limits."""
@@ -67,6 +80,14 @@ class _Played(eqx.Module):
 
     def __call__(self, state: EnvState) -> Float[Array, " input"]:
         return self.actions[state.k]
+
+    def excitation(self, layout: Layout) -> Replay:
+        """The same signal in input units, to be played on any plant."""
+        return _replayed(layout, self.actions)
+
+
+def _replayed(layout: Layout, actions: Float[Array, "time input"]) -> Replay:
+    return Replay(jax.vmap(partial(scaled_action, jnp, layout))(actions))
 
 
 @dataclass(frozen=True)
@@ -138,9 +159,10 @@ def _search(
     report: Progress,
 ) -> Float[Array, "search time input"]:
     """Actions at the end of all searches, side by side."""
-    now = eqx.filter_vmap(lambda p: Optimisation.start(p, settings))(player)
+    now = eqx.filter_vmap(lambda p: Optimisation.start(p, settings, env.uncertainty))(player)
     for i in range(settings.num_updates):
-        now, _ = update_all(env, settings, now, keys(i), False)
+        is_adversarial = settings.has_adversaries(i) and env.uncertainty is not None
+        now, _ = update_all(env, settings, now, keys(i), is_adversarial)
         report(f"updating {i + 1:,} of {settings.num_updates:,}", i + 1, settings.num_updates)
     return jnp.tanh(now.player.latent)
 
@@ -163,8 +185,11 @@ def _at_the_limit(
     worth = np.full(len(actions), -np.inf)
     nearness, factors = np.zeros(len(actions)), np.ones(len(actions))
     for factor in AMPLITUDES:
-        batch = _played(env, jnp.clip(factor * actions, -1, 1), keys)
+        scaled = jnp.clip(factor * actions, -1, 1)
+        batch = _played(env, scaled, keys)
         own, nearest = np.mean(batch.worth, axis=1), np.max(batch.nearness, axis=1)
+        if env.uncertainty is not None:
+            nearest = np.maximum(nearest, _worst(env, scaled))
         is_better = (nearest < limit) & (own > worth)
         worth = np.where(is_better, own, worth)
         nearness = np.where(is_better, nearest, nearness)
@@ -180,6 +205,24 @@ def _at_the_limit(
     chosen = np.clip(factors[best, None, None] * np.asarray(actions)[best], -1, 1)
     middle, half = np.array(env.layout.input_middle), np.array(env.layout.input_half)
     return FoundSignals(middle + half * chosen, by_start.max(axis=1), nearness[best], by_start)
+
+
+@eqx.filter_jit
+def _worst(env: Env, actions: Float[Array, "search time input"]) -> Float[Array, " search"]:
+    """The largest nearness of every signal at corners and random plants of the uncertainty."""
+    box = env.uncertainty
+    if box is None:
+        raise TypeError("no uncertainty is declared")
+    key = jax.random.key(0)
+    drawn = jax.vmap(box.draw)(jax.random.split(key, NUM_JUDGES))
+    points = jnp.concatenate([box.corners(key, NUM_JUDGES), drawn])
+    cases = Cases(points, jnp.zeros(len(points), int))
+
+    def one(own: Float[Array, "time input"]) -> Float[Array, ""]:
+        play = OnPlant(box, _Played(own).excitation(env.layout), env.layout.num_steps)
+        return jnp.max(jax.vmap(play)(cases))
+
+    return jax.lax.map(one, actions)
 
 
 def _first_signals(env: Env, keys: Key[Array, " search"]) -> OpenLoop:
