@@ -254,3 +254,48 @@ def test_the_command_ends_with_1_where_a_level_is_reached(tmp_path):
     told = json.loads(result.stdout)
     assert told["nearness"] >= 1
     assert json.loads(worst.read_text())["plant"] == "dc_motor"
+
+
+@pytest.fixture(scope="module")
+def certified():
+    return ex.falsify("aero2-goals", budget=100, steps=20).certified()
+
+
+@pytest.mark.parametrize(
+    ("change", "options", "words"),
+    [
+        (None, {}, "has no certificate"),
+        ({"nearness": 1.01}, {}, "is not safe"),
+        ({"noise_nearness": None}, {}, "is not safe"),
+        ({}, {"plant": "aero2_lag"}, "for another plant"),
+        ({}, {"spread": 0.4}, "for another uncertainty: J_p"),
+    ],
+)
+def test_a_run_that_needs_a_certificate_refuses_any_other(certified, change, options, words):
+    certificate = None if change is None else {**certified.certificate, **change}
+    policy = certified.certified(certificate)
+    arguments = {"plant": "aero2", "dry_run": True, "require_certificate": True, **options}
+    with pytest.raises(ValueError, match=words):
+        ex.run(policy=policy, **arguments)
+
+
+def test_a_run_with_the_certificate_it_needs(certified):
+    planned = ex.run(policy=certified, plant="aero2", dry_run=True, require_certificate=True)
+    assert len(planned.inputs) == 500
+    with pytest.raises(ValueError, match="only policies have certificates"):
+        ex.run(excitation="chirp", plant="aero2", dry_run=True, require_certificate=True)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"nearness": "low"},
+        {"uncertainty": {"J_p": [1]}},
+        {"plant_hash": None},
+        {"experiments": None},
+    ],
+)
+def test_a_certificate_that_is_malformed_is_refused(certified, change):
+    broken = certified.certified({**certified.certificate, **change})
+    with pytest.raises(ValueError, match="policy: .*(malformed|certificate)"):
+        ex.Policy.from_bytes(broken.to_bytes())

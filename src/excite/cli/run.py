@@ -60,6 +60,9 @@ def _options(command: Callable[..., int]) -> Callable[..., int]:
         click.option("--filter", is_flag=True,
                      help="Predictive safety filter: changes an input where a plant of the prior "
                      "could no longer be brought to rest before its critical level."),
+        click.option("--require-certificate", is_flag=True,
+                     help="Refuse a policy without a certificate (excite falsify) for this plant "
+                     "and spread."),
         click.option("--address", default="0", show_default=True,
                      help="Board of the Quanser rig, or a virtual one "
                      "(0@tcpip://localhost:18950)."),

@@ -12,6 +12,7 @@ from .contract import forward as forward
 from .contract import mismatch as mismatch
 from .contract import network as network
 from .contract import observe as observe
+from .contract import require_certified as require_certified
 from .contract import respond as respond
 from .contract import scaled_action as scaled_action
 from .contract import with_input as with_input

@@ -355,14 +355,13 @@ def _check_layout(layout: Layout, plant: PlantDescription) -> None:
 
 
 def _check_certificate(certificate: Any) -> None:
-    """Raises ValueError for a certificate without its numbers."""
+    """Raises an error for a certificate without its numbers."""
     names = "nearness", "noise_nearness", "experiments", "noise_bound"
     numbers = [certificate[name] for name in names]
-    if not all(n is None or (isinstance(n, int | float) and n >= 0) for n in numbers):
-        raise ValueError("the certificate of the policy is malformed")
-    ends = certificate["uncertainty"].values()
-    if not all(len(pair) == 2 and all(isinstance(n, int | float) for n in pair) for pair in ends):
-        raise ValueError("the certificate of the policy is malformed")
+    ends = [end for low, high in certificate["uncertainty"].values() for end in (low, high)]
+    is_whole = isinstance(certificate["plant_hash"], str) and None not in numbers[2:]
+    if not is_whole or not all(isinstance(n, int | float | None) for n in [*numbers, *ends]):
+        raise ValueError("its certificate is malformed")
 
 
 def _check_layers(weights: Weights, num_inputs: int, num_outputs: int) -> None:
@@ -407,6 +406,36 @@ def mismatch(policy: Policy, plant: PlantDescription) -> str | None:
         f"the policy was trained on another {trained.name!r} (hash {trained.hash[:8]}) than this "
         "one, with other constants, nominal values or noise"
     )
+
+
+def require_certified(policy: Policy, plant: PlantDescription, spread: float) -> None:
+    """Raises ValueError where no certificate says that a search found the policy safe.
+
+    Args:
+        policy: to be played.
+        plant: on which the search must have been made.
+        spread: of its parameters, which the search must have covered.
+    """
+    certificate = policy.certificate
+    if certificate is None:
+        raise ValueError("the policy has no certificate ('excite falsify --certify' makes one)")
+    largest = [certificate["nearness"], certificate["noise_nearness"]]
+    if None in largest or max(largest) >= 1:
+        raise ValueError(f"the policy's certificate says that it is not safe ({policy.claim})")
+    if certificate["plant_hash"] != plant.hash:
+        raise ValueError(
+            f"the policy's certificate is for another plant than this {plant.name!r} "
+            "('excite falsify --plant' makes one for it)"
+        )
+    for p in plant.parameters:
+        low, high = certificate["uncertainty"].get(p.name, (p.nominal, p.nominal))
+        reach = spread * p.scale * (1 - 1e-9)
+        if not low <= p.nominal - reach <= p.nominal + reach <= high:
+            raise ValueError(
+                f"the policy's certificate is for another uncertainty: {p.name} {low:g} to "
+                f"{high:g} {p.unit}, and a spread of {spread:g} is {p.nominal - reach:g} to "
+                f"{p.nominal + reach:g}"
+            )
 
 
 def _require_same(

@@ -27,7 +27,7 @@ from ..description import (
     require_whole,
     wrong_type,
 )
-from ..policy import Policy, mismatch, policy_path, read_policy
+from ..policy import Policy, mismatch, policy_path, read_policy, require_certified
 from ..record import Record, read_record, read_signal, require_record_path
 from ..record.read import SIGNAL_ENDINGS
 from ..report.tables import html_table, text_table
@@ -195,6 +195,7 @@ def run(
     steps: int | None = None,
     slew: float = math.inf,
     filter: bool = False,
+    require_certificate: bool = False,
     address: str = "0",
     fast: bool = False,
     dry_run: bool = False,
@@ -222,6 +223,8 @@ def run(
         steps: number of samples; by default all of a policy or signal, else 500.
         slew: largest change of an input in one second, in its unit.
         filter: adds a predictive safety filter for parameters within ± `spread`.
+        require_certificate: refuses a policy without a certificate that a search on this plant,
+            with this `spread`, found it safe.
         address: board identifier of the Quanser rig.
         fast: runs a simulated rig or an FMU as fast as it can, not in real time.
         dry_run: computes the inputs for a plant at rest; nothing is sent or written.
@@ -281,6 +284,8 @@ def run(
     warnings = tuple(source.warnings(description))
     for warning in warnings:
         on_warning(warning)
+    if require_certificate:
+        source.check_certificate(description, spread)
     make = source.maker(description, known, steps, seed)
     prior = _required(known, "--filter") if filter else None
     safety_filter = None if prior is None else SafetyFilter.of(prior, spread, slew)
@@ -326,6 +331,17 @@ class _Source:
         except ValueError as error:
             raise ValueError(f"{self.name}: {error}") from None
         return [] if warning is None else [f"{self.name}: {warning}"]
+
+    def check_certificate(self, plant: PlantDescription, spread: float) -> None:
+        """Raises ValueError for what is played without a certificate of its safety."""
+        if self.policy is None:
+            raise ValueError(
+                f"{self.name}: only a policy has a certificate (--require-certificate)"
+            )
+        try:
+            require_certified(self.policy, plant, spread)
+        except ValueError as error:
+            raise ValueError(f"{self.name}: {error}") from None
 
     def maker(
         self,
