@@ -10,6 +10,7 @@ training and simulation. Nothing is unpickled.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -356,11 +357,15 @@ def _check_layout(layout: Layout, plant: PlantDescription) -> None:
 
 def _check_certificate(certificate: Any) -> None:
     """Raises an error for a certificate without its numbers."""
-    names = "nearness", "noise_nearness", "experiments", "noise_bound"
-    numbers = [certificate[name] for name in names]
-    ends = [end for low, high in certificate["uncertainty"].values() for end in (low, high)]
-    is_whole = isinstance(certificate["plant_hash"], str) and None not in numbers[2:]
-    if not is_whole or not all(isinstance(n, int | float | None) for n in [*numbers, *ends]):
+    ranges = [tuple(ends) for ends in certificate["uncertainty"].values()]
+    counts = [certificate[name] for name in ("experiments", "noise_bound")]
+    sizes = [certificate[name] for name in ("nearness", "noise_nearness")]  # None for infinity
+    numbers = [*itertools.chain(*ranges), *counts, *(size for size in sizes if size is not None)]
+    if not (
+        isinstance(certificate["plant_hash"], str)
+        and all(len(ends) == 2 for ends in ranges)
+        and all(isinstance(n, int | float) for n in numbers)
+    ):
         raise ValueError("its certificate is malformed")
 
 

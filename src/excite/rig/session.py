@@ -335,9 +335,7 @@ class _Source:
     def check_certificate(self, plant: PlantDescription, spread: float) -> None:
         """Raises ValueError for what is played without a certificate of its safety."""
         if self.policy is None:
-            raise ValueError(
-                f"{self.name}: only a policy has a certificate (--require-certificate)"
-            )
+            raise ValueError(f"{self.name} is no policy: only policies have certificates")
         try:
             require_certified(self.policy, plant, spread)
         except ValueError as error:
