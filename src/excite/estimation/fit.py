@@ -48,6 +48,14 @@ def known_parameters(plant: AbstractPlant, estimator: AbstractEstimator) -> np.n
     return np.array(held)
 
 
+class NothingLeftError(ValueError):
+    """No parameter is left to estimate; `fit` is the one before any was held."""
+
+    def __init__(self, sentence: str, fit: Fit) -> None:
+        super().__init__(sentence)
+        self.fit = fit
+
+
 @dataclass(frozen=True)
 class Fit:
     """An estimate, its free and known parameters, and a sentence for each held one.
@@ -109,6 +117,7 @@ def _fit_seen(
     known = known_parameters(plant, estimator)
     free, reasons = ~known, ()
     found = _estimate(plant, experiments, estimator, start, free, progress)
+    first = Fit(found[0], free, known, reasons, found[1:])
     while True:
         fit = Fit(found[0], free, known, reasons, found[1:])
         # ARX estimates all parameters or none.
@@ -128,8 +137,10 @@ def _fit_seen(
             groups = found.not_identifiable if found else ()
             why = [f"{STRUCTURALLY_NOT}: {group.sentence}" for group in groups]
             if bound_reached(plant.definition, start) is not None:
-                raise ValueError(f"no parameter is left to estimate: {'; '.join(reasons)}")
-            raise ValueError("; ".join([*why, NOTHING_SEEN]))
+                raise NothingLeftError(
+                    f"no parameter is left to estimate: {'; '.join(reasons)}", first
+                )
+            raise NothingLeftError("; ".join([*why, NOTHING_SEEN]), first)
         found = _estimate(plant, experiments, estimator, start, free, progress, [last])
 
 
