@@ -11,7 +11,8 @@ from excite.estimation.contract import residual_of, simulate_experiments
 from excite.estimation.diagnosis import innovations
 from excite.estimation.excerpt import Span, excerpt_of, spans_of
 from excite.estimation.remedies import outliers
-from excite.plant.catalogue import plant_from
+from excite.excitation.catalogue import EXCITATIONS, LOOP
+from excite.plant.catalogue import PLANTS, plant_from
 from excite.plant.extension import extensions_of
 from excite.record import Record
 from excite.simulation import response
@@ -63,8 +64,8 @@ def unnamed(record: Record) -> Record:
 
 def effects(plant: str) -> list[str]:
     """What can be left out of a plant; EMPS has an offset and Coulomb friction itself."""
-    # Drag hides in the viscous friction of EMPS; 0.5 s are too short for drag and drift to show.
-    own = {"emps": ("offset", "coulomb", "drag"), "dc_motor": ("drag", "drift")}.get(plant, ())
+    # Drag hides in the viscous friction of EMPS; a drift of the current does not show in 0.5 s.
+    own = {"emps": ("offset", "coulomb", "drag"), "dc_motor": ("drift_current",)}.get(plant, ())
     names = [e for e in extensions_of(plant_from(plant)) if not e.startswith(tuple(own))]
     inputs = [i.name for i in plant_from(plant).definition.inputs]
     return [*names, *(f"linear_{name}" for name in inputs), "outliers"]
@@ -208,3 +209,19 @@ def test_what_each_plant_leaves_out_is_named_first(plant):
         if not found or found[0].name != effect:
             missed.append((effect, [s.name for s in found[:2]]))
     assert not missed
+
+
+@pytest.mark.science
+@pytest.mark.parametrize("plant", sorted(PLANTS))
+def test_a_record_of_the_very_plant_is_no_alarm(plant):
+    """At most 1.5 % of 2,000 records: 8 alarms in 2,160 records were counted, 4 of 72 are rare."""
+    d, alarms = plant_from(plant).definition, 0
+    loop = LOOP if plant in ("emps", "cart_pole") else ""
+    for played in EXCITATIONS:
+        for seed in range(12):
+            rng = np.random.default_rng(seed)
+            params = {p.name: p.nominal * rng.uniform(0.8, 1.2) for p in d.parameters}
+            record = unnamed(ex.simulate(plant, loop + played, params=params, seed=seed))
+            result = ex.identify(record, plant, initial_state=("known", "free")[seed % 2])
+            alarms += any("follows the input" in sentence for sentence in result.verdict)
+    assert alarms < 4

@@ -23,7 +23,7 @@ from .contract import (
     quality,
     to_search,
 )
-from .diagnosis import ljung_box
+from .diagnosis import ljung_box, mean_or_trend
 from .held import structure_of
 from .nls import NLS
 from .pem import PEM
@@ -209,6 +209,15 @@ def is_noise(plant: AbstractPlant, experiments: Experiments, estimate: Estimate)
         not whiteness_of([r[v, i] for r, v in zip(residual, valid[..., i], strict=True)], o.scale)
         < RARE
         for i, o in enumerate(plant.definition.outputs)
+    )
+
+
+def is_centred(experiments: Experiments, estimate: Estimate) -> bool:
+    """Whether the residual of no output has a mean or a trend."""
+    residual, valid = np.asarray(estimate.residual), np.asarray(experiments.valid)
+    return all(
+        not mean_or_trend(*(r[v, i] for r, v in zip(residual, valid[..., i], strict=True))) < RARE
+        for i in range(residual.shape[2])
     )
 
 

@@ -49,6 +49,7 @@ from .fit import (
     NothingLeftError,
     Progress,
     fit_of,
+    is_centred,
     is_more_than_rounding,
     is_noise,
     known_parameters,
@@ -552,7 +553,8 @@ def _suspects(
     if estimator.likelihood != "normal" or estimator.prior is not None:
         return (), ()  # outliers would hide them, a prior explain what they explain
     residual, valid = np.asarray(fit.estimate.residual), np.asarray(experiments.valid)
-    if is_noise(plant, experiments, fit.estimate) and outliers(residual, valid) is None:
+    is_white = is_noise(plant, experiments, fit.estimate) and is_centred(experiments, fit.estimate)
+    if is_white and outliers(residual, valid) is None:
         return (), ()
 
     name, plus, extensions = plant.definition.name.partition("+")

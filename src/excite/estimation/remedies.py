@@ -206,7 +206,9 @@ def suspects(question: Question, progress: Told = lambda *_: None) -> tuple[Susp
     """
     q, valid = question, np.asarray(question.experiments.valid)
     search, total = q.search(), len(q.linear) + _MOST_FITTED
-    before = np.asarray(q.estimate.residual) if q.is_best else search.refitted()
+    before = np.asarray(q.estimate.residual)
+    if not q.is_best:
+        before = search.refitted(search.begin, search.start)
     found = [] if (tails := outliers(before, valid)) is None else [tails]
     for i, channel in enumerate(names_of(q.plant.definition.inputs)):
         progress(f"likely causes: {channel} between samples", i, total)
@@ -236,13 +238,14 @@ def suspects_in(
     """
     q, total = question, len(question.linear) + _MOST_FITTED + 1
     search = q.search(excerpt_of(q.plant, q.experiments, q.estimate, spans))
-    before, valid = search.refitted(), search.valid
+    before, valid = search.refitted(search.begin), search.valid
     found = [] if (tails := outliers(before, valid)) is None else [tails]
     for i, channel in enumerate(names_of(q.plant.definition.inputs)):
         progress(f"likely causes: {channel} between samples", i, total)
         other, name = q.other_hold(i)
         part = excerpt_of(q.plant, q.stacked(q.plant, other), q.estimate, spans)
-        after = q.search(part).refitted()
+        other_search = q.search(part)
+        after = other_search.refitted(other_search.begin)
         found.append(q.suspect(name, before, after, valid))
     found += _effects(q, search, before, progress)
     likely = q.likely(found, int(valid.sum()))
@@ -286,7 +289,8 @@ def _effects(q: Question, search: _Search, before: Residual, progress: Told) -> 
     """The extensions that could explain most, fitted."""
     inputs, found, first = search.data.inputs, [], len(q.linear)
     trials = [_Trial(n, v) for n in q.names for v in _tried(search.whole, n, inputs)]
-    for i, trial in enumerate(search.promising(trials), first):
+    where = search.begin if q.is_best else search.start  # an estimate may be far off
+    for i, trial in enumerate(search.promising(trials, where), first):
         progress(f"likely causes: {trial.name}", i, first + _MOST_FITTED)
         value, std_error, after = search.best(trial)
         named = q.suspect(trial.name, before, after, search.valid)
@@ -403,12 +407,12 @@ class _Search:
         columns[:, -1 - self.of_state.shape[1] : -1] *= self.of_state
         return found[0], columns
 
-    def promising(self, trials: Sequence[_Trial]) -> list[_Trial]:
-        """The few trials that explain most if everything were linear, one for each suspect."""
-        before, S = self.slopes(np.append(self.begin, 0.0), "")
+    def promising(self, trials: Sequence[_Trial], where: np.ndarray) -> list[_Trial]:
+        """The few trials that explain most if all were linear at a point, one for each suspect."""
+        before, S = self.slopes(np.append(where, 0.0), "")
         basis, _ = np.linalg.qr(S[:, :-1])
         scale = [_parameter(self.whole, trial.name).scale for trial in trials]
-        points = [np.append(self.begin, t.value / s) for t, s in zip(trials, scale, strict=True)]
+        points = [np.append(where, t.value / s) for t, s in zip(trials, scale, strict=True)]
         changed = self.misfits(np.stack(points), [trial.name for trial in trials])
         best: dict[str, tuple[float, _Trial]] = {}
         for trial, change in zip(trials, changed - before, strict=True):
@@ -447,14 +451,15 @@ class _Search:
         std_error = sd * size * float(np.linalg.norm(row))
         return float(found.x[-1]) * size, std_error, self._residual(found)
 
-    def refitted(self) -> Residual:
-        """The residual of a fit without suspects, at which all others begin."""
+    def refitted(self, *begins: np.ndarray) -> Residual:
+        """The residual of the best fit without suspects, at which all others begin."""
 
         def slopes(point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             misfit, columns = self.slopes(np.append(point, 0.0), "")
             return misfit, columns[:, :-1]
 
-        found = self._searched(slopes, self.begin, -np.inf)
+        ends = [self._searched(slopes, begin, -np.inf) for begin in begins]
+        found = min(ends, key=lambda end: end.cost)
         self.begin = found.x
         return self._residual(found)
 
