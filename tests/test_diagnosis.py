@@ -10,6 +10,7 @@ from excite.estimation.diagnosis import (
     correlation,
     fit_percent,
     ljung_box,
+    mean_or_trend,
     robust_covariance,
     widened,
 )
@@ -63,6 +64,18 @@ def test_ljung_box_of_white_noise_is_uniform():
     p = np.array([ljung_box(e) for e in noise])
     assert scipy.stats.kstest(p, "uniform").pvalue > 0.01
     assert scipy.stats.binomtest(int(np.sum(p < 0.05)), p.size, 0.05).pvalue > 0.01
+
+
+def test_a_mean_or_a_trend_below_the_noise_is_seen_and_white_noise_has_none():
+    noise = np.random.default_rng(6).normal(size=(400, 500))
+    p = np.array([mean_or_trend(e) for e in noise])
+    assert scipy.stats.kstest(p, "uniform").pvalue > 0.01
+    assert max(mean_or_trend(e + 0.3) for e in noise[:20]) < 0.01
+    assert max(mean_or_trend(e + np.linspace(-0.6, 0.6, 500)) for e in noise[:20]) < 0.01
+    assert np.median([ljung_box(e + 0.3) for e in noise[:20]]) > 0.01
+    parts = np.split(noise[0] + 0.3, 5)  # the evidence of several records adds up
+    assert mean_or_trend(*parts) < min(map(mean_or_trend, parts))
+    assert np.isnan(mean_or_trend(np.zeros(500)))
 
 
 def test_ljung_box_rejects_noise_that_remembers():

@@ -64,6 +64,23 @@ def is_more_than_rounding(residual: np.ndarray, scale: float) -> bool:
     return bool(np.any(np.abs(residual) > 1e-8 * scale))
 
 
+def mean_or_trend(*residuals: Float[np.ndarray, " _sample"]) -> float:
+    """p-value of the hypothesis that white residuals have neither a mean nor a trend.
+
+    Both are small beside the noise of each sample, and the test of whiteness hardly sees them.
+    Not a number for residuals of zeros, and for fewer than 15 samples.
+    """
+    statistic, degrees = 0.0, 0
+    for residual in residuals:
+        n, power = residual.size, float(np.mean(residual**2))
+        if power == 0 or n < _FEW:
+            continue
+        time = np.linspace(-1, 1, n)
+        parts = float(residual.mean()) ** 2 * n + float(residual @ time) ** 2 / float(time @ time)
+        statistic, degrees = statistic + parts / power, degrees + 2
+    return chi2_tail(degrees, statistic) if degrees else math.nan
+
+
 def input_dependence(
     residuals: Sequence[Float[np.ndarray, " _sample"]],
     inputs: Sequence[Float[np.ndarray, "_sample input"]],

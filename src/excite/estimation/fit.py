@@ -23,7 +23,7 @@ from .contract import (
     quality,
     to_search,
 )
-from .diagnosis import whiteness_of
+from .diagnosis import mean_or_trend, whiteness_of
 from .held import structure_of
 from .nls import NLS
 from .pem import PEM
@@ -46,6 +46,14 @@ def known_parameters(plant: AbstractPlant, estimator: AbstractEstimator) -> np.n
     if all(held):
         raise ValueError("all parameters are held; none is left to estimate")
     return np.array(held)
+
+
+class NothingLeftError(ValueError):
+    """No parameter is left to estimate; `fit` is the one before any was held."""
+
+    def __init__(self, sentence: str, fit: Fit) -> None:
+        super().__init__(sentence)
+        self.fit = fit
 
 
 @dataclass(frozen=True)
@@ -109,6 +117,7 @@ def _fit_seen(
     known = known_parameters(plant, estimator)
     free, reasons = ~known, ()
     found = _estimate(plant, experiments, estimator, start, free, progress)
+    first = Fit(found[0], free, known, reasons, found[1:])
     while True:
         fit = Fit(found[0], free, known, reasons, found[1:])
         # ARX estimates all parameters or none.
@@ -125,11 +134,13 @@ def _fit_seen(
         reasons = (*reasons, why)
         if not free.any():
             if bound_reached(plant.definition, start) is not None:
-                raise ValueError(f"no parameter is left to estimate: {'; '.join(reasons)}")
+                raise NothingLeftError(
+                    f"no parameter is left to estimate: {'; '.join(reasons)}", first
+                )
             tested = structure_of(plant, experiments, start, known)
             groups = tested.not_identifiable if tested else ()
             lost = [f"{STRUCTURALLY_NOT}: {group.sentence}" for group in groups]
-            raise ValueError("; ".join([*lost, NOTHING_SEEN]))
+            raise NothingLeftError("; ".join([*lost, NOTHING_SEEN]), first)
         found = _estimate(plant, experiments, estimator, start, free, progress, [last])
 
 
@@ -198,6 +209,15 @@ def is_noise(plant: AbstractPlant, experiments: Experiments, estimate: Estimate)
         not whiteness_of([r[v, i] for r, v in zip(residual, valid[..., i], strict=True)], o.scale)
         < RARE
         for i, o in enumerate(plant.definition.outputs)
+    )
+
+
+def is_centred(experiments: Experiments, estimate: Estimate) -> bool:
+    """Whether the residual of no output has a mean or a trend."""
+    residual, valid = np.asarray(estimate.residual), np.asarray(experiments.valid)
+    return all(
+        not mean_or_trend(*(r[v, i] for r, v in zip(residual, valid[..., i], strict=True))) < RARE
+        for i in range(residual.shape[2])
     )
 
 

@@ -156,6 +156,17 @@ def experiments_of(
     )
 
 
+def rows_of(records: Sequence[Record], spans: Sequence[tuple[int, int, int]]) -> str:
+    """Rows of records in words, from their parts' samples: part, first one, one behind the last."""
+    parts = [(record, part.start) for record in records for part in parts_of(record)]
+    rows: dict[str, list[str]] = {}
+    for index, first, stop in spans:
+        record, start = parts[index]
+        where = f" of {record.source or 'the record'}" if len(records) > 1 else ""
+        rows.setdefault(where, []).append(f"{start + first} to {start + stop - 1}")
+    return "rows " + "; ".join(f"{', '.join(own)}{where}" for where, own in rows.items())
+
+
 def by_record(
     records: Sequence[Record], values: Float[np.ndarray, "experiment sample output"]
 ) -> list[Float[np.ndarray, "_sample output"]]:

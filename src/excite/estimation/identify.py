@@ -44,11 +44,14 @@ from .diagnosis import (
     widened,
     with_independent,
 )
+from .excerpt import spans_of
 from .fit import (
     NOTHING_SEEN,
     Fit,
+    NothingLeftError,
     Progress,
     fit_of,
+    is_centred,
     is_noise,
     known_parameters,
     with_initial_state,
@@ -62,6 +65,7 @@ from .from_records import (
     require_complete,
     require_enough,
     require_short_delays,
+    rows_of,
     sampled_as,
     starts_at,
 )
@@ -70,13 +74,13 @@ from .nls import NLS, Likelihood
 from .prior import unbounded, within_support
 from .prior_knowledge import PriorLike, with_prior
 from .profile import profile_intervals
-from .remedies import Suspect, outliers, suspects
+from .remedies import Question, Suspect, outliers, suspects, suspects_in
 from .result import Identification, Noise
 from .validation import fitted_all, state_from, validated, way_to_state
 
 InitialState = Literal["auto", "free", "known"]
 Intervals = Literal["linear", "profile"]
-_SIZE_OF_SUSPECTS = 10_000  # measured values up to which suspects are tried
+_SIZE_OF_SUSPECTS = 10_000  # measured values in which suspects are looked for
 _SAME = 0.01  # difference of sums of squares at one minimum, over the noise
 _FAR_ABOVE = 10.0  # times the declared noise; a larger residual is remarked
 _BY_CHANCE = 1e-3  # a fit with a larger p-value explains nothing
@@ -210,12 +214,19 @@ def identify(
     known = known and all(len(parts_of(record)) == 1 for record in records)
     experiments = experiments_of(plant, records, known, linear)
     progress("first search", 0.0, 1.0)
-    fit = fit_of(plant, experiments, estimator, begin, progress)
+    find = partial(_suspects, plant, records, experiments, estimator, begin, linear, progress)
+    try:
+        fit = fit_of(plant, experiments, estimator, begin, progress)
+    except NothingLeftError as refusal:
+        raise _with_causes(str(refusal), find(refusal.fit, False)[0]) from None
     residual = _residuals(plant, records, experiments, estimator, fit)
     fitted = fitted_all(plant, records, experiments, fit.estimate, residual)
     is_normal = isinstance(estimator, NLS) and estimator.likelihood == "normal"
-    if is_normal and not fit.has_ended_in(Status.NOT_FINITE):
-        _require_explanation(records, residual, int(fit.free.sum()) - num_priors)
+    is_judged = is_normal and not fit.has_ended_in(Status.NOT_FINITE)
+    is_fit = not is_judged or _explains(records, residual, int(fit.free.sum()) - num_priors)
+    found, where = find(fit, is_fit and fit.is_successful)
+    if not is_fit:
+        raise _with_causes(NOTHING_SEEN, found)
     whiteness = {
         name: whiteness_of([finite(r[:, i]) for r in residual], plant.definition.outputs[i].scale)
         for i, name in enumerate(names_of(plant.definition.outputs))
@@ -229,9 +240,8 @@ def identify(
     )
     wrong = _wrong_structure(structure, estimator) if fit.is_successful else ()
     others = tuple(s for record in [*records, *validation] for s in _other_plant(record, plant))
-    found = _suspects(plant, records, experiments, estimator, begin, fit, linear, progress)
     large = _above_declared(plant, fit) if fit.is_successful else ()
-    verdict = (*others, *wrong, *large, *_remedies(found), *_agreement(fit), *verdict)
+    verdict = (*others, *wrong, *large, *_remedies(found), *where, *_agreement(fit), *verdict)
     names = names_of(plant.definition.parameters)
     values = np.array([float(value) for value in fit.estimate.params])
     sd = np.where(fit.free, np.sqrt(np.maximum(np.diag(covariance), 0.0)), np.nan)
@@ -545,38 +555,51 @@ def _suspects(
     experiments: Experiments,
     estimator: AbstractEstimator,
     start: Params,
-    fit: Fit,
     linear: np.ndarray,
     progress: Progress,
-) -> tuple[Suspect, ...]:
-    """What the plant may leave out, where more than noise is left; not for long records."""
-    if not isinstance(estimator, NLS) or not fit.is_successful:
-        return ()
+    fit: Fit,
+    is_best: bool,
+) -> tuple[tuple[Suspect, ...], tuple[str, ...]]:
+    """What the plant may leave out, where more than noise is left, and in which rows."""
+    if not isinstance(estimator, NLS) or fit.has_ended_in(Status.NOT_FINITE):
+        return (), ()
     if estimator.likelihood != "normal" or estimator.prior is not None:
-        return ()  # outliers would hide them, a prior explain what they explain
-    if experiments.valid.size > _SIZE_OF_SUSPECTS:
-        return ()
+        return (), ()  # outliers would hide them, a prior explain what they explain
     residual, valid = np.asarray(fit.estimate.residual), np.asarray(experiments.valid)
-    if is_noise(plant, experiments, fit.estimate) and outliers(residual, valid) is None:
-        return ()
+    is_white = is_noise(plant, experiments, fit.estimate) and is_centred(experiments, fit.estimate)
+    if is_white and outliers(residual, valid) is None:
+        return (), ()
 
     name, plus, extensions = plant.definition.name.partition("+")
     word = (
         f"{name if name in PLANTS else 'FILE.py:' + plain_kind(plant).__name__}{plus}{extensions}"
     )
-    stacked = partial(experiments_of, plant, records, experiments.initial_state_known)
-    return suspects(
+    question = Question(
         plant,
         experiments,
-        stacked,
-        linear,
         estimator,
+        lambda plant, linear: experiments_of(
+            plant, records, experiments.initial_state_known, linear
+        ),
+        linear,
         start,
         fit.estimate,
+        is_best,
         ~fit.known,
         word,
-        lambda text, done, total: progress(text, 0.5 + 0.3 * done / total, 1.0),
     )
+
+    def told(text: str, done: float, total: float) -> None:
+        progress(text, 0.5 + 0.3 * done / total, 1.0)
+
+    if valid.size <= _SIZE_OF_SUSPECTS:
+        return suspects(question, told), ()
+    spans = spans_of(experiments, residual, _SIZE_OF_SUSPECTS)
+    where = rows_of(records, [(span.experiment, span.first, span.stop) for span in spans])
+    found = suspects_in(question, spans, told)
+    if not found:
+        return found, (f"no likely cause was found in {where}",)
+    return found, (f"likely causes were looked for in {where}",)
 
 
 def _remedies(found: Sequence[Suspect]) -> tuple[str, ...]:
@@ -598,10 +621,13 @@ def _agreement(fit: Fit) -> tuple[str, ...]:
     return (f"{same} of {len(ends)} starts of the search ended at this estimate",)
 
 
-def _require_explanation(
-    records: Sequence[Record], residual: Sequence[np.ndarray], unknowns: int
-) -> None:
-    """Raises ValueError where the best simulation fits the outputs no better than chance.
+def _with_causes(refusal: str, found: Sequence[Suspect]) -> ValueError:
+    """A refusal, with what the plant may leave out."""
+    return ValueError("; ".join([refusal, *_remedies(found)]))
+
+
+def _explains(records: Sequence[Record], residual: Sequence[np.ndarray], unknowns: int) -> bool:
+    """Whether the best simulation fits an output better than chance.
 
     What has no more values than unknowns cannot be tested.
     """
@@ -611,5 +637,4 @@ def _require_explanation(
         for i in range(r.shape[1])
         if np.isfinite(r[:, i]).sum() > unknowns > 0
     ]
-    if min(chances, default=0.0) > _BY_CHANCE:
-        raise ValueError(NOTHING_SEEN)
+    return min(chances, default=0.0) <= _BY_CHANCE

@@ -3,7 +3,8 @@
 Each suspect is one effect with one parameter. The plant with all of them is simulated with one
 at a time, at several values; those that could explain most of the residual are fitted. A suspect
 is named where it explains more than chance; the best by the Bayesian information criterion
-comes first.
+comes first. Of a long record some parts are searched, and the likeliest suspect is then fitted to
+all of it.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from .contract import (
     to_search,
 )
 from .diagnosis import chi2_tail, innovations, log_likelihood
+from .excerpt import Excerpt, Span, excerpt_of
 from .nls import NLS
 
 if TYPE_CHECKING:
@@ -48,11 +50,13 @@ _TRIED = {
     "offset": (1.0,),
     "coulomb": (1.0,),
     "drag": (1.0,),
+    "bias": (1.0,),
     "drift": (1.0,),
 }
 """Values of a suspect's parameter: sampling times, parts of the largest input, usual sizes."""
 HOLDS = "constant", "linear"  # an input between samples
 _MOST_FITTED, _STEPS = 5, 30  # suspects that are fitted, and most steps of one fit
+_MOST_CONFIRMED = 2  # suspects found in parts of a record that are fitted to all of it
 _STEP = 1e-6  # of a difference
 _LANES = 16  # simulated side by side; a constant, so that one program is compiled
 _HUGE = 1e30
@@ -107,38 +111,70 @@ class Suspect:
         )
 
 
-def suspects(
-    plant: AbstractPlant,
-    experiments: Experiments,
-    stacked: Callable[[Bool[np.ndarray, " input"]], Experiments],
-    linear: Bool[np.ndarray, " input"],
-    estimator: NLS,
-    start: Params,
-    estimate: Estimate,
-    free: Bool[np.ndarray, " param"],
-    plant_word: str,
-    progress: Callable[[str, float, float], None] = lambda *_: None,
-) -> tuple[Suspect, ...]:
-    """The suspects that explain more than chance, the likeliest first.
+@dataclasses.dataclass(frozen=True)
+class Question:
+    """A fit that leaves more than noise, and what else could be fitted.
 
-    Args:
-        experiments: the data.
-        stacked: the same with other inputs linear between samples.
+    Attributes:
+        plant, experiments, estimator: of the fit.
+        stacked: experiments of a plant with other inputs linear between samples.
         linear: which inputs are so in the data.
-        estimator: of the estimate.
-        start: of its search.
+        start: of the search.
         estimate: without suspects.
+        is_best: whether no other values of the free parameters fit better.
         free: which parameters were estimated.
         plant_word: the plant on the command line.
-        progress: called with a text, how many suspects are fitted, and their number.
     """
-    # A gain cannot be told from the plant's own.
-    names = [name for name in extensions_of(plant) if not name.startswith(("bias_", "gain_"))]
-    whole, valid = extended(plant, names), np.asarray(experiments.valid)
-    before, tests = np.asarray(estimate.residual), len(names) + len(linear) + 1
 
-    def suspect(name: str, after: Residual, remedy: str, freedoms: int = 1) -> Suspect:
+    plant: AbstractPlant
+    experiments: Experiments
+    estimator: NLS
+    stacked: Callable[[AbstractPlant, Bool[np.ndarray, " input"]], Experiments]
+    linear: Bool[np.ndarray, " input"]
+    start: Params
+    estimate: Estimate
+    is_best: bool
+    free: Bool[np.ndarray, " param"]
+    plant_word: str
+
+    @property
+    def names(self) -> list[str]:
+        """Extensions that are suspects; a gain cannot be told from the plant's own."""
+        return [name for name in extensions_of(self.plant) if not name.startswith("gain_")]
+
+    @property
+    def num_tests(self) -> int:
+        """Number of suspects."""
+        return len(self.names) + len(self.linear) + 1
+
+    def other_hold(self, index: int) -> tuple[Bool[np.ndarray, " input"], str]:
+        """Inputs of which one has the other hold, and the suspect's name."""
+        other = self.linear ^ (np.arange(len(self.linear)) == index)
+        return other, f"{HOLDS[int(other[index])]}_{names_of(self.plant.definition.inputs)[index]}"
+
+    def search(self, part: Excerpt | None = None) -> _Search:
+        """For suspects that are extensions, from the estimate; in a part of the record."""
+        sd = self.estimator.weights(self.plant, self.experiments, jax.device_put(self.estimate))
+        whole = extended(self.plant, self.names)
+        experiments, elapsed = part or (self.experiments, None)
+        return _Search(
+            self.plant,
+            whole,
+            experiments,
+            self.start,
+            self.estimate,
+            self.free,
+            np.asarray(sd),
+            elapsed,
+        )
+
+    def suspect(
+        self, name: str, before: Residual, after: Residual, valid: Bool[np.ndarray, "..."]
+    ) -> Suspect:
+        """A suspect by the residuals without and with it."""
         whitened = max(_gained(before, after, valid, whiten=True), 0.0)
+        word, _, channel = name.partition("_")
+        is_hold = word in HOLDS
         return Suspect(
             name=name,
             value=None,
@@ -146,34 +182,121 @@ def suspects(
             unit="",
             reduction=_reduction(before, after, valid),
             log_likelihood=_gained(before, after, valid, whiten=False),
-            p_value=chi2_tail(freedoms, 2 * whitened),
-            remedy=remedy,
+            p_value=chi2_tail(1 + (word == "drift"), 2 * whitened),
+            remedy=f"--hold-input {channel}={word}"
+            if is_hold
+            else f"--plant {self.plant_word}+{name}",
         )
 
+    def likely(self, found: Sequence[Suspect], num_values: int) -> tuple[Suspect, ...]:
+        """Those that explain more than chance, the likeliest first."""
+        likely = [s for s in found if s.log_likelihood > 0 and s.p_value * self.num_tests <= RARE]
+        return tuple(sorted(likely, key=lambda s: -s.evidence(num_values)))
+
+
+Told = Callable[[str, float, float], None]
+
+
+def suspects(question: Question, progress: Told = lambda *_: None) -> tuple[Suspect, ...]:
+    """The suspects that explain more than chance, the likeliest first.
+
+    Args:
+        question: what was fitted.
+        progress: called with a text, how many suspects are fitted, and their number.
+    """
+    q, valid = question, np.asarray(question.experiments.valid)
+    search, total = q.search(), len(q.linear) + _MOST_FITTED
+    before = np.asarray(q.estimate.residual)
+    if not q.is_best:
+        before = search.refitted(search.begin, search.start)
     found = [] if (tails := outliers(before, valid)) is None else [tails]
-    total = len(linear) + _MOST_FITTED
-    for i, channel in enumerate(names_of(plant.definition.inputs)):
+    for i, channel in enumerate(names_of(q.plant.definition.inputs)):
         progress(f"likely causes: {channel} between samples", i, total)
-        other = linear ^ (np.arange(len(linear)) == i)
-        data, word = stacked(other), HOLDS[int(other[i])]
+        other, name = q.other_hold(i)
+        data = q.stacked(q.plant, other)
         ended = [
-            jax.device_get(estimator(plant, data, *jax.device_put((begin, free))))
-            for begin in (start, estimate.params)
+            jax.device_get(q.estimator(q.plant, data, *jax.device_put((begin, q.free))))
+            for begin in (q.start, q.estimate.params)
         ]
         after = np.asarray(min(ended, key=quality).residual)
-        found.append(suspect(f"{word}_{channel}", after, f"--hold-input {channel}={word}"))
-    sd = np.asarray(estimator.weights(plant, experiments, jax.device_put(estimate)))
-    search = _Search(plant, whole, experiments, start, estimate, free, sd)
-    trials = [_Trial(n, v) for n in names for v in _tried(whole, n, experiments.inputs)]
-    for i, trial in enumerate(search.promising(trials), len(linear)):
-        progress(f"likely causes: {trial.name}", i, total)
+        found.append(q.suspect(name, before, after, valid))
+    found += _effects(q, search, before, progress)
+    return q.likely(found, int(valid.sum()))
+
+
+def suspects_in(
+    question: Question, spans: Sequence[Span], progress: Told = lambda *_: None
+) -> tuple[Suspect, ...]:
+    """The suspects of a long record, looked for in some parts of it.
+
+    The likeliest is fitted to the whole record: its figures are of that fit.
+
+    Args:
+        question: what was fitted.
+        spans: the parts.
+        progress: see `suspects`.
+    """
+    q, total = question, len(question.linear) + _MOST_FITTED + 1
+    search = q.search(excerpt_of(q.plant, q.experiments, q.estimate, spans))
+    before, valid = search.refitted(search.begin), search.valid
+    found = [] if (tails := outliers(before, valid)) is None else [tails]
+    for i, channel in enumerate(names_of(q.plant.definition.inputs)):
+        progress(f"likely causes: {channel} between samples", i, total)
+        other, name = q.other_hold(i)
+        part = excerpt_of(q.plant, q.stacked(q.plant, other), q.estimate, spans)
+        other_search = q.search(part)
+        after = other_search.refitted(other_search.begin)
+        found.append(q.suspect(name, before, after, valid))
+    found += _effects(q, search, before, progress)
+    likely = q.likely(found, int(valid.sum()))
+    for i, first in enumerate(likely[:_MOST_CONFIRMED]):
+        progress(f"likely causes: {first.name} in the whole record", total - 1, total)
+        if confirmed := q.likely([_in_all(q, first)], int(q.experiments.valid.sum())):
+            return *confirmed, *likely[i + 1 :]
+    return ()
+
+
+def _in_all(q: Question, found: Suspect) -> Suspect:
+    """A suspect by its fit to the whole record."""
+    before, valid = np.asarray(q.estimate.residual), np.asarray(q.experiments.valid)
+    if found.name == "outliers":
+        return outliers(before, valid) or dataclasses.replace(found, p_value=1.0)
+    if found.value is None:
+        index = names_of(q.plant.definition.inputs).index(found.name.partition("_")[2])
+        data, plant = q.stacked(q.plant, q.other_hold(index)[0]), q.plant
+        begin, free = q.estimate.params, q.free
+    else:
+        plant = extended(q.plant, [found.name])
+        data = q.stacked(plant, q.linear)
+        values = {**q.estimate.params._asdict(), found.name: jnp.asarray(found.value)}
+        begin = plant.Params(**values)
+        free = np.array([n not in q.plant.Params._fields for n in begin._fields])
+        free[[begin._fields.index(n) for n in q.plant.Params._fields]] = q.free
+    end = jax.device_get(q.estimator(plant, data, *jax.device_put((begin, free))))
+    suspect = q.suspect(found.name, before, np.asarray(end.residual), valid)
+    if found.value is None:
+        return suspect
+    at = plant.Params._fields.index(found.name)
+    return dataclasses.replace(
+        suspect,
+        value=float(end.params[at]),
+        std_error=math.sqrt(end.covariance[at, at]),
+        unit=found.unit,
+    )
+
+
+def _effects(q: Question, search: _Search, before: Residual, progress: Told) -> list[Suspect]:
+    """The extensions that could explain most, fitted."""
+    inputs, found, first = search.data.inputs, [], len(q.linear)
+    trials = [_Trial(n, v) for n in q.names for v in _tried(search.whole, n, inputs)]
+    where = search.begin if q.is_best else search.start  # an estimate may be far off
+    for i, trial in enumerate(search.promising(trials, where), first):
+        progress(f"likely causes: {trial.name}", i, first + _MOST_FITTED)
         value, std_error, after = search.best(trial)
-        remedy, freedoms = f"--plant {plant_word}+{trial.name}", 1 + trial.name.startswith("drift_")
-        named = suspect(trial.name, after, remedy, freedoms)
-        unit = whole.definition.parameter(trial.name).unit
+        named = q.suspect(trial.name, before, after, search.valid)
+        unit = search.whole.definition.parameter(trial.name).unit
         found.append(dataclasses.replace(named, value=value, std_error=std_error, unit=unit))
-    likely = [s for s in found if s.log_likelihood > 0 and s.p_value * tests <= RARE]
-    return tuple(sorted(likely, key=lambda s: -s.evidence(int(valid.sum()))))
+    return found
 
 
 class _Trial(NamedTuple):
@@ -200,13 +323,21 @@ class _Search:
         estimate: Estimate,
         free: Bool[np.ndarray, " param"],
         sd: Float[np.ndarray, " output"],
+        elapsed: Float[np.ndarray, " experiment"] | None = None,
     ) -> None:
         d, own = whole.definition, names_of(plant.definition.states)
         self.plant, self.whole, self.estimate, self.free, self.sd = plant, whole, estimate, free, sd
         self.valid = np.asarray(experiments.valid)
         self.states = np.array([names_of(d.states).index(name) for name in own])
         initial = np.tile(np.asarray(whole.initial_state), (len(self.valid), 1))
-        initial[:, self.states] = np.asarray(estimate.initial_state)
+        begun = estimate if elapsed is None else experiments
+        initial[:, self.states] = np.asarray(begun.initial_state)
+        names = names_of(d.states)
+        if elapsed is not None:  # lags have settled, and drifts have gone on since the beginning
+            for i, channel in enumerate(names_of(d.inputs)):
+                if (lag := f"lag_{channel}") in names and lag not in own:
+                    initial[:, names.index(lag)] = np.asarray(experiments.inputs)[:, 0, i]
+        self.elapsed = elapsed
         self.data = dataclasses.replace(experiments, initial_state=jax.device_put(initial))
         estimated, begun = (
             np.nan_to_num(to_search(plant.definition, params), posinf=_BOUND, neginf=-_BOUND)
@@ -242,9 +373,14 @@ class _Search:
         if not self.data.initial_state_known:
             moved[..., self.states] = points[:, num_free:-1].reshape(count, len(self.valid), -1)
         for lane, name in enumerate(names):
-            if name:
-                scale = self.whole.definition.parameter(name).scale
-                added[lane, fields.index(name)] = points[lane, -1] * scale
+            if not name:
+                continue
+            value = points[lane, -1] * self.whole.definition.parameter(name).scale
+            added[lane, fields.index(name)] = value
+            if name.startswith("drift_") and self.elapsed is not None:
+                state = next(s for s in self.whole.definition.states if s.name == name)
+                at = self.whole.definition.states.index(state)
+                moved[lane, :, at] = value * self.elapsed / state.scale
         found = []
         for first in range(0, count, _LANES):
             few = [rows[first : first + _LANES] for rows in (own, added, moved)]
@@ -256,7 +392,8 @@ class _Search:
                 self.estimate.params,
                 *jax.device_put((self.free, *padded)),
             )
-            weighted = (np.asarray(residual) / self.sd)[: len(few[0]), self.valid]
+            with np.errstate(over="ignore"):
+                weighted = (np.asarray(residual) / self.sd)[: len(few[0]), self.valid]
             found.append(np.clip(np.nan_to_num(weighted, nan=_HUGE), -_HUGE, _HUGE))
         return np.concatenate(found)
 
@@ -270,12 +407,12 @@ class _Search:
         columns[:, -1 - self.of_state.shape[1] : -1] *= self.of_state
         return found[0], columns
 
-    def promising(self, trials: Sequence[_Trial]) -> list[_Trial]:
-        """The few trials that explain most if everything were linear, one for each suspect."""
-        before, S = self.slopes(np.append(self.begin, 0.0), "")
+    def promising(self, trials: Sequence[_Trial], where: np.ndarray) -> list[_Trial]:
+        """The few trials that explain most if all were linear at a point, one for each suspect."""
+        before, S = self.slopes(np.append(where, 0.0), "")
         basis, _ = np.linalg.qr(S[:, :-1])
         scale = [self.whole.definition.parameter(trial.name).scale for trial in trials]
-        points = [np.append(self.begin, t.value / s) for t, s in zip(trials, scale, strict=True)]
+        points = [np.append(where, t.value / s) for t, s in zip(trials, scale, strict=True)]
         changed = self.misfits(np.stack(points), [trial.name for trial in trials])
         best: dict[str, tuple[float, _Trial]] = {}
         for trial, change in zip(trials, changed - before, strict=True):
@@ -295,8 +432,10 @@ class _Search:
         """Value of the suspect's parameter, its standard error, and the residual.
 
         The search begins at the estimate, and at its start: a strong effect distorts an estimate.
+        In parts of a long record it begins at the estimate only.
         """
-        ends = [self.fitted(trial, own) for own in (self.begin, self.start)]
+        begins = (self.begin, self.start) if self.elapsed is None else (self.begin,)
+        ends = [self.fitted(trial, own) for own in begins]
         return min(ends, key=lambda end: float(np.sum((end[2] / self.sd) ** 2)))
 
     def fitted(self, trial: _Trial, own: np.ndarray) -> tuple[float, float, Residual]:
@@ -305,8 +444,33 @@ class _Search:
         begin = np.append(own, trial.value / parameter.scale)
         lower = np.full(len(begin), -np.inf)
         lower[-1] = -np.inf if parameter.lower is None else 0.0
-        both = lru_cache(1)(lambda key: self.slopes(np.frombuffer(key), trial.name))
-        found = _require_least_squares()(
+        found = self._searched(lambda point: self.slopes(point, trial.name), begin, lower)
+        sd = math.sqrt(2 * found.cost / max(len(found.fun) - len(begin), 1))
+        row = np.linalg.pinv(np.linalg.qr(found.jac, mode="r"))[-1]
+        size = parameter.scale
+        std_error = sd * size * float(np.linalg.norm(row))
+        return float(found.x[-1]) * size, std_error, self._residual(found)
+
+    def refitted(self, *begins: np.ndarray) -> Residual:
+        """The residual of the best fit without suspects, at which all others begin."""
+
+        def slopes(point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            misfit, columns = self.slopes(np.append(point, 0.0), "")
+            return misfit, columns[:, :-1]
+
+        ends = [self._searched(slopes, begin, -np.inf) for begin in begins]
+        found = min(ends, key=lambda end: end.cost)
+        self.begin = found.x
+        return self._residual(found)
+
+    def _searched(
+        self,
+        slopes: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
+        begin: np.ndarray,
+        lower: np.ndarray | float,
+    ) -> OptimizeResult:
+        both = lru_cache(1)(lambda key: slopes(np.frombuffer(key)))
+        return _require_least_squares()(
             lambda point: both(point.tobytes())[0],
             begin,
             jac=lambda point: both(point.tobytes())[1],
@@ -314,12 +478,11 @@ class _Search:
             ftol=1e-6,
             max_nfev=_STEPS,
         )
+
+    def _residual(self, found: OptimizeResult) -> Residual:
         residual = np.zeros(self.valid.shape)
         residual[self.valid] = found.fun
-        sd = math.sqrt(2 * found.cost / max(len(found.fun) - len(begin), 1))
-        row = np.linalg.pinv(np.linalg.qr(found.jac, mode="r"))[-1]
-        size = parameter.scale
-        return float(found.x[-1]) * size, sd * size * float(np.linalg.norm(row)), residual * self.sd
+        return residual * self.sd
 
 
 @eqx.filter_jit
