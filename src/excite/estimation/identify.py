@@ -566,6 +566,8 @@ def _suspects(
     if estimator.likelihood != "normal" or estimator.prior is not None:
         return (), ()  # outliers would hide them, a prior explain what they explain
     residual, valid = np.asarray(fit.estimate.residual), np.asarray(experiments.valid)
+    if not np.any(residual):
+        return (), ()  # nothing is left to explain
     is_white = is_noise(plant, experiments, fit.estimate) and is_centred(experiments, fit.estimate)
     if is_white and outliers(residual, valid) is None:
         return (), ()
