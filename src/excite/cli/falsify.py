@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -96,22 +97,28 @@ def falsify(
         found = falsified(
             excitation, options=settings, noise=noise, progress=progress, **options,
         )  # fmt: skip
-    if plot is not None:
-        from ..figure import save
-
-        save(found.plot(), plot)
-    if out is not None:
-        found.save(out, overwrite)
-    if certify is not None:
-        found.certified().save(certify, overwrite)
     if as_json:
         show_json(
             {"excitation": found.excitation, "plant": found.plant.name, **found.certificate()}
         )
     else:
         click.echo(found)
-        if out is not None:
-            click.echo(
-                f"replay: excite simulate {out} --excitation {excitation} --seed {found.worst_seed}"
+    if out is not None:
+        found.save(out, overwrite)
+        if not as_json:
+            chosen = "".join(
+                f" --set {name}={json.dumps(value)}" for name, value in settings.items()
             )
+            click.echo(
+                f"worst plant: {out}\nreplay: excite simulate {out} --excitation {excitation}"
+                f"{chosen} --steps {found.num_steps} --seed {found.worst_seed}"
+            )
+    if certify is not None:
+        found.certified().save(certify, overwrite)
+        if not as_json:
+            click.echo(f"policy with this certificate: {certify}")
+    if plot is not None:
+        from ..figure import save
+
+        save(found.plot(), plot)
     click.get_current_context().exit(0 if found.is_safe else 1)

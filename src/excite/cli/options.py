@@ -72,6 +72,8 @@ class Assignments(click.ParamType, Generic[Value]):
             name, equals, text = (part.strip() for part in parts)
             if not (name and equals and text):
                 self.fail(f"{pair!r} is not of the form NAME=VALUE", param, ctx)
+            if name in result:
+                self.fail(f"{name} is given twice", param, ctx)
             try:
                 result[name] = self.convert_value(text)
             except ValueError:
@@ -132,8 +134,18 @@ OUT_FILE = click.Path(path_type=Path)
 
 
 def merged(pairs: Iterable[dict[str, Value]]) -> dict[str, Value]:
-    """One dictionary from an option that was given several times."""
-    return {name: value for part in pairs for name, value in part.items()}
+    """One dictionary from an option that was given several times.
+
+    Raises:
+        ValueError: for a name with two values.
+    """
+    result: dict[str, Value] = {}
+    for part in pairs:
+        for name, value in part.items():
+            if name in result:
+                raise ValueError(f"{name} is given twice")
+            result[name] = value
+    return result
 
 
 def uncertainty_option(help: str) -> Callable[[Callback], Callback]:

@@ -149,6 +149,14 @@ def plant_in_file(plant: AbstractPlant, params: Params) -> dict[str, object]:
 _FORMAT = "excite plant 1"
 
 
+def is_plant_file(path: Path) -> bool:
+    """Whether a file is that of a plant."""
+    try:
+        return read_json(path).get("format") == _FORMAT
+    except ValueError:
+        return False
+
+
 def _plant_of_file(path: Path) -> AbstractPlant:
     """The plant in a file; ValueError for a file that holds none."""
     advice = "a file of a plant is written by 'excite falsify'"
@@ -158,6 +166,8 @@ def _plant_of_file(path: Path) -> AbstractPlant:
         if content.get("format") != _FORMAT or str(content["plant"]).endswith(PLANT_ENDING):
             raise damaged(path, advice)
         plant = plant_named(content["plant"])
+        if set(content["params"]) != {*names_of(plant.definition.parameters)}:
+            raise damaged(path, advice)
         start = [float(content["initial_state"][s.name]) for s in plant.definition.states]
         constants = {name: float(value) for name, value in content["constants"].items()}
         plant = with_sensor(plant, content["noise_sd"])

@@ -309,7 +309,8 @@ def _tuned(kind: type[AbstractPlant], nominal: tuple[float, ...]) -> type[Abstra
 
     parameters = map(tuned, d.parameters, nominal)
     definition = dataclasses.replace(d, parameters=tuple(parameters))
-    return type(kind.__name__, (kind,), {"definition": definition, "__module__": kind.__module__})
+    body = {"definition": definition, "__module__": kind.__module__, "__doc__": kind.__doc__}
+    return type(kind.__name__, (kind,), body)
 
 
 def as_number(name: str, value: object) -> float:

@@ -190,7 +190,8 @@ def _class_of(kind: type[AbstractPlant], extensions: tuple[_Extension, ...]) -> 
         parameters=(*d.parameters, *(_parameter(plant, e) for e in extensions)),
     )
     body = {"definition": definition, "plain": kind, "extensions": extensions}
-    return type(f"{kind.__name__}Extended", (Extended,), {**body, "__module__": __name__})
+    body |= {"__module__": __name__, "__doc__": kind.__doc__}
+    return type(f"{kind.__name__}Extended", (Extended,), body)
 
 
 def _states(d: PlantDescription, e: _Extension) -> tuple[State, ...]:

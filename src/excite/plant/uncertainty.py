@@ -17,7 +17,7 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -58,13 +58,13 @@ class Uncertainty(eqx.Module):
         cls,
         plant: AbstractPlant,
         spread: float = 0.3,
-        ranges: Mapping[str, Range] | None = None,
+        ranges: Mapping[str, Any] | None = None,
     ) -> Uncertainty:
         """The box around a plant.
 
         Args:
             spread: of parameters without a range: nominal value ± spread times the scale.
-            ranges: by name, see the module.
+            ranges: by name, each a `Range`; see the module.
 
         Raises:
             ValueError: for an unknown name, or a range that is empty, not finite, or beyond the
@@ -86,7 +86,7 @@ class Uncertainty(eqx.Module):
         quantities = _quantities(whole, groups[_STATES])
         for name in by_name:
             if name not in quantities:
-                known = [*quantities, *possible, *groups]
+                known = dict.fromkeys([*quantities, *possible, *groups])
                 where = f"quantity in the uncertainty of {plant.definition.name!r}"
                 raise unknown(where, name, known)
         boxes = {name: _interval(name, value, quantities[name]) for name, value in by_name.items()}
@@ -148,6 +148,7 @@ class _Quantity:
     unit: str
     lower: float = -math.inf
     upper: float = math.inf
+    is_positive: bool = False
 
 
 @dataclass(frozen=True)
@@ -160,7 +161,12 @@ class _Interval:
 def _quantities(plant: AbstractPlant, starts: Sequence[str]) -> dict[str, _Quantity]:
     """All quantities of a plant that may differ, by name; `starts` are those of its states."""
     d = plant.description
-    found = {p.name: _Quantity(p.nominal, p.scale, p.unit, *p.support) for p in d.parameters}
+    found = {
+        p.name: _Quantity(p.nominal, p.scale, p.unit, *p.support, p.positive) for p in d.parameters
+    }
+    for name in d.name.split("+")[1:]:  # what a percentage of an effect would be is not plain
+        if not name.startswith(("gain_", "saturation_")):
+            found[name] = dataclasses.replace(found[name], size=0.0)
     for name in names_of(d.inputs):  # an input cannot act before it is chosen
         if (delay := f"delay_{name}") in found:
             found[delay] = dataclasses.replace(found[delay], lower=0.0)
@@ -170,7 +176,7 @@ def _quantities(plant: AbstractPlant, starts: Sequence[str]) -> dict[str, _Quant
     return {**found, _NOISE: _Quantity(1.0, 1.0, "", lower=0.0)}
 
 
-def _interval(name: str, given: Range, about: _Quantity) -> _Interval:
+def _interval(name: str, given: Any, about: _Quantity) -> _Interval:
     """The range of one quantity; ValueError for one that is not allowed."""
     found = _read(name, given, about)
     if not (math.isfinite(found.lower) and math.isfinite(found.upper)):
@@ -179,6 +185,8 @@ def _interval(name: str, given: Range, about: _Quantity) -> _Interval:
         raise ValueError(
             f"range of {name} contains no plant: it goes from {found.lower:g} to {found.upper:g}"
         )
+    if found.lower <= 0 and about.is_positive:
+        raise ValueError(f"range of {name} must be above 0: it begins at {found.lower:g}")
     if found.lower < about.lower or found.upper > about.upper:
         raise ValueError(
             f"range of {name} goes from {found.lower:g} to {found.upper:g}, beyond its bounds "
@@ -187,7 +195,7 @@ def _interval(name: str, given: Range, about: _Quantity) -> _Interval:
     return found
 
 
-def _read(name: str, given: Range, about: _Quantity) -> _Interval:
+def _read(name: str, given: Any, about: _Quantity) -> _Interval:
     """A range as it is written."""
     if isinstance(given, Sequence) and not isinstance(given, str):
         if len(given) != 2:
@@ -197,6 +205,8 @@ def _read(name: str, given: Range, about: _Quantity) -> _Interval:
         raise ValueError(f"range of {name} must be {_ALLOWED}: got {given!r}")
     text = given.strip()
     if text.endswith("%"):
+        if not about.size:
+            raise ValueError(f"range of {name} needs two numbers LOW:HIGH: got {given!r}")
         reach = _as_number(name, text[:-1], given) / 100 * about.size
         return _Interval(about.nominal - reach, about.nominal + reach)
     first, colon, second = text.partition(":")
@@ -213,15 +223,15 @@ def _read(name: str, given: Range, about: _Quantity) -> _Interval:
     return _Interval(_as_number(name, first, given), _as_number(name, second, given))
 
 
-def _as_number(name: str, value: object, given: Range) -> float:
+def _as_number(name: str, value: object, given: Any) -> float:
     try:
-        if isinstance(value, bool):
+        if isinstance(value, bool) or isinstance(value, str) != isinstance(given, str):
             raise ValueError
         return float(value)  # pyright: ignore[reportArgumentType]
     except (TypeError, ValueError, OverflowError):
         raise ValueError(f"range of {name} must be {_ALLOWED}: got {_shown(given)}") from None
 
 
-def _shown(given: Range) -> str:
+def _shown(given: Any) -> str:
     text = given if isinstance(given, str) else str(list(given))
     return repr(text) if len(text) < 60 else repr(text[:60] + "...")

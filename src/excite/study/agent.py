@@ -88,7 +88,7 @@ class DecisionSettings(RewardSettings):
     input_amplitude: dict[str, Positive] = {}
     spread: Annotated[float, Field(ge=0, lt=1, strict=True, allow_inf_nan=False)] | None = None
     constants: dict[str, tuple[float, float]] = {}
-    uncertainty: dict[str, str | tuple[float, float]] = {}
+    uncertainty: dict[str, Any] = {}
     normalise_penalty: Annotated[bool, Field(strict=True)] = False
 
 

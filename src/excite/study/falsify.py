@@ -9,13 +9,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .. import __version__
-from ..description import PlantDescription, wrong_type
+from ..description import LARGEST_SEED, PlantDescription, names_of, require_whole
 from ..environment.falsification import Effort, OnPlant, Stage, search
-from ..excitation.catalogue import ExcitationLike, excitation_and_origin, name_of
+from ..excitation.catalogue import (
+    EXCITATIONS,
+    LOOP,
+    SIGNAL_ENDINGS,
+    ExcitationLike,
+    excitation_and_origin,
+    name_of,
+)
 from ..files import require_new_file, write_json
 from ..plant.catalogue import (
     PLANT_ENDING,
     PlantLike,
+    is_plant_file,
     plant_from,
     plant_in_file,
     require_inputs,
@@ -27,7 +35,7 @@ from ..record import Record
 from ..report.numbers import number
 from ..report.tables import html_table, text_table
 from ..safety import watched_levels
-from ..simulation import Experiment, experiment_length
+from ..simulation import DivergedError, Experiment, Trajectory, experiment_length
 from ..training.checkpoint import Progress
 
 if TYPE_CHECKING:
@@ -46,6 +54,7 @@ class Falsification:
         plant: for which the excitation was made.
         excitation: its name.
         policy: its policy, if it is one.
+        num_steps: of an experiment.
         ranges: the declared uncertainty: lowest and highest value of each quantity.
         stages: of the search.
         nearness: the largest output over its critical level that was found, with the noise of
@@ -62,6 +71,7 @@ class Falsification:
     plant: PlantDescription
     excitation: str
     policy: Policy | None
+    num_steps: int
     ranges: Mapping[str, tuple[float, float]]
     stages: tuple[Stage, ...]
     nearness: float
@@ -162,6 +172,8 @@ def require_plant_path(path: Path, overwrite: bool) -> None:
     if path.suffix != PLANT_ENDING:
         raise ValueError(f"{path}: files of plants end in {PLANT_ENDING}")
     require_new_file(path, overwrite)
+    if path.exists() and not is_plant_file(path):
+        raise ValueError(f"{path} is no file of a plant and would be lost; choose another name")
 
 
 def require_certifiable(excitation: str, path: Path, overwrite: bool) -> None:
@@ -216,6 +228,8 @@ def falsify(
     made = {} if policy is None else policy.provenance
     if plant is None:
         if policy is None:
+            if isinstance(excitation, str) and not _is_signal(excitation):
+                read_policy(excitation)  # says which policies there are
             raise ValueError(
                 f"{_word(excitation)} is no policy, which would name its plant: give the plant "
                 "(--plant)"
@@ -227,10 +241,8 @@ def falsify(
         raise ValueError(
             f"plant {chosen.definition.name!r} has no critical level: there is nothing to violate"
         )
-    if not isinstance(budget, int) or isinstance(budget, bool):
-        raise wrong_type("budget", budget, "a whole number")
-    if budget < MIN_BUDGET:
-        raise ValueError(f"budget must be at least {MIN_BUDGET} experiments: got {budget}")
+    require_whole("budget", budget, MIN_BUDGET)
+    require_whole("seed", seed, 0, LARGEST_SEED)
     found, origin = excitation_and_origin(excitation, options or {}, chosen)
     name = _word(excitation)
     num_steps = experiment_length(found, name, steps, isinstance(excitation, Record))
@@ -250,6 +262,7 @@ def falsify(
         plant=chosen.description,
         excitation=name,
         policy=policy,
+        num_steps=num_steps,
         ranges={name: (low, high) for name, (low, high) in box.ranges().items()},
         stages=result.stages,
         nearness=max(plain),
@@ -258,9 +271,28 @@ def falsify(
         worst=dict(zip(box.names, box.values(result.worst.point[0]).tolist(), strict=True)),
         worst_seed=worst_seed,
         worst_plant=plant_in_file(worst, params),
-        record=experiment.record(experiment.run()),
+        record=experiment.record(_run(experiment)),
         seed=seed,
     )
+
+
+def _is_signal(word: str) -> bool:
+    return word.removeprefix(LOOP) in EXCITATIONS or word.endswith(SIGNAL_ENDINGS)
+
+
+def _run(experiment: Experiment) -> Trajectory:
+    """The worst experiment; ValueError where it diverged."""
+    try:
+        return experiment.run()
+    except DivergedError:
+        values = zip(
+            names_of(experiment.plant.definition.parameters), experiment.params, strict=True
+        )
+        told = ", ".join(f"{name} = {number(float(value))}" for name, value in values)
+        raise ValueError(
+            "the simulation of a plant of the declared uncertainty diverges (NaN or infinity): "
+            f"{told}; a narrower uncertainty may help"
+        ) from None
 
 
 def _word(excitation: ExcitationLike) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import jax
 import pydantic
@@ -131,7 +131,7 @@ class Study(Settings):
     num_steps: Count = 500
     seed: Annotated[int, Field(ge=0, lt=2**63, strict=True)] = 0
     spread: Annotated[float, Field(ge=0, lt=1, strict=True, allow_inf_nan=False)] = 0.3
-    uncertainty: dict[str, str | tuple[float, float]] = {}
+    uncertainty: dict[str, Any] = {}
     sensor: dict[str, SensorSettings] = {}
     methods: dict[str, MethodSettings] = {}
     estimators: dict[str, EstimatorSettings]
