@@ -545,9 +545,11 @@ def _gained(before: Residual, after: Residual, valid: np.ndarray, whiten: bool) 
 
 def _reduction(before: Residual, after: Residual, valid: np.ndarray) -> float:
     """Part of the squared residuals, of each output over those before, that is gone."""
-    pairs = zip(_parts(before, valid), _parts(after, valid), strict=True)
-    left = [sum(float(r @ r) for r in n) / sum(float(r @ r) for r in o) for o, n in pairs]
-    return 1 - float(np.mean(left))
+    old, new = (
+        np.array([sum(float(r @ r) for r in parts) for parts in _parts(residual, valid)])
+        for residual in (before, after)
+    )
+    return 1 - float(np.mean(new[old > 0] / old[old > 0])) if old.any() else 0.0
 
 
 def outliers(residual: Residual, valid: np.ndarray) -> Suspect | None:
@@ -558,6 +560,8 @@ def outliers(residual: Residual, valid: np.ndarray) -> Suspect | None:
     gained, count = 0.0, 0
     for parts in _parts(residual, valid):
         r = np.concatenate(innovations(parts))
+        if not r.any():
+            continue
         gauss = -0.5 * len(r) * (math.log(2 * math.pi * float(np.mean(r**2))) + 1)
         gained += max(0.0, max(_student(r, freedom) for freedom in _FREEDOMS) - gauss)
         bulk = 1.4826 * float(np.median(np.abs(r - np.median(r))))
