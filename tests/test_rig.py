@@ -30,7 +30,7 @@ from excite.files import csv_text
 from excite.plant import Aero2, Aero2Detailed
 from excite.plant.catalogue import with_sensor
 from excite.policy import read_policy, shipped_policies
-from excite.record import read_record
+from excite.record import read_record, write_record
 from excite.rig import (
     AbstractPlayer,
     AbstractRig,
@@ -1014,12 +1014,17 @@ def test_two_recorders_of_one_file_are_one_too_many(tmp_path):
                     pytest.fail("two recorders")
             except ValueError as error:
                 seen.append(str(error))
+        try:
+            write_record(path, excite.simulate("aero2", "chirp", steps=10), AERO)
+        except ValueError as error:
+            seen.append(str(error))
         return 5.0
 
     outcome, _ = experiment(path, ScriptedRig(), ScriptedPlayer(second))
     assert outcome.is_complete, outcome.reason
     assert "exists; choose another name" in seen[0]
     assert seen[1].endswith("a.csv: another process records into this file")
+    assert seen[2].endswith("a.csv: another process records into this file")
     assert len(read_record(path, AERO).time) == 9
     with Recorder(path, AERO, {}, overwrite=True):  # and then it is free again
         pass

@@ -164,17 +164,13 @@ def require_new_file(path: Path, overwrite: bool) -> None:
         raise ValueError(f"{path} is a folder; choose another name")
     if path.exists() and not overwrite:
         raise ValueError(f"{path} exists; choose another name or add --overwrite")
-    if path.is_file() and _is_locked(path):
-        raise ValueError(f"{path}: another process records into this file")
 
 
-def _is_locked(path: Path) -> bool:
-    """Whether another process holds a lock on this file."""
-    try:
-        with path.open("rb") as file:
-            return not took_lock(file)
-    except OSError:  # whoever writes it will say why not
-        return False
+def require_unlocked(path: Path) -> None:
+    """Raises ValueError where another process records into a file."""
+    with contextlib.suppress(OSError), path.open("rb") as file:
+        if not took_lock(file):
+            raise ValueError(f"{path}: another process records into this file")
 
 
 def require_free_run_folder(path: Path, overwrite: bool) -> None:

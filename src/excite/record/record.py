@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..description import PlantDescription, display_unit, wrong_type
-from ..files import csv_text, require_new_file, write_bytes, write_json
+from ..files import csv_text, require_new_file, require_unlocked, write_bytes, write_json
 from .table import data_frame
 
 if TYPE_CHECKING:
@@ -280,10 +280,12 @@ def write_record(
     """Writes a record as CSV or MAT, by the file's ending, and its sidecar.
 
     Raises:
-        ValueError: for another ending, or a folder that does not exist.
+        ValueError: for another ending, a folder that does not exist, or a file into which
+            another process records.
     """
     path = Path(path)
     require_record_path(path, overwrite=True)
+    require_unlocked(path)
     values = np.column_stack([record.time, record.inputs, record.outputs]).T
     columns = dict(zip(description.columns, values, strict=True))
     buffer = io.BytesIO()
