@@ -67,8 +67,9 @@ def unnamed(record: Record) -> Record:
 def effects(plant: str) -> list[str]:
     """What can be left out of a plant; EMPS has an offset and Coulomb friction itself."""
     # Drag hides in the viscous friction of EMPS; a drift of the current does not show in 0.5 s.
+    # A gain is the plant's own.
     own = {"emps": ("offset", "coulomb", "drag"), "dc_motor": ("drift_current",)}.get(plant, ())
-    names = [e for e in extensions_of(plant_from(plant)) if not e.startswith(tuple(own))]
+    names = [e for e in extensions_of(plant_from(plant)) if not e.startswith(("gain", *own))]
     inputs = [i.name for i in plant_from(plant).definition.inputs]
     return [*names, *(f"linear_{name}" for name in inputs), "outliers"]
 
