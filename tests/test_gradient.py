@@ -417,3 +417,17 @@ def test_a_policy_that_a_search_finds_too_near_ranks_below_a_safe_one_of_less_wo
     near, far = {**row, "worst_nearness": 0.99}, {**row, "worth": 1.0, "worst_nearness": 0.9}
     assert rank(settings, far) > rank(settings, near)
     assert rank(settings, {**row, "worst_nearness": 0.9}) == rank(settings, row)
+
+
+def test_adversaries_that_diverge_leave_the_weights_finite_and_moving():
+    env = uncertain_env()
+    fast = Uncertainty.of(env.plant, 0.3, {"J_p": (1e-7, 0.03)})
+    env = dataclasses.replace(env, uncertainty=fast)
+    many = dataclasses.replace(AGAINST, num_adversaries=24)
+    now = Optimisation.start(Network(weights_of(env), env.layout), many, fast)
+    after, _ = eqx.filter_jit(update)(env, many, now, KEYS, True)
+    moved = [
+        float(jnp.abs(a - b).max())
+        for (a, _), (b, _) in zip(after.player.weights, now.player.weights, strict=True)
+    ]
+    assert all(0 < m < 1 for m in moved)

@@ -66,7 +66,8 @@ def run_episodes(
         else:
             true, own = uncertainty.at(uncertainty.draw(params_key))
         run = run_episode(true, own, excitation, num_steps, episode_key)
-        return scored(plant, plant.Params(*own[: len(plant.nominal)]), run)
+        known = plant.Params(*(getattr(own, name) for name in plant.nominal._fields))
+        return scored(plant, known, run)
 
     return jax.vmap(episode)(keys)
 

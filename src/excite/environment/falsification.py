@@ -156,7 +156,7 @@ def search(
         seed: of the search.
         progress: called with a stage, how many of its experiments are done, and their number.
     """
-    box, keys = play.uncertainty, jax.random.split(jax.random.key(seed), 6)
+    box, keys = play.uncertainty, jax.random.split(jax.random.key(seed), 7)
     stages, seen = list[Stage](), list[tuple[Cases, np.ndarray]]()
 
     def add(name: str, cases: Cases, sizes: np.ndarray, count: int, violations: int) -> None:
@@ -184,7 +184,7 @@ def search(
     play_all("corners of the box", Cases(corners, _seeds(keys[3], len(corners))))
     fresh = effort.starts // 2
     points = jax.vmap(box.draw)(jax.random.split(keys[4], fresh))
-    starts = _joined(worst(effort.starts - fresh), Cases(points, _seeds(keys[4], fresh)))
+    starts = _joined(worst(effort.starts - fresh), Cases(points, _seeds(keys[6], fresh)))
     climb("ascents", starts)
     many = jnp.repeat(worst(1).point, effort.more_noises, axis=0)
     play_all("more noise on the worst plant", Cases(many, _seeds(keys[5], len(many))))

@@ -28,6 +28,7 @@ from ..estimation.catalogue import estimator_named
 from ..plant import AbstractARXPlant, AbstractPlant
 from ..plant.uncertainty import Range, Uncertainty
 from ..policy import Layout
+from ..safety import watched_levels
 from ..training.settings import AGAINST_UNCERTAINTY, GradientSettings, PPOSettings
 from .settings import Count, EstimatorSettings, Positive, Settings, checked
 
@@ -176,6 +177,10 @@ class Agent:
         decision = self.decision
         own = spread if decision.spread is None else decision.spread
         ranges = self.ranges(ranges)
+        if ranges and not watched_levels(plant.definition)[0]:
+            raise ValueError(
+                f"plant {plant.definition.name!r} has no critical level: leave uncertainty out"
+            )
         return Env.of(
             plant,
             objective=self._objective(plant, own),

@@ -104,6 +104,7 @@ def seed_task(
         place = Path(folder) if folder and Path(folder).is_dir() else None
         keeper = _Keeper(place, mark, checkpoint_seconds)
         env = own.env(built, chosen.spread, chosen.num_steps, chosen.uncertainty)
+        ranges = own.ranges(chosen.uncertainty)
         trained = _trained(env, own, seed, keeper)
         seconds = keeper.seconds()
         provenance = {
@@ -115,7 +116,9 @@ def seed_task(
         }
         policy = Policy(built.description, env.layout, trained.weights, provenance)
         if env.uncertainty is not None:
-            policy = falsify(policy, built).certified()
+            policy = falsify(
+                policy, built, spread=float(env.spread), uncertainty=ranges
+            ).certified()
         rows, rms = evaluate_method(chosen, built, agent, PolicyExcitation.of(policy))
         limit = np.array(policy.layout.input_half)
         metrics = SeedMetrics(

@@ -193,7 +193,9 @@ def _adversaries(
     )
     climb = partial(climbed, play, num_steps=settings.adversary_steps, decay=0.7)
     worst, sizes, _ = jax.vmap(climb)(starts)
-    order = jnp.argsort(-sizes)
+    # The gradient of a simulation that diverged is not finite: the worst other takes its place.
+    order = jnp.argsort(-jnp.where(jnp.isfinite(sizes), sizes, -jnp.inf))
+    order = jnp.where(jnp.isfinite(sizes[order]), order, order[0])
     return jax.lax.stop_gradient(jax.tree.map(lambda leaf: leaf[order], worst))
 
 
