@@ -55,7 +55,7 @@ _TRIED = {
 }
 """Values of a suspect's parameter: sampling times, parts of the largest input, usual sizes."""
 HOLDS = "constant", "linear"  # an input between samples
-_MOST_FITTED, _STEPS = 5, 30  # suspects that are fitted, and most steps of one fit
+_MOST_FITTED, _STEPS = 7, 30  # suspects that are fitted, and most steps of one fit
 _MOST_CONFIRMED = 2  # suspects found in parts of a record that are fitted to all of it
 _STEP = 1e-6  # of a difference
 _LANES = 16  # simulated side by side; a constant, so that one program is compiled
