@@ -362,18 +362,38 @@ AGAINST = dataclasses.replace(
 )
 
 
-def test_adversaries_come_nearer_than_plants_drawn_at_random_and_are_kept():
+def adversaries_after(steps: int, settings=AGAINST):
+    """Of one update; how near they come, each with its own noise."""
     env = uncertain_env()
-    now = Optimisation.start(Network(weights_of(env), env.layout), AGAINST, env.uncertainty)
-    after, _ = update(env, AGAINST, now, KEYS, True)
+    settings = dataclasses.replace(settings, adversary_steps=steps)
+    now = Optimisation.start(Network(weights_of(env), env.layout), settings, env)
+    after, _ = update(env, settings, now, KEYS, True)
     assert env.uncertainty is not None
     assert after.adversaries is not None
     play = OnPlant(env.uncertainty, now.player.excitation(env.layout), 60)
-    worst = np.asarray(jax.vmap(play)(after.adversaries))
-    points = jax.vmap(env.uncertainty.draw)(jax.random.split(jax.random.key(9), 6))
-    drawn = np.asarray(jax.vmap(play)(Cases(points, jnp.arange(6))))
-    assert np.mean(worst) > np.mean(drawn)
-    np.testing.assert_array_equal(np.argsort(-worst), np.arange(6))
+    return after.adversaries, np.asarray(jax.vmap(play)(after.adversaries))
+
+
+def test_adversaries_climb_from_where_they_start_and_come_nearest_first():
+    _, started = adversaries_after(1)  # one step looks at the start alone
+    _, climbed = adversaries_after(4)
+    assert np.mean(climbed) > 1.001 * np.mean(started)
+    np.testing.assert_array_equal(np.argsort(-climbed), np.arange(6))
+
+
+def test_noise_of_adversaries_is_searched_within_its_bound():
+    half = dataclasses.replace(AGAINST, adversary_noise=0.5)
+    within, _ = adversaries_after(4, half)
+    assert within.noise is not None
+    assert np.abs(within.noise).max() == 0.5
+    without, _ = adversaries_after(4, dataclasses.replace(AGAINST, adversary_noise=0.0))
+    assert without.noise is not None
+    np.testing.assert_array_equal(without.noise, 0.0)
+
+
+def test_without_their_time_adversaries_stay_where_they_began():
+    env = uncertain_env()
+    now = Optimisation.start(Network(weights_of(env), env.layout), AGAINST, env)
     same, _ = update(env, AGAINST, now, KEYS)
     assert same.adversaries is not None
     np.testing.assert_array_equal(same.adversaries.point, 0.0)
@@ -382,7 +402,7 @@ def test_adversaries_come_nearer_than_plants_drawn_at_random_and_are_kept():
 def test_the_penalty_of_adversaries_lowers_the_nearness_in_the_declared_uncertainty():
     env = uncertain_env()
     heavy = dataclasses.replace(AGAINST, penalty_weight=1e6, adversary_margin=0.05)
-    now = Optimisation.start(Network(weights_of(env), env.layout), heavy, env.uncertainty)
+    now = Optimisation.start(Network(weights_of(env), env.layout), heavy, env)
     box = env.uncertainty
     assert box is not None
     cases = Cases(jnp.ones((1, len(box.names))), jnp.zeros(1, int))
@@ -424,7 +444,7 @@ def test_adversaries_that_diverge_leave_the_weights_finite_and_moving():
     fast = Uncertainty.of(env.plant, 0.3, {"J_p": (1e-7, 0.03)})
     env = dataclasses.replace(env, uncertainty=fast)
     many = dataclasses.replace(AGAINST, num_adversaries=24)
-    now = Optimisation.start(Network(weights_of(env), env.layout), many, fast)
+    now = Optimisation.start(Network(weights_of(env), env.layout), many, env)
     after, _ = eqx.filter_jit(update)(env, many, now, KEYS, True)
     moved = [
         float(jnp.abs(a - b).max())

@@ -26,14 +26,13 @@ from jaxtyping import Array, Float, Key, PRNGKeyArray, PyTree
 from ..environment import Env, EnvState
 from ..environment.falsification import Cases, Effort, OnPlant, climbed, nearness, search
 from ..excitation import PolicyExcitation
-from ..plant.uncertainty import Uncertainty
 from ..policy import Layout, Weights, act
 from ..safety import watched_levels
 from .checkpoint import Checkpoint, OnBoundary, Trained
 from .settings import GradientSettings
 from .validation import VALIDATION_SEED, look, validation_keys
 
-_LOOK = dataclasses.replace(Effort.of(1500), searched_noises=0)
+_LOOK = dataclasses.replace(Effort.of(1500), searched_noises=8)
 """Of the search in a validation."""
 
 
@@ -121,15 +120,14 @@ class Optimisation(eqx.Module):
     adversaries: Cases | None = None
 
     @classmethod
-    def start(
-        cls, player: PyTree, settings: GradientSettings, box: Uncertainty | None = None
-    ) -> Optimisation:
+    def start(cls, player: PyTree, settings: GradientSettings, env: Env) -> Optimisation:
         """Before the first update."""
         adam = _optimiser(settings).init(eqx.filter(player, eqx.is_array))
         weight, count = jnp.asarray(settings.penalty_weight, float), settings.num_adversaries
-        if box is None:
+        if (box := env.uncertainty) is None:
             return cls(player, adam, weight)
-        middle = Cases(jnp.zeros((count, len(box.names))), jnp.zeros(count, int))
+        noise = jnp.zeros((count, env.layout.num_steps + 1, len(env.plant.definition.outputs)))
+        middle = Cases(jnp.zeros((count, len(box.names))), jnp.zeros(count, int), noise)
         return cls(player, adam, weight, middle)
 
 
@@ -187,16 +185,21 @@ def _adversaries(
     is_kept, is_corner = jnp.arange(count) < count // 2, jnp.arange(count) % 2 == 0
     points = jax.vmap(play.uncertainty.draw)(jax.random.split(key, count))
     points = jnp.where(is_corner[:, None], jnp.sign(points), points)
-    seeds = jax.random.randint(key, (count,), 0, 2**31 - 1)
-    starts = Cases(
-        jnp.where(is_kept[:, None], last.point, points), jnp.where(is_kept, last.seed, seeds)
-    )
-    climb = partial(climbed, play, num_steps=settings.adversary_steps, decay=0.7)
+    seeds, bound = jax.random.randint(key, (count,), 0, 2**31 - 1), settings.adversary_noise
+    fresh = Cases(points, seeds)
+    fresh = Cases(points, seeds, jnp.clip(jax.vmap(play.noise)(fresh), -bound, bound))
+    starts = jax.tree.map(lambda old, new: jnp.where(_by_case(is_kept, new), old, new), last, fresh)
+    climb = partial(climbed, play, num_steps=settings.adversary_steps, bound=bound, decay=0.7)
     worst, sizes, _ = jax.vmap(climb)(starts)
     # The gradient of a simulation that diverged is not finite: the worst other takes its place.
     order = jnp.argsort(-jnp.where(jnp.isfinite(sizes), sizes, -jnp.inf))
     order = jnp.where(jnp.isfinite(sizes[order]), order, order[0])
     return jax.lax.stop_gradient(jax.tree.map(lambda leaf: leaf[order], worst))
+
+
+def _by_case(is_case: Array, values: Array) -> Array:
+    """The condition, with as many axes as the values have."""
+    return is_case.reshape(-1, *(1 for _ in values.shape[1:]))
 
 
 def _excess(
@@ -324,7 +327,7 @@ def started(
 
     def start(key: PRNGKeyArray) -> Optimisation:
         network = Network(_first_weights(env, settings, key), env.layout)
-        return Optimisation.start(network, settings, env.uncertainty)
+        return Optimisation.start(network, settings, env)
 
     def keys(i: int) -> Key[Array, "seed plant"]:
         own = jax.vmap(jax.random.fold_in, (0, None))(pairs[:, 1], i)

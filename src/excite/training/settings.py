@@ -68,6 +68,7 @@ class GradientSettings(_Checked):
             comes near to a level, in the penalty alone; none without a declared uncertainty.
         adversary_steps: of the ascent that finds each of them.
         adversary_margin: as `margin`, for them.
+        adversary_noise: within which their noise is searched too, in standard deviations.
         adversaries_from: fraction of the updates after which they join.
         allowed_nearness: largest output over its critical level that a search of a validation
             may find in the declared uncertainty.
@@ -90,6 +91,7 @@ class GradientSettings(_Checked):
     num_adversaries: Count = 48
     adversary_steps: Count = 3
     adversary_margin: Fraction = 0.93
+    adversary_noise: NotNegative = 3.0
     adversaries_from: Fraction = 0.4
     allowed_nearness: Fraction = 0.975
 
@@ -99,8 +101,8 @@ class GradientSettings(_Checked):
 
 
 AGAINST_UNCERTAINTY = (
-    "num_adversaries", "adversary_steps", "adversary_margin", "adversaries_from",
-    "allowed_nearness",
+    "num_adversaries", "adversary_steps", "adversary_margin", "adversary_noise",
+    "adversaries_from", "allowed_nearness",
 )  # fmt: skip
 """Hyper-parameters that matter only where an uncertainty is declared."""
 

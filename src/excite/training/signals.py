@@ -159,7 +159,7 @@ def _search(
     report: Progress,
 ) -> Float[Array, "search time input"]:
     """Actions at the end of all searches, side by side."""
-    now = eqx.filter_vmap(lambda p: Optimisation.start(p, settings, env.uncertainty))(player)
+    now = eqx.filter_vmap(lambda p: Optimisation.start(p, settings, env))(player)
     for i in range(settings.num_updates):
         is_adversarial = settings.has_adversaries(i) and env.uncertainty is not None
         now, _ = update_all(env, settings, now, keys(i), is_adversarial)
