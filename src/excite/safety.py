@@ -104,6 +104,7 @@ class Trip(enum.IntEnum):
     INPUT_NOT_FINITE = 6
     DEADLINES = 7
     DURATION = 8
+    UNEXPLAINED = 9
 
     @property
     def sentence(self) -> str:
@@ -121,6 +122,7 @@ _TRIPS = {
     Trip.INPUT_NOT_FINITE: "the excitation asked for an input that is not a finite number",
     Trip.DEADLINES: "deadlines were missed",
     Trip.DURATION: "the rig's clock is too fast or too slow",
+    Trip.UNEXPLAINED: "no plant of the declared uncertainty explains the measurements",
 }
 
 

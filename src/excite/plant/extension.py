@@ -155,11 +155,11 @@ class Extended(AbstractPlant):
     def delay(self, params: Params) -> Float[Array, " input"] | None:
         """Of the plain plant, and the added ones."""
         delay = self._plain().delay(self._own(params))
-        for e in self.extensions:
-            if e.kind == "delay":
-                delay = jnp.zeros(len(self.definition.inputs)) if delay is None else delay
-                delay = delay.at[e.index].add(getattr(params, e.name))
-        return delay
+        added = {e.index: getattr(params, e.name) for e in self.extensions if e.kind == "delay"}
+        if not added:
+            return delay
+        own = jnp.zeros(len(self.definition.inputs)) if delay is None else delay
+        return jnp.stack([own[i] + added.get(i, 0.0) for i in range(len(own))])
 
     def _plain(self) -> AbstractPlant:
         return self.plain(**self.constants._asdict())

@@ -117,6 +117,11 @@ class SafetyFilter(eqx.Module):
         is_finite = jnp.all(jnp.isfinite(proposed))
         return memory, jnp.where(is_finite, input, proposed), is_finite & (best > 0)
 
+    def is_over(self, memory: Memory) -> Bool[Array, ""]:
+        """Never: a filter does not end an experiment."""
+        del memory
+        return jnp.asarray(False)
+
     def _within(self, input: Array, before: Array) -> Array:
         """The nearest input within limits and slew."""
         return jnp.clip(
@@ -162,8 +167,8 @@ def _corners(plant: AbstractPlant, spread: float) -> Params:
     return plant.Params(*(jnp.asarray(column) for column in every.T))
 
 
-def _linear_quadratic(plant: AbstractPlant) -> tuple[Array, Array]:
-    """Gains of the backup law and of the observers, for the nominal plant."""
+def linear_model(plant: AbstractPlant) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Matrices A, B, C of one sample of the nominal plant, by secants over usual sizes."""
     d, rest, params = plant.definition, plant.initial_state, plant.nominal
     zero = jnp.asarray(safe_input(d))
     states, inputs = (
@@ -181,6 +186,17 @@ def _linear_quadratic(plant: AbstractPlant) -> tuple[Array, Array]:
     A = secant(lambda move: step(plant, rest + move, zero, params), states)
     B = secant(lambda move: step(plant, rest, zero + move, params), inputs)
     C = secant(lambda move: plant.output(rest + move, params), states)
+    return A, B, C
+
+
+def _linear_quadratic(plant: AbstractPlant) -> tuple[Array, Array]:
+    """Gains of the backup law and of the observers, for the nominal plant."""
+    d = plant.definition
+    A, B, C = linear_model(plant)
+    states, inputs = (
+        np.array([s.scale for s in d.states]),
+        np.array([i.amplitude for i in d.inputs]),
+    )
     try:
         P = scipy.linalg.solve_discrete_are(A, B, np.diag(states**-2.0), np.diag(inputs**-2.0))
         # Process noise per sample: half a usual input, through the input matrix, and a

@@ -15,7 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
 
 from ..description import names_of
 from ..environment import Episodes, scored
@@ -30,6 +30,7 @@ from ..safety import (
     check_sample,
     is_violation,
     safe_input,
+    tripped,
 )
 from ..simulation import Trajectory, measure, step
 from .contract import AbstractRig, Pacer, Reading
@@ -231,6 +232,7 @@ class Runs(eqx.Module):
         num_interventions: samples at which a filter changed the input.
         inputs: of each sampling time.
         measured: when the inputs begin to act, and at the end; as a record has them.
+        memory: of the filter or guard at the end.
     """
 
     max_abs_output: Float[Array, "*run output"]
@@ -239,6 +241,7 @@ class Runs(eqx.Module):
     num_interventions: Int[Array, "*run"]
     inputs: Float[Array, "*run time input"]
     measured: Float[Array, "*run sample output"]
+    memory: PyTree = None
 
 
 class NoFilter(eqx.Module):
@@ -253,6 +256,11 @@ class NoFilter(eqx.Module):
         """The unchanged input."""
         del measured
         return memory, proposed, jnp.asarray(False)
+
+    def is_over(self, memory: None) -> Bool[Array, ""]:
+        """Never."""
+        del memory
+        return jnp.asarray(False)
 
 
 NO_FILTER = NoFilter()
@@ -318,6 +326,7 @@ def _one_run(
         watch = check_sample(jnp, rules, watch)
         player, proposed = excitation(player, measured)
         memory, proposed, is_changed = safety_filter(memory, measured, proposed)
+        watch = tripped(jnp, watch, safety_filter.is_over(memory), Trip.UNEXPLAINED)
         watch, input = allowed(jnp, rules, watch, proposed)
         player = excitation.applied(player, input)
         (state, watch), acted_on = hold(state, watch, input)
@@ -329,14 +338,14 @@ def _one_run(
     player = excitation.init(plant, num_steps, hardware.key)
     watch = Watch.start(jnp, rules, state.shown)
     carry = state, watch, player, safety_filter.start(), jnp.asarray(0)
-    (state, watch, *_, count), (inputs, measured) = jax.lax.scan(
+    (state, watch, _, memory, count), (inputs, measured) = jax.lax.scan(
         sample, carry, None, length=num_steps
     )
     trip, safe = watch.trip, jnp.asarray(rules.safe_input, float)
     (state, _), last = hold(state, watch, safe)
     measured = jnp.concatenate([measured, last[None]])
     is_over = is_violation(state.largest[None], jnp.asarray(rules.critical))
-    return Runs(state.largest, is_over, trip, count, inputs, measured)
+    return Runs(state.largest, is_over, trip, count, inputs, measured, memory)
 
 
 def drawn_hardware(

@@ -1,0 +1,307 @@
+"""A guard for experiments on a rig: it notices a plant that is not a declared one, and brakes.
+
+A filter follows the experiment. It estimates the plant's state and where in the declared
+uncertainty the plant lies (the divided-difference filter of second order: M. Nørgaard,
+N. Poulsen, O. Ravn, New developments in state estimation for nonlinear systems, Automatica
+2000, in its square-root form). The guard trips where no declared plant explains the
+measurements: an innovation is too large, the last ten are on average, or the estimate leaves
+the declared box. Its thresholds are those that declared plants do not reach (`calibrated`).
+
+Zero is no safe input in mid-swing. After a trip the guard brakes with linear feedback of the
+estimated state, then the experiment ends. What was wrong is inferred from the last samples:
+where the actuator acted with the other sign, or not at all, it brakes with that in mind, and
+where a sensor stands still it does not believe it.
+
+As for a supervisor (`excite.safety`), the functions are pure, over arrays of NumPy or JAX
+(`xp`). On a rig they need NumPy alone; the plant's equations come as a `Program`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import ModuleType
+from typing import NamedTuple
+
+import numpy as np
+
+from ..policy import AnyArray
+
+NUM_RECENT = 10
+"""Innovations of which the mean is watched."""
+
+NUM_REPLAYED = 5
+"""Samples from which the guard infers what was wrong."""
+
+_SQUARE = 3.0  # of the distance of the filter's points, in standard deviations: that of a normal
+_WIDE = 0.05  # after a trip, how far a state may move in one sample unexplained, in its scales
+_QUIET = 0.25  # fraction of the critical levels below which the plant counts as at rest
+_NUM_QUIET, _LONGEST = 5, 60  # samples of rest that end the brake; samples after which it ends
+_CLEARLY = 0.1  # a fault of the actuator must explain the last samples this much better
+
+
+@dataclass(frozen=True, eq=False)  # hashable: a static argument of compiled functions
+class GuardRules:
+    """What a guard knows of the declared plants; arrays are in the plant's units.
+
+    A quantity of the declared uncertainty is a coordinate in [-1, 1].
+
+    Attributes:
+        mean: states, then quantities, before the first sample.
+        root: of their covariance, its lower triangular root.
+        walk: standard deviation of their unexplained change in one sample.
+        noise: standard deviation of a measurement.
+        feedback: of the brake, input = rest - feedback (state - start).
+        rest: input at rest.
+        lower, upper: input limits.
+        watched: indices of the outputs with a critical level.
+        critical: their levels.
+        state_scale: usual size of each state.
+        visible: size of an output's change that is taken for one of the actuator.
+        depth: samples for which an input can act.
+        thresholds: of the largest squared innovation in standard deviations, of the mean of the
+            last ten, and of the distance of an estimate from the declared box.
+    """
+
+    mean: np.ndarray
+    root: np.ndarray
+    walk: np.ndarray
+    noise: np.ndarray
+    feedback: np.ndarray
+    rest: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    watched: np.ndarray
+    critical: np.ndarray
+    state_scale: np.ndarray
+    visible: np.ndarray
+    depth: int
+    thresholds: np.ndarray
+
+    @property
+    def num_states(self) -> int:
+        """Of the plant; the quantities follow."""
+        return len(self.state_scale)
+
+
+class Model(NamedTuple):
+    """The declared plants, over points: states, then quantities.
+
+    Attributes:
+        advance: states one sample later, of points [point, quantity] with their last inputs
+            [point, depth, input], oldest first.
+        output: of points.
+    """
+
+    advance: Callable[[AnyArray, AnyArray], AnyArray]
+    output: Callable[[AnyArray], AnyArray]
+
+
+class Belief(NamedTuple):
+    """State of a guard; the buffers of the last samples have the oldest first.
+
+    Attributes:
+        mean, root: of states and quantities.
+        inputs: applied.
+        means: estimates.
+        measured: outputs.
+        recent: squared innovations.
+        score: the three numbers that are compared with the thresholds, now.
+        largest: their largest values so far.
+        sign: factor of the actuator in the brake: 1, -1 or 0.
+        is_blind: whether the brake does not believe the sensor.
+        k: samples so far.
+        num_braked: samples since the trip; 0 before it.
+        num_quiet: samples of rest since.
+    """
+
+    mean: AnyArray
+    root: AnyArray
+    inputs: AnyArray
+    means: AnyArray
+    measured: AnyArray
+    recent: AnyArray
+    score: AnyArray
+    largest: AnyArray
+    sign: AnyArray
+    is_blind: AnyArray
+    k: AnyArray
+    num_braked: AnyArray
+    num_quiet: AnyArray
+
+    @property
+    def tripped_at(self) -> AnyArray:
+        """Sample of the trip; that after the last one before it."""
+        return self.k - self.num_braked
+
+    @property
+    def is_over(self) -> AnyArray:
+        """Whether the brake has done its work."""
+        return (self.num_quiet >= _NUM_QUIET) | (self.num_braked > _LONGEST)
+
+
+def start(xp: ModuleType, rules: GuardRules) -> Belief:
+    """Before the first measurement."""
+    mean, count = xp.asarray(rules.mean, float), NUM_REPLAYED + rules.depth
+    return Belief(
+        mean=mean,
+        root=xp.asarray(rules.root, float),
+        inputs=xp.tile(xp.asarray(rules.rest, float), (count, 1)),
+        means=xp.tile(mean, (NUM_REPLAYED, 1)),
+        measured=xp.full((NUM_REPLAYED, len(rules.noise)), np.nan),
+        recent=xp.ones(NUM_RECENT) * len(rules.noise),
+        score=xp.zeros(3),
+        largest=xp.zeros(3),
+        sign=xp.asarray(1.0),
+        is_blind=xp.asarray(False),
+        k=xp.asarray(0),
+        num_braked=xp.asarray(0),
+        num_quiet=xp.asarray(0),
+    )
+
+
+def observed(
+    xp: ModuleType, rules: GuardRules, model: Model, belief: Belief, measured: AnyArray
+) -> Belief:
+    """The belief after a measurement; it says whether the guard trips."""
+    is_braking = belief.num_braked > 0
+    mean, root, innovation = _corrected(xp, rules, model, belief, measured)
+    square = xp.sum(innovation**2)
+    recent = xp.concatenate([belief.recent[1:], square[None]])
+    sd = xp.sqrt(xp.sum(root**2, axis=1))[rules.num_states :]
+    outside = xp.max(abs(mean[rules.num_states :]) - 1 - 3 * sd, initial=-1.0)
+    score = xp.stack([square, xp.mean(recent), outside])
+    trips = ~is_braking & ~(score < xp.asarray(rules.thresholds)).all()
+    was_frozen = (measured == belief.measured[-1]).any()
+    is_blind = xp.where(trips, was_frozen, belief.is_blind)
+    keeps = is_blind & (is_braking | trips)
+    if xp is np and not (trips or is_braking):  # on a rig, what is not needed takes time
+        state, sign = mean[: rules.num_states], belief.sign
+    else:
+        state, sign = _replayed(xp, rules, model, belief, measured)
+    sign = xp.where((is_braking | trips) & ~keeps, sign, belief.sign)
+    quantities = xp.clip(belief.mean[rules.num_states :], -1.0, 1.0)
+    braking_mean = xp.concatenate([state, quantities])
+    braking_root = xp.diag(
+        xp.concatenate([_WIDE * xp.asarray(rules.state_scale), xp.zeros(len(quantities))])
+    )
+    mean = xp.where(trips, braking_mean, xp.where(keeps, belief.mean, mean))
+    root = xp.where(trips, braking_root, xp.where(keeps, belief.root, root))
+    size = abs(measured[rules.watched]) / xp.asarray(rules.critical)
+    num_quiet = xp.where((size < _QUIET).all(), belief.num_quiet + 1, 0)
+    return belief._replace(
+        mean=mean,
+        root=root,
+        means=xp.concatenate([belief.means[1:], mean[None]]),
+        measured=xp.concatenate([belief.measured[1:], measured[None]]),
+        recent=recent,
+        score=score,
+        largest=xp.where(is_braking, belief.largest, xp.fmax(belief.largest, score)),
+        sign=sign,
+        is_blind=is_blind,
+        k=belief.k + 1,
+        num_braked=belief.num_braked + (is_braking | trips),
+        num_quiet=xp.where(is_braking, num_quiet, 0),
+    )
+
+
+def decided(xp: ModuleType, rules: GuardRules, belief: Belief, proposed: AnyArray) -> AnyArray:
+    """The input to apply: the proposed one, or that of the brake."""
+    away = (belief.mean - xp.asarray(rules.mean))[: rules.feedback.shape[1]]
+    brake = belief.sign * (xp.asarray(rules.rest) - xp.asarray(rules.feedback) @ away)
+    brake = xp.clip(xp.where(xp.isfinite(brake), brake, rules.rest), rules.lower, rules.upper)
+    return xp.where(belief.num_braked > 0, brake, proposed)
+
+
+def moved(
+    xp: ModuleType, rules: GuardRules, model: Model, belief: Belief, input: AnyArray
+) -> Belief:
+    """The belief at the next sample, before its measurement."""
+    inputs = xp.concatenate([belief.inputs[1:], input[None]])
+    is_braking, n = belief.num_braked > 0, rules.num_states
+    points = _points(xp, belief.mean, belief.root)
+    acting = xp.where(is_braking, belief.sign, 1.0) * inputs[-rules.depth :]
+    past = xp.broadcast_to(acting, (len(points), *acting.shape))
+    state, first, second = _moments(xp, model.advance(points, past), len(belief.mean))
+    walk = xp.where(is_braking, _walk_of_brake(xp, rules), xp.asarray(rules.walk))
+    count = len(belief.mean) - n
+    below = xp.concatenate([belief.root[n:], xp.zeros((count, len(belief.mean)))], axis=1)
+    above = xp.concatenate([first, second], axis=1)
+    whole = xp.concatenate([xp.concatenate([above, below]), xp.diag(walk)], axis=1)
+    mean = xp.concatenate([state, belief.mean[n:]])
+    return belief._replace(mean=mean, root=_triangular(xp, whole), inputs=inputs)
+
+
+def _walk_of_brake(xp: ModuleType, rules: GuardRules) -> AnyArray:
+    """After a trip the state may do what the model does not explain; quantities stay."""
+    still = xp.zeros(len(rules.mean) - rules.num_states)
+    return xp.concatenate([_WIDE * xp.asarray(rules.state_scale), still])
+
+
+def _points(xp: ModuleType, mean: AnyArray, root: AnyArray) -> AnyArray:
+    """The mean, and points on both sides of it along every column of the root."""
+    reach = _SQUARE**0.5 * root.T
+    return xp.concatenate([mean[None], mean + reach, mean - reach])
+
+
+def _moments(xp: ModuleType, values: AnyArray, n: int) -> tuple[AnyArray, AnyArray, AnyArray]:
+    """Mean of a function of the points, and the roots of its covariance of first and second order.
+
+    The differences of Nørgaard et al., Eqs. 27 to 31.
+    """
+    middle, after, before = values[0], values[1 : n + 1], values[n + 1 :]
+    mean = (_SQUARE - n) / _SQUARE * middle + xp.sum(after + before, axis=0) / (2 * _SQUARE)
+    first = (after - before).T / (2 * _SQUARE**0.5)
+    second = (_SQUARE - 1) ** 0.5 / (2 * _SQUARE) * (after + before - 2 * middle).T
+    return mean, first, second
+
+
+def _triangular(xp: ModuleType, root: AnyArray) -> AnyArray:
+    """The lower triangular root of the same covariance."""
+    return xp.linalg.qr(root.T, mode="r").T
+
+
+def _corrected(
+    xp: ModuleType, rules: GuardRules, model: Model, belief: Belief, measured: AnyArray
+) -> tuple[AnyArray, AnyArray, AnyArray]:
+    """Mean and root after a measurement, and the innovation in standard deviations."""
+    n, count = len(belief.mean), len(rules.noise)
+    outputs = model.output(_points(xp, belief.mean, belief.root))
+    expected, first, second = _moments(xp, outputs, n)
+    above = xp.concatenate([xp.diag(xp.asarray(rules.noise)), second, first], axis=1)
+    below = xp.concatenate([xp.zeros((n, count + n)), belief.root], axis=1)
+    joint = _triangular(xp, xp.concatenate([above, below]))
+    innovation = xp.linalg.solve(joint[:count, :count], measured - expected)
+    mean = belief.mean + joint[count:, :count] @ innovation
+    return mean, joint[count:, count:], innovation
+
+
+def _replayed(
+    xp: ModuleType, rules: GuardRules, model: Model, belief: Belief, measured: AnyArray
+) -> tuple[AnyArray, AnyArray]:
+    """State now, and the actuator's sign, that explain the last samples best.
+
+    The last samples are played again from the estimate before them: as declared, and with an
+    actuator that turned its sign or died at any of these samples.
+    """
+    n, depth = rules.num_states, rules.depth
+    signs = np.array([1.0] + [-1.0] * NUM_REPLAYED + [0.0] * NUM_REPLAYED)
+    onsets = np.array([NUM_REPLAYED, *range(NUM_REPLAYED), *range(NUM_REPLAYED)])
+    # A fault since the first of these samples was there before, so that older inputs had it too.
+    since = np.where(onsets == 0, -depth, onsets)
+    factor = np.where(np.arange(-depth, NUM_REPLAYED) >= since[:, None], signs[:, None], 1.0)
+    inputs = xp.asarray(factor)[:, :, None] * belief.inputs[None]
+    quantities = xp.clip(belief.means[0, n:], -1.0, 1.0)
+    points = xp.tile(xp.concatenate([belief.means[0, :n], quantities]), (len(signs), 1))
+    seen = xp.concatenate([belief.measured[1:], measured[None]])
+    error = xp.zeros(len(signs))
+    for i in range(NUM_REPLAYED):
+        states = model.advance(points, inputs[:, i + 1 : i + 1 + depth])
+        points = xp.concatenate([states, points[:, n:]], axis=1)
+        off = (model.output(points) - seen[i]) / xp.asarray(rules.visible)
+        error = error + xp.sum(xp.where(xp.isfinite(seen[i]), off, 0.0) ** 2, axis=1)
+    error = xp.where(xp.isfinite(error), error, xp.inf)
+    best, as_now = xp.argmin(error), xp.argmin(xp.where(signs == belief.sign, error, xp.inf))
+    is_clear = (error[best] < _CLEARLY * error[as_now]) & (error[as_now] > NUM_REPLAYED)
+    best = xp.where(is_clear, best, as_now)
+    return points[best, :n], xp.asarray(signs)[best]

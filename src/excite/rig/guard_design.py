@@ -1,0 +1,189 @@
+"""Guards made for a plant, its declared uncertainty and what is played: model, brake, thresholds.
+
+A guard is made once, where JAX is installed; see `rig.guard`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.linalg
+from jaxtyping import Array, Bool, Float
+
+from ..plant import AbstractPlant
+from ..plant.uncertainty import Uncertainty
+from ..safety import safe_input, watched_levels
+from ..simulation import step
+from . import guard
+from .filter import linear_model
+from .guard import Belief, GuardRules, Model
+
+_WATCHED, _INPUT = 30.0, 0.1  # weights of the brake: outputs with a level, inputs
+_VISIBLE = 0.01  # of an output's scale
+_WALK = 1e-3  # unexplained change in one sample, of a state in its scales and of a quantity
+
+
+class GuardModel(eqx.Module):
+    """The declared plants, as the guard's filter needs them.
+
+    Attributes:
+        uncertainty: the box.
+        depth: samples for which an input can act.
+    """
+
+    uncertainty: Uncertainty
+    depth: int = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, uncertainty: Uncertainty) -> GuardModel:
+        """The model for a box."""
+        delays = [
+            high
+            for name, high in zip(uncertainty.names, uncertainty.upper.tolist(), strict=True)
+            if name.startswith("delay_")
+        ]
+        longest = max(delays, default=0.0) / float(uncertainty.plant.dt)
+        return cls(uncertainty, 2 + math.ceil(longest))
+
+    @property
+    def estimated(self) -> tuple[int, ...]:
+        """Indices of the quantities that act throughout an experiment."""
+        names = self.uncertainty.names
+        return tuple(
+            i for i, n in enumerate(names) if not n.startswith("initial_") and n != "noise"
+        )
+
+    def functions(self) -> Model:
+        """Over points."""
+        return Model(jax.vmap(self._advance), jax.vmap(self._output))
+
+    def _split(self, point: Array) -> tuple[Array, AbstractPlant, NamedTuple]:
+        """State, plant and parameters at a point."""
+        count = len(self.uncertainty.plant.definition.states)
+        place = {index: count + i for i, index in enumerate(self.estimated)}
+        zero = jnp.asarray(0.0)
+        size = len(self.uncertainty.names)
+        quantities = jnp.stack([point[place[i]] if i in place else zero for i in range(size)])
+        return point[:count], *self.uncertainty.at(quantities)
+
+    def _output(self, point: Float[Array, " quantity"]) -> Float[Array, " output"]:
+        state, plant, params = self._split(point)
+        return plant.output(state, params)
+
+    def _advance(
+        self, point: Float[Array, " quantity"], past: Float[Array, "depth input"]
+    ) -> Float[Array, " state"]:
+        state, plant, params = self._split(point)
+        delay = plant.delay(params)
+        if delay is None:
+            return step(plant, state, past[-1], params)
+        delay = jnp.clip(delay / plant.dt, 0.0, self.depth - 1.001)
+        # As `simulation.run_episode` has it: mean and first moment of the delayed input.
+        whole = jnp.floor(delay)
+        part, age = delay - whole, (self.depth - 1 - jnp.arange(self.depth))[:, None]
+        new, old = (jnp.sum(jnp.where(age == whole + i, past, 0.0), axis=0) for i in (0, 1))
+        mean, half = new + part * (old - new), 3 * part * (1 - part) * (new - old)
+        return step(plant, state, mean - half, params, next_input=mean + half)
+
+
+def rules_of(known: AbstractPlant, model: GuardModel) -> GuardRules:
+    """The rules for a model, with thresholds that nothing exceeds.
+
+    Args:
+        known: plant without what its equations leave out; the brake is made for it.
+
+    Raises:
+        ValueError: for a plant that linear feedback cannot bring to rest.
+    """
+    box, plant = model.uncertainty, model.uncertainty.plant
+    d, names = plant.definition, list(box.names)
+    num_states, count = len(d.states), len(model.estimated)
+    scale = np.array([s.scale for s in d.states])
+    start = np.zeros(num_states)
+    for i, state in enumerate(d.states):
+        if (name := f"initial_{state.name}") in names:
+            at = names.index(name)
+            start[i] = float(box.upper[at] - box.lower[at]) / 2
+    spread = np.concatenate([np.maximum(start, 1e-9 * scale), np.ones(count)])
+    walk = np.concatenate([_WALK * scale, np.full(count, _WALK)])
+    watched, _, critical = watched_levels(d)
+    feedback, rest = _brake(known), np.asarray(safe_input(d), float)
+    limits = plant.input_limits
+    return GuardRules(
+        mean=np.concatenate([np.asarray(plant.initial_state), np.zeros(count)]),
+        root=np.diag(spread / math.sqrt(3)),  # as a uniform distribution has it
+        walk=walk,
+        noise=_noise(plant),
+        feedback=feedback,
+        rest=rest,
+        lower=np.asarray(limits[0]),
+        upper=np.asarray(limits[1]),
+        watched=np.array(watched, int),
+        critical=np.asarray(critical, float),
+        state_scale=scale,
+        visible=np.maximum(_noise(plant), _VISIBLE * np.array([o.scale for o in d.outputs])),
+        depth=model.depth,
+        thresholds=np.full(3, np.inf),
+    )
+
+
+def _noise(plant: AbstractPlant) -> np.ndarray:
+    """Standard deviation of a measurement: noise, rounding, and a trifle where there is neither."""
+    sensor, scale = plant.sensor, np.array([o.scale for o in plant.definition.outputs])
+    rounding = np.asarray(sensor.resolution) / math.sqrt(12)
+    return np.maximum(np.hypot(np.asarray(sensor.noise_sd), rounding), 1e-5 * scale)
+
+
+def _brake(plant: AbstractPlant) -> np.ndarray:
+    """Linear-quadratic feedback that keeps the outputs with a critical level small."""
+    A, B, C = linear_model(plant)
+    d = plant.definition
+    watched, _, critical = watched_levels(d)
+    states, inputs = (
+        np.array([s.scale for s in d.states]),
+        np.array([i.amplitude for i in d.inputs]),
+    )
+    levels = C[np.array(watched, int)] / critical[:, None]
+    Q = np.diag(states**-2.0) + _WATCHED * levels.T @ levels
+    R = _INPUT * np.diag(inputs**-2.0)
+    try:
+        P = scipy.linalg.solve_discrete_are(A, B, Q, R)
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise ValueError(f"no linear feedback brings plant {d.name!r} to rest ({error})") from None
+    return np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+
+
+class GuardFilter(eqx.Module):
+    """A guard between excitation and supervisor, for batches of simulated experiments.
+
+    Attributes:
+        model: the declared plants.
+        rules: of the guard.
+    """
+
+    model: GuardModel
+    rules: GuardRules = eqx.field(static=True)
+
+    def start(self) -> Belief:
+        """Before the first measurement."""
+        return guard.start(jnp, self.rules)
+
+    def __call__(
+        self, belief: Belief, measured: Float[Array, " output"], proposed: Float[Array, " input"]
+    ) -> tuple[Belief, Float[Array, " input"], Bool[Array, ""]]:
+        """The belief at the next sample, the input to apply, and whether it is the brake's."""
+        model = self.model.functions()
+        belief = guard.observed(jnp, self.rules, model, belief, measured)
+        input = guard.decided(jnp, self.rules, belief, proposed)
+        input = jnp.clip(input, self.rules.lower, self.rules.upper)
+        after = guard.moved(jnp, self.rules, model, belief, input)
+        return after, input, belief.num_braked > 0
+
+    def is_over(self, belief: Belief) -> Bool[Array, ""]:
+        """Whether the experiment ends."""
+        return belief.is_over

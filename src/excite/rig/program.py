@@ -1,0 +1,162 @@
+"""A function of arrays as a list of NumPy operations, so that it runs without JAX.
+
+A plant is written for JAX. What a guard needs of it, one sample ahead and the outputs, is
+written down once as a `Program`, kept in a policy's file, and run by NumPy on a laboratory
+computer. A program from a file can only do arithmetic on arrays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+
+Numpy = Callable[..., Any]
+
+_BY_ELEMENT: Mapping[str, Numpy] = {
+    "add": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.divide, "neg": np.negative,
+    "max": np.maximum, "min": np.minimum, "pow": np.power, "rem": np.fmod, "abs": np.abs,
+    "sign": np.sign, "floor": np.floor, "ceil": np.ceil, "sqrt": np.sqrt, "square": np.square,
+    "exp": np.exp, "exp2": np.exp2, "expm1": np.expm1, "log": np.log, "log1p": np.log1p,
+    "sin": np.sin, "cos": np.cos, "tan": np.tan, "asin": np.arcsin, "acos": np.arccos,
+    "atan": np.arctan, "atan2": np.arctan2, "sinh": np.sinh, "cosh": np.cosh, "tanh": np.tanh,
+    "asinh": np.arcsinh, "acosh": np.arccosh, "atanh": np.arctanh, "lt": np.less,
+    "le": np.less_equal, "gt": np.greater, "ge": np.greater_equal, "eq": np.equal,
+    "ne": np.not_equal, "and": np.logical_and, "or": np.logical_or, "not": np.logical_not,
+    "is_finite": np.isfinite, "copy": np.asarray, "stop_gradient": np.asarray,
+}  # fmt: skip
+
+
+def _broadcast(x: np.ndarray, shape: list[int], broadcast_dimensions: list[int]) -> np.ndarray:
+    ones = [1] * len(shape)
+    for axis, size in zip(broadcast_dimensions, np.shape(x), strict=True):
+        ones[axis] = size
+    return np.broadcast_to(np.reshape(x, ones), shape)
+
+
+def _dot(a: np.ndarray, b: np.ndarray, dimension_numbers: list[list[list[int]]]) -> np.ndarray:
+    (of_a, of_b), (batch_a, batch_b) = dimension_numbers
+    if batch_a or batch_b:
+        names_a, names_b = list(range(np.ndim(a))), list(range(20, 20 + np.ndim(b)))
+        for i, j in zip([*of_a, *batch_a], [*of_b, *batch_b], strict=True):
+            names_b[j] = names_a[i]
+        batch = [names_a[i] for i in batch_a]
+        used = {*batch, *(names_a[i] for i in of_a)}
+        rest = [n for n in (*names_a, *names_b) if n not in used]
+        return np.einsum(a, names_a, b, names_b, [*batch, *rest])
+    return np.tensordot(a, b, (of_a, of_b))
+
+
+OPERATIONS: Mapping[str, Numpy] = {
+    **_BY_ELEMENT,
+    "integer_pow": lambda x, y: np.power(x, y) if y > 0 else 1.0 / np.power(x, -y),
+    "rsqrt": lambda x: 1.0 / np.sqrt(x),
+    "logistic": lambda x: 1.0 / (1.0 + np.exp(-x)),
+    "clamp": lambda low, x, high: np.clip(x, low, high),
+    "select_n": lambda which, first, second: np.where(which, second, first),
+    "convert_element_type": lambda x, new_dtype: np.asarray(x).astype(new_dtype),
+    "broadcast_in_dim": _broadcast,
+    "reshape": lambda x, new_sizes: np.reshape(x, new_sizes),
+    "squeeze": lambda x, dimensions: np.squeeze(x, tuple(dimensions)),
+    "transpose": lambda x, permutation: np.transpose(x, permutation),
+    "concatenate": lambda *parts, dimension: np.concatenate(parts, dimension),
+    "stack": lambda *parts, axis: np.stack(parts, axis),
+    "slice": lambda x, start_indices, limit_indices, strides: x[
+        tuple(map(slice, start_indices, limit_indices, strides or [1] * len(start_indices)))
+    ],
+    "row": lambda x, i: x[i],
+    "reduce_sum": lambda x, axes: np.sum(x, tuple(axes)),
+    "reduce_max": lambda x, axes: np.max(x, tuple(axes)),
+    "reduce_min": lambda x, axes: np.min(x, tuple(axes)),
+    "dot_general": _dot,
+    "iota": lambda dtype, shape, dimension: np.asarray(np.indices(shape)[dimension], dtype),
+}
+"""By the names of JAX; the settings of each are named as there."""
+
+
+@dataclass(frozen=True)
+class Operation:
+    """One operation on values, which are known by their numbers.
+
+    Attributes:
+        name: of `OPERATIONS`.
+        takes: values.
+        gives: value.
+        settings: by name, JSON-ready.
+    """
+
+    name: str
+    takes: tuple[int, ...]
+    gives: int
+    settings: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Program:
+    """A function of some arrays that gives one array.
+
+    Attributes:
+        num_inputs: arrays it takes; they are values 0, 1, ...
+        constants: by value.
+        operations: in their order.
+        result: value.
+    """
+
+    num_inputs: int
+    constants: Mapping[int, np.ndarray]
+    operations: tuple[Operation, ...]
+    result: int
+
+    def __call__(self, *arrays: np.ndarray) -> np.ndarray:
+        """The function, in double precision."""
+        values: dict[int, Any] = {**dict(enumerate(arrays)), **self.constants}
+        for o in self.operations:
+            values[o.gives] = OPERATIONS[o.name](*(values[i] for i in o.takes), **o.settings)
+        return values[self.result]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The program as JSON-ready data."""
+        constants = {
+            str(i): {"dtype": str(c.dtype), "shape": list(c.shape), "values": c.ravel().tolist()}
+            for i, c in self.constants.items()
+        }
+        return {
+            "num_inputs": self.num_inputs,
+            "constants": constants,
+            "operations": [[o.name, o.takes, o.gives, o.settings] for o in self.operations],
+            "result": self.result,
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Self:
+        """The program that `to_dict` wrote.
+
+        Raises:
+            ValueError: for data of another form.
+        """
+        try:
+            constants = {
+                int(i): np.array(c["values"], _dtype(c["dtype"])).reshape(c["shape"])
+                for i, c in data["constants"].items()
+            }
+            operations = tuple(
+                Operation(_known(name), tuple(takes), gives, dict(settings))
+                for name, takes, gives, settings in data["operations"]
+            )
+            return cls(int(data["num_inputs"]), constants, operations, int(data["result"]))
+        except (KeyError, TypeError, AttributeError) as error:
+            raise ValueError(f"a plant's program is damaged ({error!r})") from None
+
+
+def _known(name: str) -> str:
+    if name not in OPERATIONS:
+        raise ValueError(f"a plant's program has the unknown operation {name!r}")
+    return name
+
+
+def _dtype(name: str) -> str:
+    if name not in ("float64", "float32", "int64", "int32", "bool"):
+        raise ValueError(f"a plant's program has numbers of the unknown type {name!r}")
+    return name
