@@ -12,13 +12,16 @@ from commands import excite
 
 import excite as ex
 from excite.description import Input, Output, Parameter, PlantDescription, State
+from excite.environment import Env
 from excite.environment.falsification import Cases, Effort, OnPlant, search
 from excite.excitation import PositionLoop, Replay, Square
 from excite.plant import AbstractPlant, Aero2
 from excite.plant.catalogue import plant_named
+from excite.plant.contract import with_nominal
 from excite.plant.uncertainty import Uncertainty
+from excite.policy import Layout
 from excite.safety import critical_levels
-from excite.simulation import run_episode
+from excite.simulation import response, run_episode
 
 SMALL = Effort(
     random=64, corners=8, noises=1, starts=16, steps=20, more_noises=4, searched_noises=2
@@ -127,6 +130,25 @@ def test_corners_are_all_corners_or_as_many_as_asked_for():
 def test_a_range_that_is_not_allowed_is_one_sentence(ranges, words):
     with pytest.raises(ValueError, match=words):
         Uncertainty.of(Aero2(), 0.3, ranges)
+
+
+@pytest.mark.parametrize("effect", ["bias_y", "drift_y"])
+def test_levels_are_judged_without_errors_of_the_sensor(effect):
+    plant = Oscillator()
+    box = Uncertainty.of(plant, 0.0, {effect: (0.5, 0.5)})
+    case = Cases(jnp.zeros(len(box.names)), jnp.asarray(0), jnp.zeros((51, 1)))
+    true, params = box.at(case.point)
+    expected = largest(plant, plant.nominal, sine(5.0), 50)
+    np.testing.assert_allclose(OnPlant(box, sine(5.0), 50)(case), expected, rtol=1e-12)
+    run = run_episode(true, params, sine(5.0), 50, jax.random.key(0), case.noise)
+    error = 0.5 * np.ones(51) if effect == "bias_y" else 0.5 * np.asarray(run.time)
+    np.testing.assert_allclose((run.measured - run.outputs)[:, 0], error, atol=1e-9)
+    np.testing.assert_allclose(response(true, params, run.inputs), run.measured, atol=1e-9)
+    own = with_nominal(true, {name: float(x) for name, x in params._asdict().items()})
+    env = Env.of(own, layout=Layout.of(true.description, 5, 4))
+    state, _ = env.reset(jax.random.key(1))
+    assert float(state.max_abs_output[0]) == 0.0
+    np.testing.assert_allclose(env.advance(state, jnp.zeros(1))[1], 0.0, atol=1e-12)
 
 
 # -------------------------------------------------------------------------------- the search

@@ -163,6 +163,13 @@ class AbstractPlant(_Module):
     def output(self, state: Float[Array, " state"], params: Params) -> Float[Array, " output"]:
         """Noise-free outputs. An input acts only through the state."""
 
+    def true_output(self, state: Float[Array, " state"], params: Params) -> Float[Array, " output"]:
+        """What is judged against the levels: the outputs without errors of their sensor.
+
+        `output`, which identification predicts, has these errors, such as a bias.
+        """
+        return self.output(state, params)
+
     def delay(self, params: Params) -> Float[Array, " input"] | None:
         """Time after which each input acts [s]; None: all inputs act at once.
 

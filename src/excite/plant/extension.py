@@ -7,7 +7,8 @@
     saturation_voltage              largest magnitude of the input
     dead_zone_voltage               magnitude up to which the input does nothing
     coulomb_speed, drag_speed       deceleration c sign(v) or c v |v| of a velocity v
-    bias_pitch, drift_pitch         is added to the output, the second times the time
+    bias_pitch, drift_pitch         is added to the output, the second times the time, by its
+                                    sensor: levels are judged without it
 
 They act in this order. A plant with extensions is a plant like any other, named
 `aero2+delay_voltage`.
@@ -151,6 +152,11 @@ class Extended(AbstractPlant):
             elif e.kind == "drift":
                 outputs[e.index] += jnp.where(value != 0, drifts.pop(0), 0.0)
         return jnp.stack(outputs)
+
+    def true_output(self, state: Float[Array, " state"], params: Params) -> Float[Array, " output"]:
+        """Of the plain plant: biases and drifts are of its sensors."""
+        num_own = len(self.plain.definition.states)
+        return self._plain().true_output(state[:num_own], self._own(params))
 
     def delay(self, params: Params) -> Float[Array, " input"] | None:
         """Of the plain plant, and the added ones."""
