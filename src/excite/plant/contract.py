@@ -304,6 +304,14 @@ def with_nominal(plant: AbstractPlant, values: Mapping[str, float]) -> AbstractP
     return plant.as_class(_tuned(type(plant), nominal))
 
 
+_UNTUNED = "untuned"
+
+
+def untuned(kind: type[AbstractPlant]) -> type[AbstractPlant]:
+    """The class that `with_nominal` gave other nominal parameters; else the class itself."""
+    return kind.__dict__.get(_UNTUNED, kind)
+
+
 @cache
 def _tuned(kind: type[AbstractPlant], nominal: tuple[float, ...]) -> type[AbstractPlant]:
     """The class with other nominal parameters; the same one every time, so that JAX knows it."""
@@ -317,6 +325,7 @@ def _tuned(kind: type[AbstractPlant], nominal: tuple[float, ...]) -> type[Abstra
     parameters = map(tuned, d.parameters, nominal)
     definition = dataclasses.replace(d, parameters=tuple(parameters))
     body = {"definition": definition, "__module__": kind.__module__, "__doc__": kind.__doc__}
+    body[_UNTUNED] = untuned(kind)
     return type(kind.__name__, (kind,), body)
 
 
