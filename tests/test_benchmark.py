@@ -16,6 +16,7 @@ from excite.excitation import PRBS, Chirp, Random
 from excite.files import json_ready
 from excite.information import best_possible
 from excite.plant import EMPS, Aero2, draw_params
+from excite.report.study_table import footnotes
 from excite.study import methods as benchmark
 from excite.study.run import _locked, opened, run_study
 from excite.study.spec import Study, study_from
@@ -419,3 +420,24 @@ def test_a_table_shows_itself_and_is_filtered_and_sorted(rows):
         table.only("nsl")
     with pytest.raises(ValueError, match=r"unknown column 'D_q'.*'D_p'"):
         table.sorted_by("D_q")
+
+
+# In a declared uncertainty
+
+
+def test_bounds_of_shorter_experiments_are_of_plants_of_the_declared_uncertainty():
+    box = {"parameters": "50%", "initial_pitch": [-0.1, 0.1]}
+    study = tiny(uncertainty=box, num_steps=20, lengths=[20])
+    for row in benchmark.method_rows(study):
+        assert row.bound_by_length is not None
+        for name, (bound,) in row.bound_by_length.cramer_rao_percent.items():
+            np.testing.assert_allclose(bound, row.cramer_rao_percent[name], rtol=1e-6)
+
+
+def test_a_table_says_what_its_plants_differ_in():
+    box = {"d_S": "10%", "initial_pitch": [-0.1, 0.1]}
+    study = tiny(uncertainty=box, clairvoyant={"plants": 2, "starts": 1})
+    notes = " ".join(footnotes(benchmark.facts(study)))
+    assert "d_S 10%, initial_pitch -0.1 to 0.1" in notes
+    assert "clairvoyant signals are for plants of the spread alone" in notes
+    assert "differ in more" not in " ".join(footnotes(benchmark.facts(tiny())))

@@ -543,6 +543,11 @@ def test_one_late_reading_is_counted_and_forgiven(tmp_path, clock):
     assert outcome.to_dict()["late_ms_percentiles"]["100"] == pytest.approx(150, abs=1)
 
 
+def test_a_reading_before_it_is_due_is_not_late():
+    told = Outcome(late=[-0.002, -0.001, 0.003]).to_dict()["late_ms_percentiles"]
+    assert told == pytest.approx({"50": 0.0, "90": 2.4, "99": 2.94, "100": 3.0})
+
+
 def test_where_time_is_not_the_walls_nothing_is_late():
     assert Outcome().to_dict()["late_ms_percentiles"] is None
 

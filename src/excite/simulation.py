@@ -34,7 +34,7 @@ class Trajectory(eqx.Module):
         time: sampling instants [s].
         inputs: row k is held from time[k] to time[k + 1].
         measured: outputs of the sensor.
-        outputs: true outputs.
+        outputs: true ones, without noise and other errors of the sensor.
     """
 
     time: Float[Array, " sample"]
@@ -227,8 +227,8 @@ def run_episode(
 
     def advance(carry: tuple, now: tuple) -> tuple[tuple, tuple]:
         (state, past, memory), (noise, k) = carry, now
-        output = plant.output(state, params)
-        measured = sensed(plant, output, noise)
+        output = plant.true_output(state, params)
+        measured = sensed(plant, plant.output(state, params), noise)
         memory, input = excitation(memory, measured)
         input = jnp.clip(input, lower, upper)
         state, past = moved(state, past, input, k)
@@ -238,11 +238,11 @@ def run_episode(
     start = plant.initial_state, past, excitation.init(plant, num_steps, jax.random.split(key)[0])
     steps = noise[:-1], jnp.arange(num_steps)
     (state, *_), (inputs, measured, outputs) = jax.lax.scan(advance, start, steps)
-    last = plant.output(state, params)
+    last, shown = plant.true_output(state, params), plant.output(state, params)
     return Trajectory(
         time=jnp.arange(num_steps + 1) * plant.dt,
         inputs=inputs,
-        measured=jnp.concatenate([measured, sensed(plant, last, noise[-1])[None]]),
+        measured=jnp.concatenate([measured, sensed(plant, shown, noise[-1])[None]]),
         outputs=jnp.concatenate([outputs, last[None]]),
     )
 

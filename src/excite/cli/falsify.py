@@ -84,13 +84,16 @@ def falsify(
     The search goes over the declared uncertainty and over sensor noise. What it finds is
     found; what it does not find is not proved. Exit code 1 where a level is reached.
     """
+    from ..files import require_new_file
     from ..study.falsify import falsify as falsified
     from ..study.falsify import require_certifiable, require_plant_path
 
     if out is not None:
         require_plant_path(out, overwrite)
     if certify is not None:
-        require_certifiable(excitation, certify, overwrite)
+        require_certifiable(excitation, certify, overwrite, options["steps"])
+    if plot is not None:
+        require_new_file(plot, overwrite)
     options["uncertainty"] = merged(options["uncertainty"]) or None
     settings, noise = merged(options.pop("settings")), merged(options.pop("noise"))
     with warnings_shown(), progress_bar(f"falsifying {excitation}") as progress:

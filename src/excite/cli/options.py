@@ -103,6 +103,10 @@ class Number(click.FloatRange):
 
     name = "number"
 
+    def _describe_range(self) -> str:
+        """The range for help; empty where there is none."""
+        return super()._describe_range() if (self.min, self.max) != (None, None) else ""
+
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import click
@@ -26,19 +27,24 @@ from .study import show_comparison
 
 
 @click.command()
+@click.argument("files", metavar="[FILE]...", nargs=-1)
 @json_option
-def policies(as_json: bool) -> None:
-    """List the policies that come with the package; one with its plant's name is its default."""
-    from ..policy import read_policy, shipped_policies
+def policies(files: tuple[str, ...], as_json: bool) -> None:
+    """List the policies that come with the package, or those in files.
 
-    found = []
-    for name, path in shipped_policies().items():
-        policy = read_policy(path)
+    A policy with its plant's name is the default of that plant.
+    """
+    from ..policy import policy_path, read_policy, shipped_policies
+
+    shipped, found = shipped_policies(), []
+    chosen = {name: policy_path(name) or Path(name) for name in files or shipped}
+    for name, path in chosen.items():
+        policy = read_policy(path if path.suffix else name)
         found.append(
             {
                 "name": name,
                 "plant": policy.plant.name,
-                "default": name == policy.plant.name,
+                "default": name == policy.plant.name and name in shipped,
                 "num_steps": policy.layout.num_steps,
                 "method": policy.provenance.get("method"),
                 "agent": policy.provenance.get("agent"),
@@ -58,7 +64,8 @@ def policies(as_json: bool) -> None:
          str(p["agent"]), str(p["study"]), _worst(p["certificate"])]
         for p in found
     ]  # fmt: skip
-    show_table("shipped policies; use a name as --excitation", header, rows)
+    title = "policies in files" if files else "shipped policies"
+    show_table(f"{title}; use a name as --excitation", header, rows)
     click.echo(
         "worst found: largest output over its critical level that a search found in the "
         "uncertainty\ndeclared in the policy's file (--json shows it; excite falsify)"
@@ -68,8 +75,10 @@ def policies(as_json: bool) -> None:
 def _worst(certificate: Mapping[str, Any] | None) -> str:
     if certificate is None:
         return "-"
+    from ..policy import shown_nearness
+
     sizes = [certificate["nearness"], certificate["noise_nearness"]]
-    return "diverged" if None in sizes else f"{max(sizes):.3f}"
+    return shown_nearness(None if None in sizes else max(sizes))
 
 
 @click.command()

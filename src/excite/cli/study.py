@@ -23,6 +23,7 @@ from .options import (
     screen_width,
     show_json,
     show_table,
+    warnings_shown,
 )
 
 if TYPE_CHECKING:
@@ -113,7 +114,7 @@ def running(name: str, keeps: Path | None) -> Iterator[dict[str, Any]]:
         click.echo(f"finished: {task}", err=True)
 
     try:
-        with progress_bar(name) as progress:
+        with warnings_shown(), progress_bar(name) as progress:
             yield {"progress": progress, "on_done": finished, "command": command_line()}
     except StudyFailedError as error:
         raise RunFailedError(str(error)) from None

@@ -94,7 +94,7 @@ class Effort:
     """
 
     random: int = 1000
-    corners: int = 128
+    corners: int = 256
     noises: int = 8
     starts: int = 160
     steps: int = 40

@@ -143,7 +143,7 @@ class Env(eqx.Module):
             window=window,
             memory=self.objective.init(plant, measured),
             k=jnp.asarray(0),
-            max_abs_output=jnp.abs(output),
+            max_abs_output=jnp.abs(plant.true_output(plant.initial_state, params)),
             is_finite=jnp.asarray(True),
             key=key,
         )
@@ -165,8 +165,9 @@ class Env(eqx.Module):
         is_finite = jnp.all(jnp.isfinite(after)) & self._is_visible(after, state.params)
         is_finite = is_finite & state.is_finite
         after = jnp.where(is_finite, after, state.plant_state)
-        output = plant.output(after, state.params)
-        measured = measure(plant, output, jax.random.fold_in(state.key, k))
+        output = plant.true_output(after, state.params)
+        shown = plant.output(after, state.params)
+        measured = measure(plant, shown, jax.random.fold_in(state.key, k))
         sample = StepData(state.params, state.plant_state, input, measured)
         memory, gain = self.objective.update(plant, state.memory, sample, state.k)
         window = with_input(jnp, self.layout, state.window, input)

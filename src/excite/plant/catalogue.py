@@ -18,10 +18,10 @@ from .aero2 import Aero2, Aero2Detailed, Aero2Lag
 from .cart_pole import CartPole
 from .contract import (
     AbstractPlant,
-    Params,
     Sensor,
     as_number,
     require_double_precision,
+    untuned,
     with_nominal,
 )
 from .dc_motor import DCMotor
@@ -81,8 +81,8 @@ def plant_named(name: str) -> AbstractPlant:
     Either may have extensions: `aero2+delay_voltage`. A file (.json) is read as
     `plant_in_file` writes it.
 
-    The user's file is imported, so its code runs. Take such a name only from the user's
-    command line, script or study file.
+    The user's file is imported, so its code runs; a plant's file may name such a file, too.
+    Take these names only from the user's command line, script or study file.
 
     Raises:
         ValueError: for an unknown name, or a file without such a class.
@@ -110,7 +110,7 @@ def word_of(plant: AbstractPlant) -> str:
     Raises:
         ValueError: for a class that is in no file, as one of a notebook.
     """
-    kind = plain_kind(plant)
+    kind = untuned(plain_kind(plant))
     added = "".join(f"+{name}" for name in plant.definition.name.split("+")[1:])
     shipped = [name for name, plant_class in PLANTS.items() if plant_class is kind]
     if shipped:
@@ -127,10 +127,10 @@ def word_of(plant: AbstractPlant) -> str:
 PLANT_ENDING = ".json"
 
 
-def plant_in_file(plant: AbstractPlant, params: Params) -> dict[str, object]:
-    """Content of a plant's file: its class, and its numbers by name.
+def plant_in_file(plant: AbstractPlant) -> dict[str, object]:
+    """Content of a plant's file: its class, and its numbers by name, of which `substeps` follow.
 
-    `plant_named` makes the plant of such a file, with these parameters as nominal ones.
+    `plant_named` makes the plant of such a file.
 
     Raises:
         ValueError: as `word_of`.
@@ -139,10 +139,12 @@ def plant_in_file(plant: AbstractPlant, params: Params) -> dict[str, object]:
     return {
         "format": _FORMAT,
         "plant": word_of(plant),
-        "params": dict(zip(names_of(d.parameters), map(float, params), strict=True)),
+        "params": {p.name: p.nominal for p in d.parameters},
         "constants": {c.name: c.value for c in d.constants},
         "initial_state": {s.name: s.initial for s in d.states},
         "noise_sd": {o.name: o.noise_sd for o in d.outputs},
+        "resolution": {o.name: o.resolution for o in d.outputs},
+        "dt": d.dt,
     }
 
 
@@ -160,20 +162,21 @@ def is_plant_file(path: Path) -> bool:
 def _plant_of_file(path: Path) -> AbstractPlant:
     """The plant in a file; ValueError for a file that holds none."""
     advice = "a file of a plant is written by 'excite falsify'"
-    content = read_json(path, "plant", "params", "constants", "initial_state", "noise_sd",
-                        advice=advice)  # fmt: skip
+    content = read_json(path, advice=advice)
     try:
-        if content.get("format") != _FORMAT or str(content["plant"]).endswith(PLANT_ENDING):
-            raise damaged(path, advice)
+        if content["format"] != _FORMAT or str(content["plant"]).endswith(PLANT_ENDING):
+            raise KeyError(path)
         plant = plant_named(content["plant"])
         if set(content["params"]) != {*names_of(plant.definition.parameters)}:
-            raise damaged(path, advice)
+            raise KeyError(path)
         start = [float(content["initial_state"][s.name]) for s in plant.definition.states]
         constants = {name: float(value) for name, value in content["constants"].items()}
-        plant = with_sensor(plant, content["noise_sd"])
-        plant = plant.changed(initial_state=floats(start), **constants)
-        return with_nominal(plant, content["params"])
-    except (KeyError, TypeError, AttributeError):
+        if not 0 < content["dt"] < math.inf:
+            raise KeyError(path)
+        plant = with_sensor(plant, content["noise_sd"], content["resolution"])
+        numbers = {"dt": float(content["dt"]), "initial_state": floats(start), **constants}
+        return with_nominal(plant.changed(**numbers), content["params"])
+    except (KeyError, TypeError, AttributeError, OverflowError):
         raise damaged(path, advice) from None
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None

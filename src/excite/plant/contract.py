@@ -163,6 +163,13 @@ class AbstractPlant(_Module):
     def output(self, state: Float[Array, " state"], params: Params) -> Float[Array, " output"]:
         """Noise-free outputs. An input acts only through the state."""
 
+    def true_output(self, state: Float[Array, " state"], params: Params) -> Float[Array, " output"]:
+        """What is judged against the levels: the outputs without errors of their sensor.
+
+        `output`, which identification predicts, has these errors, such as a bias.
+        """
+        return self.output(state, params)
+
     def delay(self, params: Params) -> Float[Array, " input"] | None:
         """Time after which each input acts [s]; None: all inputs act at once.
 
@@ -297,6 +304,14 @@ def with_nominal(plant: AbstractPlant, values: Mapping[str, float]) -> AbstractP
     return plant.as_class(_tuned(type(plant), nominal))
 
 
+_UNTUNED = "untuned"
+
+
+def untuned(kind: type[AbstractPlant]) -> type[AbstractPlant]:
+    """The class that `with_nominal` gave other nominal parameters; else the class itself."""
+    return kind.__dict__.get(_UNTUNED, kind)
+
+
 @cache
 def _tuned(kind: type[AbstractPlant], nominal: tuple[float, ...]) -> type[AbstractPlant]:
     """The class with other nominal parameters; the same one every time, so that JAX knows it."""
@@ -310,6 +325,7 @@ def _tuned(kind: type[AbstractPlant], nominal: tuple[float, ...]) -> type[Abstra
     parameters = map(tuned, d.parameters, nominal)
     definition = dataclasses.replace(d, parameters=tuple(parameters))
     body = {"definition": definition, "__module__": kind.__module__, "__doc__": kind.__doc__}
+    body[_UNTUNED] = untuned(kind)
     return type(kind.__name__, (kind,), body)
 
 

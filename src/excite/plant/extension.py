@@ -7,7 +7,8 @@
     saturation_voltage              largest magnitude of the input
     dead_zone_voltage               magnitude up to which the input does nothing
     coulomb_speed, drag_speed       deceleration c sign(v) or c v |v| of a velocity v
-    bias_pitch, drift_pitch         is added to the output, the second times the time
+    bias_pitch, drift_pitch         is added to the output, the second times the time, by its
+                                    sensor: levels are judged without it
 
 They act in this order. A plant with extensions is a plant like any other, named
 `aero2+delay_voltage`.
@@ -25,7 +26,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..description import Parameter, PlantDescription, State, names_of, unknown
-from .contract import AbstractPlant, Params
+from .contract import AbstractPlant, Params, with_nominal
 
 _INPUT, _VELOCITY, _OUTPUT = (
     ("delay", "lag", "gain", "offset", "saturation", "dead_zone"),
@@ -95,9 +96,13 @@ def extended(plant: AbstractPlant, extensions: Sequence[str]) -> AbstractPlant:
             raise ValueError(f"plant {plant.definition.name!r} has {found[0]!r} already")
         chosen |= {found[0]}
     whole = _class_of(kind, tuple(e for e in possible if e.name in chosen))
-    num_own, start = len(kind.definition.states), whole().initial_state
-    initial_state = start.at[:num_own].set(plant.initial_state[:num_own])
-    return plant.as_class(whole, initial_state=initial_state)
+    start, states = whole().initial_state, names_of(whole.definition.states)
+    for name, value in zip(names_of(plant.definition.states), plant.initial_state, strict=True):
+        start = start.at[states.index(name)].set(value)
+    made = plant.as_class(whole, initial_state=start)
+    own = {p.name: p.nominal for p in plant.definition.parameters}
+    is_changed = any(made.definition.parameter(name).nominal != own[name] for name in own)
+    return with_nominal(made, own) if is_changed else made
 
 
 class Extended(AbstractPlant):
@@ -151,6 +156,11 @@ class Extended(AbstractPlant):
             elif e.kind == "drift":
                 outputs[e.index] += jnp.where(value != 0, drifts.pop(0), 0.0)
         return jnp.stack(outputs)
+
+    def true_output(self, state: Float[Array, " state"], params: Params) -> Float[Array, " output"]:
+        """Of the plain plant: biases and drifts are of its sensors."""
+        num_own = len(self.plain.definition.states)
+        return self._plain().true_output(state[:num_own], self._own(params))
 
     def delay(self, params: Params) -> Float[Array, " input"] | None:
         """Of the plain plant, and the added ones."""

@@ -89,7 +89,18 @@ class Uncertainty(eqx.Module):
                 known = dict.fromkeys([*quantities, *possible, *groups])
                 where = f"quantity in the uncertainty of {plant.definition.name!r}"
                 raise unknown(where, name, known)
-        boxes = {name: _interval(name, value, quantities[name]) for name, value in by_name.items()}
+        boxes = {}
+        for name, value in by_name.items():
+            try:
+                boxes[name] = _interval(name, value, quantities[name])
+            except ValueError as error:
+                by_spread = _PARAMETERS not in (ranges or {}) and name in groups[_PARAMETERS]
+                if name in (ranges or {}) or not by_spread:
+                    raise
+                advice = (
+                    f"a smaller --spread, or a range of its own (--uncertainty {name}=LOW:HIGH)"
+                )
+                raise ValueError(f"{error}: take {advice}") from None
         return cls(
             whole,
             floats([box.lower for box in boxes.values()]),
@@ -126,12 +137,20 @@ class Uncertainty(eqx.Module):
         return jax.random.uniform(key, (len(self.names),), float, -1.0, 1.0)
 
     def corners(self, key: PRNGKeyArray, most: int) -> Float[Array, "corner quantity"]:
-        """All corners of the box, or `most` of them drawn at random where there are more."""
+        """All corners of the box, or `most` of them drawn at random where there are more.
+
+        No corner is drawn twice.
+        """
         count = len(self.names)
         if 2**count <= most:
             every = itertools.product((-1.0, 1.0), repeat=count)
             return jnp.asarray(list(every)).reshape(-1, count)
-        return jax.random.rademacher(key, (most, count), float)
+        first = min(count, max(16, most.bit_length()))  # these quantities make corners differ
+        own_key, other_key = jax.random.split(key)
+        drawn = jax.random.choice(own_key, 2**first, (most,), replace=False)
+        signs = 2.0 * (drawn[:, None] >> jnp.arange(first)[None] & 1) - 1.0
+        rest = jax.random.rademacher(other_key, (most, count - first), float)
+        return jnp.concatenate([signs, rest], axis=1)
 
     def ranges(self) -> dict[str, list[float]]:
         """Lowest and highest value of each quantity, JSON-ready."""
@@ -219,7 +238,8 @@ def _read(name: str, given: Any, about: _Quantity) -> _Interval:
             )
         return _Interval(about.nominal / factor, about.nominal * factor, is_factor=True)
     if not colon:
-        raise ValueError(f"range of {name} must be {_ALLOWED}: got {given!r}")
+        hint = f" ({text}:{text} is one value)" if _is_number(text) else ""
+        raise ValueError(f"range of {name} must be {_ALLOWED}: got {given!r}{hint}")
     return _Interval(_as_number(name, first, given), _as_number(name, second, given))
 
 
@@ -230,6 +250,13 @@ def _as_number(name: str, value: object, given: Any) -> float:
         return float(value)  # pyright: ignore[reportArgumentType]
     except (TypeError, ValueError, OverflowError):
         raise ValueError(f"range of {name} must be {_ALLOWED}: got {_shown(given)}") from None
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False
 
 
 def _shown(given: Any) -> str:

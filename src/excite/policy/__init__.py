@@ -15,6 +15,7 @@ from .contract import observe as observe
 from .contract import require_certified as require_certified
 from .contract import respond as respond
 from .contract import scaled_action as scaled_action
+from .contract import shown_nearness as shown_nearness
 from .contract import with_input as with_input
 from .contract import with_measurement as with_measurement
 from .file import POLICY_ENDING as POLICY_ENDING

@@ -12,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -259,13 +260,16 @@ class Policy:
         if c is None:
             return "no certificate: no search for violations (excite falsify)"
         largest, with_noise = (
-            "a simulation diverged" if c[name] is None else f"{c[name]:.3f} of the critical level"
+            "a simulation diverged"
+            if c[name] is None
+            else f"{shown_nearness(c[name])} of the critical level"
             for name in ("nearness", "noise_nearness")
         )
         box = ", ".join(f"{n} {a:.3g} to {b:.3g}" for n, (a, b) in c["uncertainty"].items())
+        where = f"plants {c['plant']}" if "plant" in c else "plants"
         return (
             f"largest output found in {c['experiments']:,} experiments: {largest}, {with_noise} "
-            f"with noise searched within {c['noise_bound']:g} sd; plants: {box}; found, not proved"
+            f"with noise searched within {c['noise_bound']:g} sd; {where}: {box}; found, not proved"
         )
 
     def certified(self, certificate: Mapping[str, Any] | None) -> Policy:
@@ -355,16 +359,32 @@ def _check_layout(layout: Layout, plant: PlantDescription) -> None:
         raise ValueError("the observation layout does not belong to the policy's plant")
 
 
+def shown_nearness(value: float | None) -> str:
+    """A largest output over its critical level, as text."""
+    if value is None or not math.isfinite(value):
+        return "diverged"
+    return f"{value:.3f}" if value <= _MOST_SHOWN else f"> {_MOST_SHOWN}"
+
+
+_MOST_SHOWN = 1000
+
+
 def _check_certificate(certificate: Any) -> None:
     """Raises an error for a certificate without its numbers."""
     ranges = [tuple(ends) for ends in certificate["uncertainty"].values()]
-    counts = [certificate[name] for name in ("experiments", "noise_bound")]
+    whole = [certificate["experiments"], certificate.get("num_steps", 0)]
     sizes = [certificate[name] for name in ("nearness", "noise_nearness")]  # None for infinity
-    numbers = [*itertools.chain(*ranges), *counts, *(size for size in sizes if size is not None)]
+    numbers = [
+        *itertools.chain(*ranges),
+        certificate["noise_bound"],
+        *(size for size in sizes if size is not None),
+    ]
     if not (
         isinstance(certificate["plant_hash"], str)
+        and isinstance(certificate.get("plant", ""), str)
         and all(len(ends) == 2 for ends in ranges)
-        and all(isinstance(n, int | float) for n in numbers)
+        and all(type(n) in (int, float) and abs(n) <= sys.float_info.max for n in numbers)
+        and all(type(n) is int and 0 <= n < _MAX_COUNT for n in whole)
     ):
         raise ValueError("its certificate is malformed")
 
@@ -425,12 +445,16 @@ def require_certified(policy: Policy, plant: PlantDescription, spread: float) ->
     if certificate is None:
         raise ValueError("the policy has no certificate ('excite falsify --certify' makes one)")
     largest = [certificate["nearness"], certificate["noise_nearness"]]
-    if None in largest or max(largest) >= 1:
+    if None in largest or max(largest) >= 1 or certificate.get("violations", 0):
         raise ValueError(f"the policy's certificate says that it is not safe ({policy.claim})")
     if certificate["plant_hash"] != plant.hash:
         raise ValueError(
             f"the policy's certificate is for another plant than this {plant.name!r} "
             "('excite falsify --plant' makes one for it)"
+        )
+    if (steps := certificate.get("num_steps", policy.layout.num_steps)) < policy.layout.num_steps:
+        raise ValueError(
+            f"the policy's certificate is for its first {steps} of {policy.layout.num_steps} steps"
         )
     for p in plant.parameters:
         low, high = certificate["uncertainty"].get(p.name, (p.nominal, p.nominal))

@@ -214,7 +214,7 @@ def require_record_path(path: Path, overwrite: bool) -> None:
     sidecar = path.with_suffix(".json")
     if sidecar.is_file() and not read_sidecar(path):
         raise ValueError(
-            f"{sidecar} was not written by excite and would be lost; choose another name for the "
+            f"{sidecar} is no sidecar of a record and would be lost; choose another name for the "
             "record"
         )
     require_new_file(path, overwrite)

@@ -234,6 +234,7 @@ class StudyFacts(Saved):
     num_steps: int
     seed: int
     spread: float
+    uncertainty: Options = {}
     sensor: dict[str, Options] = {}
     methods: dict[str, Options] = {}
     estimators: dict[str, Options]

@@ -288,6 +288,13 @@ def footnotes(study: StudyFacts) -> list[str]:
             f"the first {count} plants, with signals designed for each plant as if its parameters "
             "were known (local search)."
         )
+    if study.uncertainty:
+        box = ", ".join(f"{name} {_range(ends)}" for name, ends in study.uncertainty.items())
+        signals = "; the clairvoyant signals are for plants of the spread alone"
+        notes.append(
+            f"The plants differ in more than the spread: {box}; the estimators and the bound take "
+            f"only the parameters as unknown{signals * bool(study.clairvoyant)}."
+        )
     if study.rig:
         notes.append(
             "Experiments were made on the plant's simulated rig, with its latency and jitter, "
@@ -301,6 +308,11 @@ def footnotes(study: StudyFacts) -> list[str]:
     if study.inferred:
         notes.append("Inferred, not stated by the source: " + "; ".join(study.inferred) + ".")
     return notes
+
+
+def _range(given: object) -> str:
+    """A range of a declared uncertainty as it is written, or its two ends."""
+    return " to ".join(f"{x:g}" for x in given) if isinstance(given, list | tuple) else str(given)
 
 
 def _latex_row(cells: Sequence[str]) -> str:

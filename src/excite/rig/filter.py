@@ -147,7 +147,7 @@ class SafetyFilter(eqx.Module):
         def advance(carry: tuple, _: None) -> tuple[tuple, Array]:
             states, applied = carry
             states = jax.vmap(self._next, (0, 0, None))(states, self.params, applied)
-            outputs = jax.vmap(self.plant.output)(states, self.params)
+            outputs = jax.vmap(self.plant.true_output)(states, self.params)
             size = jnp.max(jnp.abs(outputs) / critical[None])
             return (states, self._within(self._backup(states), applied)), size
 

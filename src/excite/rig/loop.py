@@ -72,10 +72,13 @@ class Outcome:
 
     @property
     def late_ms_percentiles(self) -> dict[str, float] | None:
-        """Delay of the readings [ms], by percentile; None if the rig is not in real time."""
+        """Delay of the readings [ms], by percentile; None if the rig is not in real time.
+
+        A reading before it is due has no delay.
+        """
         if not self.late:
             return None
-        late = np.percentile(np.array(self.late) * 1000, _PERCENTILES)
+        late = np.percentile(np.maximum(self.late, 0.0) * 1000, _PERCENTILES)
         return dict(zip(map(str, _PERCENTILES), late, strict=True))
 
     def to_dict(self) -> dict[str, object]:

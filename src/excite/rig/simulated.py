@@ -113,8 +113,9 @@ class Hardware(eqx.Module):
         output = plant.output(plant.initial_state, self.params)
         rest = jnp.asarray(safe_input(plant.definition))
         shown = measure(plant, output, jax.random.fold_in(self.key, 0))
+        largest = jnp.abs(plant.true_output(plant.initial_state, self.params))
         now, first = jnp.asarray(0.0), jnp.asarray(0)
-        return HardwareState(plant.initial_state, rest, rest, now, shown, first, jnp.abs(output))
+        return HardwareState(plant.initial_state, rest, rest, now, shown, first, largest)
 
     def write(self, state: HardwareState, input: Float[Array, " input"]) -> HardwareState:
         """State after an input was written; it acts after latency and jitter."""
@@ -139,7 +140,7 @@ class Hardware(eqx.Module):
             delay=state.delay - interval,
             shown=jnp.where(is_lost, state.shown, measured),
             n=state.n + 1,
-            largest=jnp.maximum(state.largest, jnp.abs(output)),
+            largest=jnp.maximum(state.largest, jnp.abs(self.plant.true_output(after, self.params))),
         )
 
     def _moved(self, state: Array, input: Array, duration: Array) -> Array:

@@ -259,13 +259,13 @@ class Agent:
     def total_steps(self, num_steps: int) -> int:
         """Sampling times of the whole training, for experiments of `num_steps`."""
         if isinstance(self.training, PPOSettings):
-            return self.training.total_steps
+            return self.training.whole_steps
         return self.training.num_updates * self.training.num_plants * num_steps
 
     def stage(self, steps: float, num_steps: int) -> str:
         """Progress of a training after `steps` sampling times, in its unit."""
         if isinstance(self.training, PPOSettings):
-            return f"step {steps:,.0f} of {self.training.total_steps:,}"
+            return f"step {steps:,.0f} of {self.training.whole_steps:,}"
         done = steps / (self.training.num_plants * num_steps)
         return f"updating {done:,.0f} of {self.training.num_updates:,}"
 

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
 from .. import __version__
 from ..description import LARGEST_SEED, PlantDescription, names_of, require_whole
-from ..environment.falsification import Effort, OnPlant, Stage, search
+from ..environment.falsification import Cases, Effort, OnPlant, Stage, nearness, search
 from ..excitation.catalogue import (
     EXCITATIONS,
     LOOP,
@@ -20,8 +26,10 @@ from ..excitation.catalogue import (
     name_of,
 )
 from ..files import require_new_file, write_json
+from ..plant import AbstractPlant
 from ..plant.catalogue import (
     PLANT_ENDING,
+    PLANTS,
     PlantLike,
     is_plant_file,
     plant_from,
@@ -29,13 +37,14 @@ from ..plant.catalogue import (
     require_inputs,
     with_sensor,
 )
+from ..plant.contract import with_nominal
 from ..plant.uncertainty import Range, Uncertainty
-from ..policy import POLICY_ENDING, Policy, policy_path, read_policy
+from ..policy import POLICY_ENDING, Policy, policy_path, read_policy, shown_nearness
 from ..record import Record
 from ..report.numbers import number
 from ..report.tables import html_table, text_table
 from ..safety import watched_levels
-from ..simulation import DivergedError, Experiment, Trajectory, experiment_length
+from ..simulation import Experiment, Trajectory, experiment_length, run_episode
 from ..training.checkpoint import Progress
 
 if TYPE_CHECKING:
@@ -58,13 +67,17 @@ class Falsification:
         ranges: the declared uncertainty: lowest and highest value of each quantity.
         stages: of the search.
         nearness: the largest output over its critical level that was found, with the noise of
-            a seed; 1 and more are violations.
+            a seed, as `simulate` repeats it; 1 and more are violations, infinite is a simulation
+            that diverged.
         noise_nearness: the same with noise that is searched too, within `noise_bound`.
         noise_bound: in standard deviations.
         worst: quantities of the worst plant.
         worst_seed: of its noise, for `simulate`.
-        worst_plant: content of that plant's file.
-        record: its experiment.
+        worst_plant: with its parameters as nominal ones.
+        record: its experiment, until it diverged.
+        noise_worst: quantities of the worst plant with searched noise.
+        noise: that noise, in standard deviations.
+        noise_record: its experiment.
         seed: of the search.
     """
 
@@ -79,20 +92,30 @@ class Falsification:
     noise_bound: float
     worst: Mapping[str, float]
     worst_seed: int
-    worst_plant: Mapping[str, object]
+    worst_plant: AbstractPlant
     record: Record
+    noise_worst: Mapping[str, float]
+    noise: Float[np.ndarray, "sample output"]
+    noise_record: Record
     seed: int
 
     @property
     def is_safe(self) -> bool:
         """Whether no experiment reached a critical level, with searched noise neither."""
-        return max(self.nearness, self.noise_nearness) < 1
+        is_reached = any(stage.violations for stage in self.stages)
+        return max(self.nearness, self.noise_nearness) < 1 and not is_reached
 
     def certificate(self) -> dict[str, Any]:
         """What was searched, how hard, and what was found, JSON-ready."""
         return {
             "excite": __version__,
+            "plant": self.plant.name,
             "plant_hash": self.plant.hash,
+            "sensor": {
+                o.name: {"noise_sd": o.noise_sd, "resolution": o.resolution}
+                for o in self.plant.outputs
+            },
+            "num_steps": self.num_steps,
             "uncertainty": {name: list(ends) for name, ends in self.ranges.items()},
             "seed": self.seed,
             "experiments": sum(stage.experiments for stage in self.stages),
@@ -103,33 +126,41 @@ class Falsification:
             "noise_nearness": self.noise_nearness,
             "worst": dict(self.worst),
             "worst_seed": self.worst_seed,
+            "noise_worst": dict(self.noise_worst),
         }
 
     def certified(self) -> Policy:
         """The policy with this certificate in its file.
 
         Raises:
-            ValueError: where the excitation is not a policy.
+            ValueError: where the excitation is not a policy, or was played for a part of its
+                length.
         """
         if self.policy is None:
             raise ValueError(f"only a policy has a certificate; {self.excitation} is none")
+        _require_whole(self.policy, self.num_steps)
         return self.policy.certified(self.certificate())
 
     def save(self, path: str | Path, overwrite: bool = False) -> None:
         """Writes the worst plant as JSON, a plant for every verb: `ex.simulate("worst.json")`.
 
         Raises:
-            ValueError: for another ending, or a file that exists, unless `overwrite`.
+            ValueError: for another ending, a file that exists, unless `overwrite`, or a class of
+                plant that is in no file.
         """
         path = Path(path)
         require_plant_path(path, overwrite)
-        write_json(path, self.worst_plant)
+        write_json(path, plant_in_file(self.worst_plant))
 
     def plot(self) -> matplotlib.figure.Figure:
-        """Inputs and outputs of the worst experiment over time, with limits and levels."""
+        """Inputs and outputs of the worst experiment over time, with limits and levels.
+
+        That with searched noise where it is worse.
+        """
         from ..figure import episode_figure
 
-        return episode_figure(self.plant, self.record)
+        with_noise = self.noise_nearness > self.nearness
+        return episode_figure(self.plant, self.noise_record if with_noise else self.record)
 
     def __repr__(self) -> str:
         """The stages as a table, the verdict, and the worst plant."""
@@ -144,14 +175,13 @@ class Falsification:
     def _table(self) -> tuple[str, list[str], list[list[str]]]:
         title = f"{self.excitation} on {self.plant.name}: largest output over its critical level"
         rows = [
-            [s.name, f"{s.experiments:,}", f"{s.violations:,}", f"{s.nearness:.3f}"]
+            [s.name, f"{s.experiments:,}", f"{s.violations:,}", shown_nearness(s.nearness)]
             for s in self.stages
         ]
         return title, ["searched", "experiments", "violations", "largest"], rows
 
     def _sentences(self) -> list[str]:
         box = ", ".join(f"{n} {number(a)} to {number(b)}" for n, (a, b) in self.ranges.items())
-        worst = ", ".join(f"{name} = {number(value)}" for name, value in self.worst.items())
         total = sum(stage.experiments for stage in self.stages)
         found = (
             f"no violation found in {total:,} experiments; this is no proof"
@@ -159,11 +189,13 @@ class Falsification:
             else f"UNSAFE: {sum(s.violations for s in self.stages):,} of {total:,} experiments "
             "reach a critical level"
         )
+        bound = f"noise searched within {self.noise_bound:g} sd"
         return [
             found,
-            f"searched: {box}",
-            f"worst plant ({self.nearness:.3f} of the level, noise of seed {self.worst_seed}): "
-            f"{worst}",
+            f"searched: {box}; {self.num_steps} steps",
+            f"worst plant ({_told(self.nearness)}, noise of seed {self.worst_seed}): "
+            f"{_values(self.worst)}",
+            f"worst plant with {bound} ({_told(self.noise_nearness)}): {_values(self.noise_worst)}",
         ]
 
 
@@ -176,13 +208,35 @@ def require_plant_path(path: Path, overwrite: bool) -> None:
         raise ValueError(f"{path} is no file of a plant and would be lost; choose another name")
 
 
-def require_certifiable(excitation: str, path: Path, overwrite: bool) -> None:
-    """Raises ValueError where a certificate cannot be written: no policy, or a file that exists."""
+def _told(nearness: float) -> str:
+    is_number = math.isfinite(nearness)
+    return f"{shown_nearness(nearness)} of the level" if is_number else "its simulation diverges"
+
+
+def _values(quantities: Mapping[str, float]) -> str:
+    return ", ".join(f"{name} = {number(value)}" for name, value in quantities.items())
+
+
+def require_certifiable(excitation: str, path: Path, overwrite: bool, steps: int | None) -> None:
+    """Raises ValueError where a certificate cannot be written.
+
+    That is for no policy, a part of its length, or a file that exists.
+    """
     if policy_path(excitation) is None:
         raise ValueError(f"only a policy has a certificate; {excitation!r} is none")
+    if steps is not None:
+        _require_whole(read_policy(excitation), steps)
     if path.suffix != POLICY_ENDING:
         raise ValueError(f"{path}: policy files end in {POLICY_ENDING}")
     require_new_file(path, overwrite)
+
+
+def _require_whole(policy: Policy, steps: int) -> None:
+    if steps != policy.layout.num_steps:
+        raise ValueError(
+            f"a certificate is for the policy's whole length of {policy.layout.num_steps} steps: "
+            f"got {steps} (leave --steps out)"
+        )
 
 
 def falsify(
@@ -212,7 +266,8 @@ def falsify(
         spread: of parameters without a range: nominal value ± spread times the scale; default
             that of the policy's training, or 0.3.
         uncertainty: ranges by name, such as `{"delay_voltage": (0, 0.1), "d_S": "10%",
-            "initial_state": "2%"}`; default that of the policy's training.
+            "initial_state": "2%"}`; default that of the policy's training, and the constants that
+            were drawn there.
         noise: standard deviation of an output's noise, by name [output unit].
         steps: length [samples]; default 500, or that of a policy or a signal.
         budget: number of simulated experiments, about.
@@ -225,10 +280,14 @@ def falsify(
         TypeError: for an argument of another type.
     """
     policy = _policy_of(excitation)
-    made = {} if policy is None else policy.provenance
     if plant is None:
         if policy is None:
             if isinstance(excitation, str) and not _is_signal(excitation):
+                if _is_plant(excitation):
+                    raise ValueError(
+                        f"{excitation!r} is a plant: give a policy or a signal for it, such as "
+                        f"chirp --plant {excitation}"
+                    )
                 read_policy(excitation)  # says which policies there are
             raise ValueError(
                 f"{_word(excitation)} is no policy, which would name its plant: give the plant "
@@ -236,6 +295,8 @@ def falsify(
             )
         plant = policy.plant.name
     chosen = with_sensor(plant_from(plant), noise)
+    if isinstance(excitation, Record):
+        chosen = chosen.changed(dt=excitation.dt)
     require_inputs(chosen)
     if not watched_levels(chosen.definition)[0]:
         raise ValueError(
@@ -245,19 +306,36 @@ def falsify(
     require_whole("seed", seed, 0, LARGEST_SEED)
     found, origin = excitation_and_origin(excitation, options or {}, chosen)
     name = _word(excitation)
+    if "warning" in origin:
+        warnings.warn(f"{name}: {origin['warning']}", stacklevel=2)
     num_steps = experiment_length(found, name, steps, isinstance(excitation, Record))
-    own = {} if spread is None and uncertainty is not None else made.get("uncertainty", {})
+    usual_spread, usual = _trained_in(policy, chosen)
     box = Uncertainty.of(
         chosen,
-        made.get("spread", 0.3) if spread is None else spread,
-        own if uncertainty is None else uncertainty,
+        usual_spread if spread is None else spread,
+        usual if uncertainty is None else uncertainty,
     )
     effort = Effort.of(budget)
-    result = search(OnPlant(box, found, num_steps), effort, seed, progress)
-    worst, params = box.at(result.worst.point[0])
-    worst_seed = int(result.worst.seed[0])
-    experiment = Experiment(worst, params, found, name, origin, num_steps, worst_seed)
-    plain = [stage.nearness for stage in result.stages[:-1]]
+    play = OnPlant(box, found, num_steps)
+    result = search(play, effort, seed, progress)
+    with_noise = result.worst_noise or result.worst
+
+    def replayed(case: Cases) -> tuple[Record, float, dict[str, float], AbstractPlant]:
+        """The first case alone, as `simulate` makes it: record, nearness, quantities, plant.
+
+        A batch is another program, and the single precision of a policy shows in the 7th digit.
+        """
+        own = jax.tree.map(lambda leaf: leaf[0], case)
+        (worst, params), key = box.at(own.point), int(own.seed)
+        experiment = Experiment(worst, params, found, name, origin, num_steps, key)
+        run = run_episode(worst, params, found, num_steps, experiment.key, own.noise)
+        values = dict(zip(box.names, box.values(own.point).tolist(), strict=True))
+        size = float(nearness(worst, run.outputs))
+        tuned = with_nominal(worst, {n: float(x) for n, x in params._asdict().items()})
+        return experiment.record(_until_diverged(run)), size, values, tuned
+
+    record, largest, values, tuned = replayed(result.worst)
+    noise_record, noise_largest, noise_values, _ = replayed(with_noise)
     return Falsification(
         plant=chosen.description,
         excitation=name,
@@ -265,13 +343,16 @@ def falsify(
         num_steps=num_steps,
         ranges={name: (low, high) for name, (low, high) in box.ranges().items()},
         stages=result.stages,
-        nearness=max(plain),
-        noise_nearness=result.stages[-1].nearness,
+        nearness=largest,
+        noise_nearness=noise_largest,
         noise_bound=effort.noise_bound,
-        worst=dict(zip(box.names, box.values(result.worst.point[0]).tolist(), strict=True)),
-        worst_seed=worst_seed,
-        worst_plant=plant_in_file(worst, params),
-        record=experiment.record(_run(experiment)),
+        worst=values,
+        worst_seed=int(result.worst.seed[0]),
+        worst_plant=tuned,
+        record=record,
+        noise_worst=noise_values,
+        noise=np.asarray(_noise(play, with_noise)),
+        noise_record=noise_record,
         seed=seed,
     )
 
@@ -280,19 +361,36 @@ def _is_signal(word: str) -> bool:
     return word.removeprefix(LOOP) in EXCITATIONS or word.endswith(SIGNAL_ENDINGS)
 
 
-def _run(experiment: Experiment) -> Trajectory:
-    """The worst experiment; ValueError where it diverged."""
-    try:
-        return experiment.run()
-    except DivergedError:
-        values = zip(
-            names_of(experiment.plant.definition.parameters), experiment.params, strict=True
-        )
-        told = ", ".join(f"{name} = {number(float(value))}" for name, value in values)
-        raise ValueError(
-            "the simulation of a plant of the declared uncertainty diverges (NaN or infinity): "
-            f"{told}; a narrower uncertainty may help"
-        ) from None
+def _noise(play: OnPlant, cases: Cases) -> Float[Array, "sample output"]:
+    """Of the first case, in standard deviations."""
+    return (
+        play.noise(jax.tree.map(lambda leaf: leaf[0], cases))
+        if cases.noise is None
+        else cases.noise[0]
+    )
+
+
+def _is_plant(word: str) -> bool:
+    return word.split("+")[0] in PLANTS or ".py:" in word or word.endswith(PLANT_ENDING)
+
+
+def _trained_in(policy: Policy | None, plant: AbstractPlant) -> tuple[float, Mapping[str, Range]]:
+    """Spread and ranges of the plants that a policy was trained for."""
+    made = {} if policy is None else policy.provenance
+    decision = made.get("decision") or {}
+    spread = decision.get("spread")
+    drawn, known = decision.get("constants") or {}, names_of(plant.definition.constants)
+    constants = {name: tuple(ends) for name, ends in drawn.items() if name in known}
+    ranges = {**constants, **(made.get("uncertainty") or {})}
+    return made.get("spread", 0.3) if spread is None else spread, ranges
+
+
+def _until_diverged(run: Trajectory) -> Trajectory:
+    """The samples before the first that is not finite, at least two."""
+    is_finite = np.isfinite(np.hstack([run.outputs, run.measured])).all(axis=1)
+    count = len(run.time) if np.all(is_finite) else max(2, int(np.argmin(is_finite)))
+    time, inputs, *outputs = run.time[:count], run.inputs[: count - 1], run.measured, run.outputs
+    return Trajectory(time, inputs, *(rows[:count] for rows in outputs))
 
 
 def _word(excitation: ExcitationLike) -> str:

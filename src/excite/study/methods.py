@@ -132,11 +132,11 @@ def _bound_by_length(
     study: Study, plant: AbstractPlant, excitation: AbstractExcitation
 ) -> BoundByLength:
     """Bounds of shorter experiments; signals are designed again for each length."""
-    keys = episode_keys(study)[:CHUNK]
-    bounds = [
-        np.asarray(run_episodes(plant, excitation, length, study.spread, keys).bound).mean(axis=0)
-        for length in study.lengths
+    keys, box = episode_keys(study)[:CHUNK], study.build_uncertainty(plant)
+    every = [
+        run_episodes(plant, excitation, length, study.spread, keys, box) for length in study.lengths
     ]
+    bounds = [np.asarray(episodes.bound).mean(axis=0) for episodes in every]
     names = names_of(plant.definition.parameters)
     percent = {
         n: tuple((100 * values).tolist())

@@ -1,5 +1,7 @@
 """Progress of a training: `progress.json` beside the checkpoint of every running seed.
 
+`search.json` says how far the search for violations is that follows.
+
 The worker that trains writes it. The command line and the bench page read it without JAX.
 """
 
@@ -11,7 +13,7 @@ from pathlib import Path
 
 from ..files import write_json
 
-_NAME = "progress.json"
+_NAME, _SEARCH = "progress.json", "search.json"
 
 
 def write_progress(seed_folder: Path, look: Mapping[str, float]) -> None:
@@ -37,6 +39,20 @@ def _is_number(value: object) -> bool:
     return value is None or isinstance(value, int | float)
 
 
+def write_search(seed_folder: Path, text: str) -> None:
+    """Stores how far the search for violations is that follows a training."""
+    write_json(seed_folder / _SEARCH, {"text": text})
+
+
+def read_search(seed_folder: Path) -> str:
+    """How far that search is; empty where it has not begun."""
+    try:
+        return str(json.loads((seed_folder / _SEARCH).read_text(encoding="utf-8"))["text"])
+    except (OSError, ValueError, RecursionError, LookupError, TypeError):
+        return ""
+
+
 def remove_progress(seed_folder: Path) -> None:
-    """Removes the file after the training."""
+    """Removes the files after the training."""
     (seed_folder / _NAME).unlink(missing_ok=True)
+    (seed_folder / _SEARCH).unlink(missing_ok=True)

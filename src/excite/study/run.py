@@ -14,6 +14,7 @@ import importlib.util
 import json
 import os
 import shutil
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -46,9 +47,9 @@ from .example_episodes import episodes_data, example_episodes
 from .folder import agent_settings, fingerprint, read_json, seed_folder, study_of
 from .methods import compared, method_rows
 from .pool import num_cores
-from .progress import read_progress, remove_progress
+from .progress import read_progress, read_search, remove_progress
 from .spec import Study, read_study
-from .table import best_seeds, learning_curves, study_table
+from .table import best_seeds, learning_curves, study_table, too_near
 from .tasks import clairvoyant_task, methods_task, seed_task
 from .worker import OF_PPO
 
@@ -223,6 +224,8 @@ def write_table(study: Study, folder: Path) -> StudyTable:
         curves = curves_figure(plant, learning_curves(study, folder), title, bounds)
         played = agents_figure(plant, {agent: episodes[agent] for agent in seeds}, title)
         files["differences.csv"] = differences_csv(table.differences).encode()
+        for sentence in too_near(study, folder):
+            warnings.warn(sentence, stacklevel=2)
         files |= {"curves.png": image(curves, "png"), "episodes.png": image(played, "png")}
         table = table.model_copy(update={"best_seeds": seeds, "bound_curves": tuple(bounds)})
     for name, data in files.items():
@@ -492,6 +495,8 @@ def _live(study: Study, target: _Target, folder: Path) -> tuple[float, str]:
     if row is None:
         return 0.0, ""
     own, steps = study.agent(agent), row["steps"] or 0.0
+    if part := read_search(place):
+        return 1.0, f"{agent} seed {seed}: searching for violations ({part})"
     stage = f"{agent} seed {seed}: {own.stage(steps, study.num_steps)}"
     return steps / own.total_steps(study.num_steps), f"{stage}; {_looks(row)}"
 

@@ -379,8 +379,8 @@ def plant_tables(
     usual = given if isinstance(plant, str) else plant_named(word)
     if usual.changed(sensor=given.sensor).description.hash != given.description.hash:
         raise ValueError(
-            f"a study names its plant, and this {word} differs from its class in constants, dt or "
-            "initial state: write a class with these numbers"
+            f"a study names its plant, and this {word} differs from its class in nominal values, "
+            "constants, dt or initial state: write a class with these numbers"
         )
     pairs = zip(usual.description.outputs, given.description.outputs, strict=True)
     sensor = {

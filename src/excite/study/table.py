@@ -10,6 +10,7 @@ import numpy as np
 import scipy.stats
 
 from ..description import PlantDescription, names_of
+from ..policy import read_policy, shown_nearness
 from ..report.rows import (
     BoundByLength,
     Difference,
@@ -303,6 +304,25 @@ def best_seeds(study: Study, folder: Path) -> dict[str, int]:
 
     seeds = range(study.seeds)
     return {a: max(seeds, key=lambda seed, a=a: value(a, seed)) for a in study.agents}
+
+
+def too_near(study: Study, folder: Path) -> list[str]:
+    """A sentence for every best policy with which a search came too near to a critical level."""
+    sentences = []
+    for agent, seed in best_seeds(study, folder).items():
+        found = read_policy(seed_folder(folder, agent, seed) / "policy.safetensors").certificate
+        if found is None:
+            continue
+        sizes = [found["nearness"], found["noise_nearness"]]  # None for infinity
+        largest = None if None in sizes else max(sizes)
+        allowed = getattr(study.agent(agent).training, "allowed_nearness", 1.0)
+        if largest is None or largest > allowed:
+            sentences.append(
+                f"{agent} seed {seed}: a search in the declared uncertainty found "
+                f"{shown_nearness(largest)} of the critical level, and {allowed:g} is allowed: "
+                "more updates or a smaller uncertainty may help"
+            )
+    return sentences
 
 
 def learning_curves(study: Study, folder: Path) -> dict[str, list[dict[str, np.ndarray]]]:

@@ -34,7 +34,7 @@ from .agent import Agent
 from .falsify import falsify
 from .folder import agent_settings, fingerprint
 from .methods import episode_keys, evaluate_method, method_rows, scores
-from .progress import write_progress
+from .progress import write_progress, write_search
 from .spec import Study, study_from
 from .statistics import table_row
 
@@ -104,7 +104,6 @@ def seed_task(
         place = Path(folder) if folder and Path(folder).is_dir() else None
         keeper = _Keeper(place, mark, checkpoint_seconds)
         env = own.env(built, chosen.spread, chosen.num_steps, chosen.uncertainty)
-        ranges = own.ranges(chosen.uncertainty)
         trained = _trained(env, own, seed, keeper)
         seconds = keeper.seconds()
         provenance = {
@@ -116,9 +115,7 @@ def seed_task(
         }
         policy = Policy(built.description, env.layout, trained.weights, provenance)
         if env.uncertainty is not None:
-            policy = falsify(
-                policy, built, spread=float(env.spread), uncertainty=ranges
-            ).certified()
+            policy = falsify(policy, built, progress=keeper.searching).certified()
         rows, rms = evaluate_method(chosen, built, agent, PolicyExcitation.of(policy))
         limit = np.array(policy.layout.input_half)
         metrics = SeedMetrics(
@@ -151,6 +148,7 @@ class _Keeper:
         self.path = None if folder is None else folder / "checkpoint.safetensors"
         self.log_folder = None if folder is None else str(folder / "tensorboard")
         self.before, self.start, self.last = 0.0, time.monotonic(), time.monotonic()
+        self.last_search = 0.0
 
     def seconds(self) -> float:
         """Training time so far [s], that before an interruption included."""
@@ -183,6 +181,13 @@ class _Keeper:
             state = {**made.state, **own}
             write_bytes(self.path, dataclasses.replace(made, state=state).to_bytes())
             self.last = time.monotonic()
+
+    def searching(self, part: str, done: float, total: float) -> None:
+        """Called during the search for violations after the training."""
+        is_due = time.monotonic() - self.last_search >= 1 or done == total
+        if self.folder is not None and is_due:
+            write_search(self.folder, f"{part}, {100 * done / total:.0f} %")
+            self.last_search = time.monotonic()
 
 
 def methods_task(study: Mapping[str, object], plant: Mapping[str, str | None]) -> Data:

@@ -80,6 +80,10 @@ def train(
         ValueError: for an argument that is not allowed, or a training that cannot succeed.
         StudyFailedError: where tasks failed; finished tasks are kept in `out`.
     """
+    if method == "ppo" and uncertainty:
+        raise ValueError(
+            "ppo does not train against an uncertainty: leave it out, or take the method gradient"
+        )
     rewards = rewards_of(objective, goal or {})
     decision = {
         **decision_of(rewards.values()),

@@ -160,6 +160,12 @@ class PPOSettings(_Checked):
                 "(num_envs times n_steps), or is below 2"
             )
 
+    @property
+    def whole_steps(self) -> int:
+        """Environment steps of all rollouts."""
+        rollout = self.num_envs * self.n_steps
+        return -(-self.total_steps // rollout) * rollout
+
     def noise_at(self, progress: float) -> float | None:
         """Exploration noise at a fraction of the training; None where it is learned."""
         if self.noise_sd_end is None:
