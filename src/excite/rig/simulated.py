@@ -8,7 +8,8 @@ enough. The true parameters are shown only at the end.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -20,7 +21,8 @@ from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray
 from ..description import names_of
 from ..environment import Episodes, scored
 from ..excitation import AbstractExcitation
-from ..plant import AbstractPlant, Params, draw_params
+from ..plant import AbstractPlant, Params, draw_params, params_from
+from ..plant.extension import extended
 from ..safety import (
     Supervision,
     Trip,
@@ -31,8 +33,9 @@ from ..safety import (
     is_violation,
     safe_input,
 )
-from ..simulation import Trajectory, measure, step
+from ..simulation import Trajectory, measure, sensed, step
 from .contract import AbstractRig, Pacer, Reading
+from .faults import NO_FAULTS, Faults
 from .filter import SafetyFilter
 
 
@@ -41,18 +44,20 @@ class HardwareState(eqx.Module):
 
     Attributes:
         plant_state: true state.
-        acting: input that acts now.
-        written: input that was written last.
-        delay: time until that one acts [s].
+        inputs: those written last, the newest at the end.
+        due: time until each of them has come to the plant, whose delay is added [s].
+        acting: input that acted last.
+        followed: outputs as the sensor follows them.
         shown: last reading.
         n: number of readings so far.
         largest: largest magnitude of each true output.
     """
 
     plant_state: Float[Array, " state"]
+    inputs: Float[Array, "written input"]
+    due: Float[Array, " written"]
     acting: Float[Array, " input"]
-    written: Float[Array, " input"]
-    delay: Float[Array, ""]
+    followed: Float[Array, " output"]
     shown: Float[Array, " output"]
     n: Int[Array, ""]
     largest: Float[Array, " output"]
@@ -62,12 +67,15 @@ class Hardware(eqx.Module):
     """Plant, parameters and faults of a simulated rig.
 
     Attributes:
-        plant: with the interval between two readings as its dt.
+        plant: the true one, with the interval between two readings as its dt.
         params: its true parameters.
         latency: mean time from writing an input to its action [s].
         jitter: half the range in which that time is drawn for every input [s].
         dropout: probability that a reading repeats the one before it.
         key: of noise, jitter and dropouts.
+        faults: of sensor and actuator.
+        noise: of each reading in standard deviations, in place of that of the key.
+        num_written: number of inputs that are kept until they act, see `num_written`.
     """
 
     plant: AbstractPlant
@@ -76,6 +84,9 @@ class Hardware(eqx.Module):
     jitter: Float[Array, ""]
     dropout: Float[Array, ""]
     key: PRNGKeyArray
+    faults: Faults = NO_FAULTS
+    noise: Float[Array, "reading output"] | None = None
+    num_written: int = eqx.field(static=True, default=3)
 
     @classmethod
     def draw(
@@ -84,6 +95,9 @@ class Hardware(eqx.Module):
         num_readings: int,
         spread: float,
         key: PRNGKeyArray,
+        *,
+        effects: Mapping[str, float] | None = None,
+        faults: Faults = NO_FAULTS,
         **numbers: float,
     ) -> Hardware:
         """Hardware with parameters drawn around the nominal ones.
@@ -93,58 +107,146 @@ class Hardware(eqx.Module):
             num_readings: in one sampling time.
             spread: of the parameters, as a fraction of their scales.
             key: of the parameters, and of noise, jitter and dropouts.
+            effects: values of extensions that the true plant has and `plant` has not, by name:
+                `gain_voltage`, `delay_voltage`, ...
+            faults: of sensor and actuator.
             numbers: `latency`, `jitter`, `dropout`; by default a tenth of dt, a thousandth
                 of dt, and zero.
         """
         params_key, rig_key = jax.random.split(key)
-        dt = float(plant.dt)
+        dt, given = float(plant.dt), effects or {}
         usual = {"latency": dt / 10, "jitter": dt / 1000, "dropout": 0.0} | numbers
+        whole = extended(plant, list(given)) if given else plant
+        own = draw_params(plant, params_key, spread)
+        middle = jnp.asarray(plant.nominal)
+        scales = np.array([p.scale for p in plant.definition.parameters])
+
+        def true(own: Params) -> Params:
+            return params_from(whole, given)._replace(**own._asdict())
+
+        def delay(point: Array) -> Array | None:
+            return whole.delay(true(plant.Params(*(middle + spread * scales * point))))
+
         return cls(
-            plant=at_interval(plant, num_readings),
-            params=draw_params(plant, params_key, spread),
+            plant=at_interval(whole, num_readings),
+            params=true(own),
             key=rig_key,
+            faults=faults,
+            num_written=num_written(delay, len(scales), dt),
             **{name: jnp.asarray(value, float) for name, value in usual.items()},
         )
 
     def start(self) -> HardwareState:
-        """At rest, input zero, at the first reading."""
+        """At the plant's initial state, input zero, at the first reading."""
         plant = self.plant
         output = plant.output(plant.initial_state, self.params)
         rest = jnp.asarray(safe_input(plant.definition))
-        shown = measure(plant, output, jax.random.fold_in(self.key, 0))
         now, first = jnp.asarray(0.0), jnp.asarray(0)
-        return HardwareState(plant.initial_state, rest, rest, now, shown, first, jnp.abs(output))
+        return HardwareState(
+            plant_state=plant.initial_state,
+            inputs=jnp.tile(rest, (self.num_written, 1)),
+            due=jnp.zeros(self.num_written),
+            acting=rest,
+            followed=output,
+            shown=self._reading(output, now, first, jax.random.fold_in(self.key, 0)),
+            n=first,
+            largest=jnp.abs(output),
+        )
 
     def write(self, state: HardwareState, input: Float[Array, " input"]) -> HardwareState:
-        """State after an input was written; it acts after latency and jitter."""
+        """State after an input was written; it acts after latency and jitter, and in order."""
         late = jax.random.uniform(jax.random.fold_in(self.key, -1 - state.n), (), float, -1, 1)
-        delay = jnp.maximum(self.latency + self.jitter * late, 0.0)
-        return eqx.tree_at(lambda s: (s.written, s.delay), state, (input, delay))
+        due = jnp.maximum(self.latency + self.jitter * late, jnp.maximum(state.due[-1], 0.0))
+        written = (
+            jnp.concatenate([state.inputs[1:], input[None]]),
+            jnp.concatenate([state.due[1:], due[None]]),
+        )
+        return eqx.tree_at(lambda s: (s.inputs, s.due), state, written)
 
     def advance(self, state: HardwareState) -> HardwareState:
         """State one interval later, at the next reading."""
         interval = self.plant.dt
-        before = jnp.clip(state.delay, 0.0, interval)  # how long the earlier input still acts
-        middle = self._moved(state.plant_state, state.acting, before)
-        after = self._moved(middle, state.written, interval - before)
+        before, now = state.n * interval, (state.n + 1) * interval
+        arriving = self._arriving(state)
+        # Up to the first input that arrives in the interval, and after it.
+        first = jnp.min(jnp.where(arriving > 0, arriving, interval), initial=interval)
+        middle, _ = self._moved(state, state.plant_state, arriving, (0.0, first), before)
+        after, acting = self._moved(state, middle, arriving, (first, interval), before)
         output = self.plant.output(after, self.params)
         noise_key, dropout_key = jax.random.split(jax.random.fold_in(self.key, state.n + 1))
-        measured = measure(self.plant, output, noise_key)
+        followed = self.faults.followed(output, state.followed, interval)
+        measured = self._reading(followed, now, state.n + 1, noise_key)
         is_lost = jax.random.uniform(dropout_key) < self.dropout
         return HardwareState(
             plant_state=after,
-            acting=jnp.where(state.delay < interval, state.written, state.acting),
-            written=state.written,
-            delay=state.delay - interval,
-            shown=jnp.where(is_lost, state.shown, measured),
+            inputs=state.inputs,
+            due=state.due - interval,
+            acting=acting,
+            followed=followed,
+            shown=jnp.where(is_lost | self.faults.is_frozen(now), state.shown, measured),
             n=state.n + 1,
             largest=jnp.maximum(state.largest, jnp.abs(output)),
         )
 
-    def _moved(self, state: Array, input: Array, duration: Array) -> Array:
-        """The plant's state after part of an interval."""
-        plant = eqx.tree_at(lambda p: p.dt, self.plant, duration)
-        return step(plant, state, input, self.params)
+    def _arriving(self, state: HardwareState) -> Float[Array, "later input"]:
+        """Time until each input but the oldest acts on the plant [s], by channel."""
+        delay, due = self.plant.delay(self.params), state.due[1:, None]
+        delay = jnp.zeros(state.inputs.shape[1]) if delay is None else jnp.maximum(delay, 0.0)
+        return due + delay[None]
+
+    def _moved(
+        self,
+        state: HardwareState,
+        plant_state: Float[Array, " state"],
+        arriving: Float[Array, "later input"],
+        part: tuple[Array | float, Array | float],
+        time: Float[Array, ""],
+    ) -> tuple[Float[Array, " state"], Float[Array, " input"]]:
+        """The plant's state after a part of the interval, and what acts at its end.
+
+        Where inputs change within the part, a linear input has their mean and first moment, as
+        in `simulation.delayed`.
+        """
+        begin, end = part
+        duration = end - begin
+        share = jnp.clip((end - arriving) / jnp.where(duration > 0, duration, 1.0), 0.0, 1.0)
+        share = jnp.where(arriving <= begin, 1.0, share)
+        change = jnp.diff(state.inputs, axis=0)
+        mean = state.inputs[0] + jnp.sum(share * change, axis=0)
+        half = jnp.sum(3 * share * (1 - share) * change, axis=0)
+        last = state.inputs[0] + jnp.sum(jnp.where(arriving <= end, change, 0.0), axis=0)
+        from_input, to_input, last = (
+            self.faults.acting(input, state.acting, time)
+            for input in (mean - half, mean + half, last)
+        )
+        moved = step(self.plant, plant_state, from_input, self.params, duration, to_input)
+        return moved, last
+
+    def _reading(
+        self, followed: Float[Array, " output"], time: Array, n: Array, key: PRNGKeyArray
+    ) -> Float[Array, " output"]:
+        """What is read of the outputs that the sensor follows."""
+        biased = followed + self.faults.bias(time)
+        if self.noise is None:
+            return measure(self.plant, biased, key)
+        return sensed(self.plant, biased, self.noise[n])
+
+
+def num_written(delay: Callable[[Array], Array | None], num_coordinates: int, dt: float) -> int:
+    """Number of inputs that a rig keeps until they act.
+
+    Args:
+        delay: of a plant at a point of [-1, 1]^num_coordinates; each adds its part to it.
+        num_coordinates: of the point.
+        dt: sampling time [s].
+    """
+    middle = delay(jnp.zeros(num_coordinates))
+    if middle is None:
+        return 3  # the one that acts, the one that comes, and a safe input after a trip
+    ends = [np.asarray(delay(end)) for end in (*np.eye(num_coordinates), *-np.eye(num_coordinates))]
+    parts = np.abs(np.array(ends).reshape(2, num_coordinates, -1) - np.asarray(middle))
+    longest = np.max(np.asarray(middle) + np.sum(np.max(parts, axis=0), axis=0))
+    return 3 + max(0, math.ceil(longest / dt - 1e-9))
 
 
 def at_interval(plant: AbstractPlant, num_readings: int) -> AbstractPlant:
@@ -213,7 +315,7 @@ class SimulatedRig(AbstractRig):
 
     def facts(self) -> Mapping[str, Any]:
         """True parameters and largest true outputs."""
-        names = names_of(self.description.parameters)
+        names = names_of(self._hardware.plant.definition.parameters)
         return {
             "simulated": True,
             "true_params": dict(zip(names, map(float, self._hardware.params), strict=True)),
@@ -344,12 +446,12 @@ def drawn_hardware(
     num_readings: int,
     spread: float,
     keys: Key[Array, " run"],
-    **numbers: float,
+    **options: Any,
 ) -> Hardware:
     """Hardware for each key, with the same plant as in `run_episodes`; see `Hardware.draw`."""
 
     def draw(key: PRNGKeyArray) -> Hardware:
-        return Hardware.draw(plant, num_readings, spread, key, **numbers)
+        return Hardware.draw(plant, num_readings, spread, key, **options)
 
     return eqx.filter_vmap(draw)(keys)
 
@@ -390,8 +492,9 @@ def _scored(plant: AbstractPlant, params: Params, runs: Runs) -> Episodes:
     """Every run as an experiment; its safety is that of all readings, not only of samples."""
 
     def score(params: Params, run: Runs) -> Episodes:
+        known = plant.Params(*(getattr(params, name) for name in plant.Params._fields))
         time = jnp.arange(len(run.measured)) * plant.dt
-        return scored(plant, params, Trajectory(time, run.inputs, run.measured, run.measured))
+        return scored(plant, known, Trajectory(time, run.inputs, run.measured, run.measured))
 
     episodes = jax.vmap(score)(params, runs)
     safety = runs.is_violation, runs.max_abs_output
