@@ -260,6 +260,15 @@ class DivergedError(ValueError):
     """A simulation with outputs that are not finite."""
 
 
+def require_finite(outputs: Float[Array, "..."]) -> None:
+    """Raises DivergedError for outputs that are not finite."""
+    if not np.all(np.isfinite(outputs)):
+        raise DivergedError(
+            "the simulation diverged (NaN or infinity): these parameters make the plant too "
+            "fast for its integration step, or unstable"
+        )
+
+
 @dataclasses.dataclass(frozen=True)
 class Experiment:
     """All choices of one simulated experiment.
@@ -336,11 +345,7 @@ class Experiment:
             DivergedError: where the simulation diverged.
         """
         run = run_episode(self.plant, self.params, self.excitation, self.num_steps, self.key)
-        if not np.all(np.isfinite(run.outputs)):
-            raise DivergedError(
-                "the simulation diverged (NaN or infinity): these parameters make the plant too "
-                "fast for its integration step, or unstable"
-            )
+        require_finite(run.outputs)
         return run
 
     def record(self, run: Trajectory) -> Record:

@@ -263,8 +263,10 @@ class Policy:
             for name in ("nearness", "noise_nearness")
         )
         box = ", ".join(f"{n} {a:.3g} to {b:.3g}" for n, (a, b) in c["uncertainty"].items())
+        where = " on the simulated rig" if c.get("rig") else ""
+        where += " behind the safety filter" if c.get("filter") else ""
         return (
-            f"largest output found in {c['experiments']:,} experiments: {largest}, {with_noise} "
+            f"largest output found in {c['experiments']:,} experiments{where}: {largest}, {with_noise} "
             f"with noise searched within {c['noise_bound']:g} sd; plants: {box}; found, not proved"
         )
 

@@ -39,14 +39,11 @@ from .player import AbstractPlayer, PolicyPlayer, SignalPlayer, step_seconds
 from .recorder import Recorder
 
 if TYPE_CHECKING or HAS_JAX:
-    import jax
-    from jaxtyping import PRNGKeyArray
-
     from ..excitation.catalogue import ExcitationLike, excitation_and_origin, name_of
     from ..plant import AbstractPlant
     from ..plant.catalogue import PlantLike, plant_from, require_inputs
     from ..simulation import experiment_length
-    from .excitation import ExcitationPlayer
+    from .excitation import ExcitationPlayer, excitation_key
     from .filter import FilteredPlayer, SafetyFilter
     from .live_estimate import LiveEstimate
 
@@ -359,15 +356,11 @@ class _Source:
             plant, given = _required(plant, "--excitation"), self.excitation or self.name
             excitation, _ = excitation_and_origin(given, self.options, plant)
             length = experiment_length(excitation, self.name, steps, isinstance(given, Record))
-            return functools.partial(ExcitationPlayer, excitation, plant, length, _key(seed))
+            key = excitation_key(seed)
+            return functools.partial(ExcitationPlayer, excitation, plant, length, key)
         if steps is not None and steps > longest:
             raise ValueError(f"{self.name} was made for {longest} steps; --steps asks for {steps}")
         return make
-
-
-def _key(seed: int) -> PRNGKeyArray:
-    """A key other than that of a simulated rig, which uses the seed directly."""
-    return jax.random.fold_in(jax.random.key(seed), 1)
 
 
 def _required(plant: AbstractPlant | None, option: str) -> AbstractPlant:

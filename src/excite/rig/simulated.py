@@ -33,7 +33,7 @@ from ..safety import (
     is_violation,
     safe_input,
 )
-from ..simulation import Trajectory, measure, sensed, step
+from ..simulation import Trajectory, sensed, step
 from .contract import AbstractRig, Pacer, Reading
 from .faults import NO_FAULTS, Faults
 from .filter import SafetyFilter
@@ -74,7 +74,6 @@ class Hardware(eqx.Module):
         dropout: probability that a reading repeats the one before it.
         key: of noise, jitter and dropouts.
         faults: of sensor and actuator.
-        noise: of each reading in standard deviations, in place of that of the key.
         num_written: number of inputs that are kept until they act, see `num_written`.
     """
 
@@ -85,7 +84,6 @@ class Hardware(eqx.Module):
     dropout: Float[Array, ""]
     key: PRNGKeyArray
     faults: Faults = NO_FAULTS
-    noise: Float[Array, "reading output"] | None = None
     num_written: int = eqx.field(static=True, default=3)
 
     @classmethod
@@ -115,7 +113,6 @@ class Hardware(eqx.Module):
         """
         params_key, rig_key = jax.random.split(key)
         dt, given = float(plant.dt), effects or {}
-        usual = {"latency": dt / 10, "jitter": dt / 1000, "dropout": 0.0} | numbers
         whole = extended(plant, list(given)) if given else plant
         own = draw_params(plant, params_key, spread)
         middle = jnp.asarray(plant.nominal)
@@ -133,23 +130,27 @@ class Hardware(eqx.Module):
             key=rig_key,
             faults=faults,
             num_written=num_written(delay, len(scales), dt),
-            **{name: jnp.asarray(value, float) for name, value in usual.items()},
+            **usual_numbers(dt, numbers),
         )
 
-    def start(self) -> HardwareState:
-        """At the plant's initial state, input zero, at the first reading."""
+    def start(self, noise: Float[Array, " output"] | None = None) -> HardwareState:
+        """At the plant's initial state, input zero, at the first reading.
+
+        Args:
+            noise: of the reading in standard deviations, in place of that of the key.
+        """
         plant = self.plant
         output = plant.output(plant.initial_state, self.params)
-        rest = jnp.asarray(safe_input(plant.definition))
-        now, first = jnp.asarray(0.0), jnp.asarray(0)
+        rest, now = jnp.asarray(safe_input(plant.definition)), jnp.asarray(0.0)
+        noise = self._noise(jax.random.fold_in(self.key, 0)) if noise is None else noise
         return HardwareState(
             plant_state=plant.initial_state,
             inputs=jnp.tile(rest, (self.num_written, 1)),
             due=jnp.zeros(self.num_written),
             acting=rest,
             followed=output,
-            shown=self._reading(output, now, first, jax.random.fold_in(self.key, 0)),
-            n=first,
+            shown=sensed(plant, output + self.faults.bias(now), noise),
+            n=jnp.asarray(0),
             largest=jnp.abs(output),
         )
 
@@ -163,8 +164,10 @@ class Hardware(eqx.Module):
         )
         return eqx.tree_at(lambda s: (s.inputs, s.due), state, written)
 
-    def advance(self, state: HardwareState) -> HardwareState:
-        """State one interval later, at the next reading."""
+    def advance(
+        self, state: HardwareState, noise: Float[Array, " output"] | None = None
+    ) -> HardwareState:
+        """State one interval later, at the next reading; noise as for `start`."""
         interval = self.plant.dt
         before, now = state.n * interval, (state.n + 1) * interval
         arriving = self._arriving(state)
@@ -175,7 +178,8 @@ class Hardware(eqx.Module):
         output = self.plant.output(after, self.params)
         noise_key, dropout_key = jax.random.split(jax.random.fold_in(self.key, state.n + 1))
         followed = self.faults.followed(output, state.followed, interval)
-        measured = self._reading(followed, now, state.n + 1, noise_key)
+        noise = self._noise(noise_key) if noise is None else noise
+        measured = sensed(self.plant, followed + self.faults.bias(now), noise)
         is_lost = jax.random.uniform(dropout_key) < self.dropout
         return HardwareState(
             plant_state=after,
@@ -222,14 +226,24 @@ class Hardware(eqx.Module):
         moved = step(self.plant, plant_state, from_input, self.params, duration, to_input)
         return moved, last
 
-    def _reading(
-        self, followed: Float[Array, " output"], time: Array, n: Array, key: PRNGKeyArray
-    ) -> Float[Array, " output"]:
-        """What is read of the outputs that the sensor follows."""
-        biased = followed + self.faults.bias(time)
-        if self.noise is None:
-            return measure(self.plant, biased, key)
-        return sensed(self.plant, biased, self.noise[n])
+    def reading_noise(self, num_readings: int) -> Float[Array, "reading output"]:
+        """The noise of the first readings, in standard deviations of the sensor."""
+        first = self._noise(jax.random.fold_in(self.key, 0))
+
+        def later(n: Array) -> Array:
+            return self._noise(jax.random.split(jax.random.fold_in(self.key, n))[0])
+
+        others = jax.vmap(later)(jnp.arange(1, num_readings))
+        return jnp.concatenate([first[None], others])
+
+    def _noise(self, key: PRNGKeyArray) -> Float[Array, " output"]:
+        return jax.random.normal(key, (len(self.plant.definition.outputs),), float)
+
+
+def usual_numbers(dt: float, given: Mapping[str, float]) -> dict[str, Float[Array, ""]]:
+    """Latency, jitter and dropout of a simulated rig, where they are not given."""
+    usual = {"latency": dt / 10, "jitter": dt / 1000, "dropout": 0.0}
+    return {name: jnp.asarray(value, float) for name, value in (usual | dict(given)).items()}
 
 
 def num_written(delay: Callable[[Array], Array | None], num_coordinates: int, dt: float) -> int:
@@ -381,25 +395,34 @@ def run_batch(
     """
 
     def one(hardware: Hardware) -> Runs:
-        return _one_run(hardware, excitation, rules, num_steps, num_readings, safety_filter)
+        return one_run(hardware, excitation, rules, num_steps, num_readings, safety_filter)
 
     return jax.vmap(one)(hardware)
 
 
-def _one_run(
+def one_run(
     hardware: Hardware,
     excitation: AbstractExcitation,
     rules: Supervision,
     num_steps: int,
     num_readings: int,
     safety_filter: SafetyFilter | NoFilter,
+    noise: Float[Array, "reading output"] | None = None,
+    key: PRNGKeyArray | None = None,
 ) -> Runs:
+    """One experiment; see `run_batch`.
+
+    Args:
+        key: of the excitation; default the hardware's.
+        noise: of all (num_steps + 1) num_readings + 1 readings in standard deviations; default
+            that of the hardware's key.
+    """
     interval = rules.dt / num_readings
     latency = jnp.round(hardware.latency / interval).astype(int)
 
-    def reading(carry: tuple, _: None) -> tuple[tuple, Array]:
+    def reading(carry: tuple, noise: Array | None) -> tuple[tuple, Array]:
         state, watch = carry
-        state = hardware.advance(state)
+        state = hardware.advance(state, noise)
         was_running = watch.trip == int(Trip.NONE)
         watch = check_reading(jnp, rules, watch, state.shown, interval)
         is_new = was_running & (watch.trip != int(Trip.NONE))
@@ -407,14 +430,17 @@ def _one_run(
         state = jax.tree.map(lambda a, b: jnp.where(is_new, a, b), safe, state)
         return (state, watch), state.shown
 
-    def hold(state: HardwareState, watch: Watch, input: Array) -> tuple[tuple, Array]:
+    def hold(
+        state: HardwareState, watch: Watch, input: Array, noise: Array | None
+    ) -> tuple[tuple, Array]:
         """The readings of one sampling time, and the one at which the input begins to act."""
         now = state.shown
         carry = hardware.write(state, input), watch
-        carry, shown = jax.lax.scan(reading, carry, None, length=num_readings)
+        carry, shown = jax.lax.scan(reading, carry, noise, length=num_readings)
         return carry, jnp.concatenate([now[None], shown])[latency]
 
-    def sample(carry: tuple, _: None) -> tuple[tuple, tuple]:
+    @jax.checkpoint  # a gradient keeps the states at sampling instants alone
+    def sample(carry: tuple, noise: Array | None) -> tuple[tuple, tuple]:
         state, watch, player, memory, count = carry
         measured = watch.reading
         watch = check_sample(jnp, rules, watch)
@@ -422,21 +448,25 @@ def _one_run(
         memory, proposed, is_changed = safety_filter(memory, measured, proposed)
         watch, input = allowed(jnp, rules, watch, proposed)
         player = excitation.applied(player, input)
-        (state, watch), acted_on = hold(state, watch, input)
+        (state, watch), acted_on = hold(state, watch, input, noise)
         return (state, watch, player, memory, count + is_changed), (input, acted_on)
 
-    state = hardware.start()
+    first = by_sample = last = None
+    if noise is not None:
+        first, later = noise[0], noise[1:].reshape(num_steps + 1, num_readings, -1)
+        by_sample, last = later[:-1], later[-1]
+    state = hardware.start(first)
     # A signal is made for the sampling time, not for the interval between two readings.
     plant = eqx.tree_at(lambda p: p.dt, hardware.plant, jnp.asarray(rules.dt))
-    player = excitation.init(plant, num_steps, hardware.key)
+    player = excitation.init(plant, num_steps, hardware.key if key is None else key)
     watch = Watch.start(jnp, rules, state.shown)
     carry = state, watch, player, safety_filter.start(), jnp.asarray(0)
     (state, watch, *_, count), (inputs, measured) = jax.lax.scan(
-        sample, carry, None, length=num_steps
+        sample, carry, by_sample, length=num_steps
     )
     trip, safe = watch.trip, jnp.asarray(rules.safe_input, float)
-    (state, _), last = hold(state, watch, safe)
-    measured = jnp.concatenate([measured, last[None]])
+    (state, _), last_acted_on = hold(state, watch, safe, last)
+    measured = jnp.concatenate([measured, last_acted_on[None]])
     is_over = is_violation(state.largest[None], jnp.asarray(rules.critical))
     return Runs(state.largest, is_over, trip, count, inputs, measured)
 

@@ -8,9 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import jax
+
 from .. import __version__
 from ..description import LARGEST_SEED, PlantDescription, names_of, require_whole
-from ..environment.falsification import Effort, OnPlant, Stage, search
+from ..environment.falsification import Cases, Effort, OnPlant, Stage, search
 from ..excitation.catalogue import (
     EXCITATIONS,
     LOOP,
@@ -34,6 +36,9 @@ from ..policy import POLICY_ENDING, Policy, policy_path, read_policy
 from ..record import Record
 from ..report.numbers import number
 from ..report.tables import html_table, text_table
+from ..rig.falsification import OnRig
+from ..rig.filter import SafetyFilter
+from ..rig.simulated import NO_FILTER
 from ..safety import watched_levels
 from ..simulation import DivergedError, Experiment, Trajectory, experiment_length
 from ..training.checkpoint import Progress
@@ -66,6 +71,8 @@ class Falsification:
         worst_plant: content of that plant's file.
         record: its experiment.
         seed: of the search.
+        rig: whether experiments were made on the plant's simulated rig.
+        filter: whether they were made there behind the predictive safety filter.
     """
 
     plant: PlantDescription
@@ -82,6 +89,8 @@ class Falsification:
     worst_plant: Mapping[str, object]
     record: Record
     seed: int
+    rig: bool = False
+    filter: bool = False
 
     @property
     def is_safe(self) -> bool:
@@ -94,6 +103,8 @@ class Falsification:
             "excite": __version__,
             "plant_hash": self.plant.hash,
             "uncertainty": {name: list(ends) for name, ends in self.ranges.items()},
+            "rig": self.rig,
+            "filter": self.filter,
             "seed": self.seed,
             "experiments": sum(stage.experiments for stage in self.stages),
             "violations": sum(stage.violations for stage in self.stages),
@@ -142,7 +153,10 @@ class Falsification:
         return html_table(*self._table()) + "".join(f"<p>{line}</p>" for line in self._sentences())
 
     def _table(self) -> tuple[str, list[str], list[list[str]]]:
-        title = f"{self.excitation} on {self.plant.name}: largest output over its critical level"
+        where = on_rig(self.rig, self.filter)
+        title = (
+            f"{self.excitation} on {self.plant.name}{where}: largest output over its critical level"
+        )
         rows = [
             [s.name, f"{s.experiments:,}", f"{s.violations:,}", f"{s.nearness:.3f}"]
             for s in self.stages
@@ -196,6 +210,8 @@ def falsify(
     steps: int | None = None,
     budget: int = 10_000,
     seed: int = 0,
+    rig: bool = False,
+    filter: bool = False,
     progress: Progress = lambda *_: None,
 ) -> Falsification:
     """Searches a declared uncertainty for the plant on which an excitation is least safe.
@@ -217,6 +233,9 @@ def falsify(
         steps: length [samples]; default 500, or that of a policy or a signal.
         budget: number of simulated experiments, about.
         seed: of the search.
+        rig: whether experiments are made on the plant's simulated rig, with its latency, readings
+            between the samples and supervisor.
+        filter: whether they are made there behind the predictive safety filter.
         progress: called with a text, how much is done, and the total.
 
     Raises:
@@ -224,6 +243,8 @@ def falsify(
             critical level.
         TypeError: for an argument of another type.
     """
+    if filter and not rig:
+        raise ValueError("the safety filter is part of a rig: filter (--filter) needs rig (--rig)")
     policy = _policy_of(excitation)
     made = {} if policy is None else policy.provenance
     if plant is None:
@@ -247,13 +268,13 @@ def falsify(
     name = _word(excitation)
     num_steps = experiment_length(found, name, steps, isinstance(excitation, Record))
     own = {} if spread is None and uncertainty is not None else made.get("uncertainty", {})
-    box = Uncertainty.of(
-        chosen,
-        made.get("spread", 0.3) if spread is None else spread,
-        own if uncertainty is None else uncertainty,
-    )
-    effort = Effort.of(budget)
-    result = search(OnPlant(box, found, num_steps), effort, seed, progress)
+    spread = made.get("spread", 0.3) if spread is None else spread
+    box = Uncertainty.of(chosen, spread, own if uncertainty is None else uncertainty)
+    effort, play = Effort.of(budget), OnPlant(box, found, num_steps)
+    if rig:
+        safety_filter = SafetyFilter.of(chosen, spread) if filter else NO_FILTER
+        play = OnRig.of(box, found, num_steps, safety_filter)
+    result = search(play, effort, seed, progress)
     worst, params = box.at(result.worst.point[0])
     worst_seed = int(result.worst.seed[0])
     experiment = Experiment(worst, params, found, name, origin, num_steps, worst_seed)
@@ -271,8 +292,10 @@ def falsify(
         worst=dict(zip(box.names, box.values(result.worst.point[0]).tolist(), strict=True)),
         worst_seed=worst_seed,
         worst_plant=plant_in_file(worst, params),
-        record=experiment.record(_run(experiment)),
+        record=experiment.record(_run(experiment, play, result.worst)),
         seed=seed,
+        rig=rig,
+        filter=filter,
     )
 
 
@@ -280,9 +303,16 @@ def _is_signal(word: str) -> bool:
     return word.removeprefix(LOOP) in EXCITATIONS or word.endswith(SIGNAL_ENDINGS)
 
 
-def _run(experiment: Experiment) -> Trajectory:
+def on_rig(rig: bool, filter: bool) -> str:
+    """Where experiments were made, after the plant's name; empty for the plant itself."""
+    return "'s simulated rig" * rig + " behind the safety filter" * filter
+
+
+def _run(experiment: Experiment, play: OnPlant | OnRig, worst: Cases) -> Trajectory:
     """The worst experiment; ValueError where it diverged."""
     try:
+        if isinstance(play, OnRig):
+            return play.trajectory(jax.tree.map(lambda leaf: leaf[0], worst))
         return experiment.run()
     except DivergedError:
         values = zip(
