@@ -266,8 +266,9 @@ class Policy:
         where = " on the simulated rig" if c.get("rig") else ""
         where += " behind the safety filter" if c.get("filter") else ""
         return (
-            f"largest output found in {c['experiments']:,} experiments{where}: {largest}, {with_noise} "
-            f"with noise searched within {c['noise_bound']:g} sd; plants: {box}; found, not proved"
+            f"largest output found in {c['experiments']:,} experiments{where}: {largest}, "
+            f"{with_noise} with noise searched within {c['noise_bound']:g} sd; plants: {box}; "
+            "found, not proved"
         )
 
     def certified(self, certificate: Mapping[str, Any] | None) -> Policy:

@@ -131,7 +131,11 @@ class OnRig(eqx.Module):
         """The rig of one case; its key is that of `Hardware.draw` with the case's seed."""
         plant, params = self.uncertainty.at(case.point)
         key = jax.random.split(jax.random.key(case.seed))[1]
-        return Hardware(plant, params, key=key, num_written=self.num_written, **self.numbers)
+        n = self.numbers
+        return Hardware(
+            plant, params, n["latency"], n["jitter"], n["dropout"], key,
+            num_written=self.num_written,
+        )  # fmt: skip
 
 
 _run = eqx.filter_jit(OnRig.run)

@@ -6,7 +6,9 @@ the like are effects that any plant can have (`plant.extension`).
 
 from __future__ import annotations
 
-from typing import Any
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,14 +18,6 @@ from ..plant.fields import floats
 
 _NEVER = float("inf")
 _CLOSE = 1e-9  # seconds: a reading that is due at a time is not before it
-
-
-def _never() -> Any:
-    return eqx.field(default=_NEVER, converter=floats)
-
-
-def _none() -> Any:
-    return eqx.field(default=0.0, converter=floats)
 
 
 class Faults(eqx.Module):
@@ -42,13 +36,13 @@ class Faults(eqx.Module):
         actuator_sign: from when on inputs act with the opposite sign.
     """
 
-    sensor_frozen: Float[Array, ""] = _never()
-    sensor_slow: Float[Array, ""] = _none()
-    sensor_bias: Float[Array, "..."] = _none()
-    sensor_bias_from: Float[Array, ""] = _none()
-    actuator_stuck: Float[Array, ""] = _never()
-    actuator_dead: Float[Array, ""] = _never()
-    actuator_sign: Float[Array, ""] = _never()
+    sensor_frozen: Float[Array, ""] = eqx.field(converter=floats, default=_NEVER)
+    sensor_slow: Float[Array, ""] = eqx.field(converter=floats, default=0.0)
+    sensor_bias: Float[Array, "..."] = eqx.field(converter=floats, default=0.0)
+    sensor_bias_from: Float[Array, ""] = eqx.field(converter=floats, default=0.0)
+    actuator_stuck: Float[Array, ""] = eqx.field(converter=floats, default=_NEVER)
+    actuator_dead: Float[Array, ""] = eqx.field(converter=floats, default=_NEVER)
+    actuator_sign: Float[Array, ""] = eqx.field(converter=floats, default=_NEVER)
 
     def acting(
         self, input: Float[Array, " input"], before: Float[Array, " input"], time: Float[Array, ""]
@@ -84,3 +78,28 @@ class Faults(eqx.Module):
 
 
 NO_FAULTS = Faults()
+
+_BIAS = "sensor_bias"
+
+
+def fault_names(outputs: Sequence[str]) -> tuple[str, ...]:
+    """Names of the faults for `faults_from`: a bias has the name of its output at the end."""
+    names = [field.name for field in dataclasses.fields(Faults) if field.name != _BIAS]
+    return (*names, *(f"{_BIAS}_{output}" for output in outputs))
+
+
+def faults_from(outputs: Sequence[str], values: Mapping[str, float]) -> Faults:
+    """Faults by name, as in `fault_names`.
+
+    Raises:
+        ValueError: for a time that is negative, or a bias that is not finite.
+    """
+    biases = [values.get(f"{_BIAS}_{output}", 0.0) for output in outputs]
+    times = {n: values[n] for n in fault_names(()) if n in values}
+    for name, value in times.items():
+        if not value >= 0:
+            raise ValueError(f"{name} must be 0 s or more: got {value:g}")
+    for output, value in zip(outputs, biases, strict=True):
+        if not math.isfinite(value):
+            raise ValueError(f"{_BIAS}_{output} must be finite: got {value:g}")
+    return Faults(**times, sensor_bias=biases)

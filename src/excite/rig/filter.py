@@ -108,7 +108,8 @@ class SafetyFilter(eqx.Module):
         backup = self._within(self._backup(states), memory.input)
         share = jnp.linspace(0.0, 1.0, self.num_candidates)[:, None]
         candidates = wanted[None] + share * (backup - wanted)[None]
-        is_safe = jax.vmap(self._reach, (0, None))(candidates, states) < self.level
+        tried = jax.lax.stop_gradient((candidates, states))  # a choice has no derivative
+        is_safe = jax.vmap(self._reach, (0, None))(*tried) < self.level
         # The first safe input; where there is none, that of the backup law.
         best = jnp.where(jnp.any(is_safe), jnp.argmax(is_safe), self.num_candidates - 1)
         input = candidates[best]

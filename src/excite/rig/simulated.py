@@ -173,7 +173,9 @@ class Hardware(eqx.Module):
         arriving = self._arriving(state)
         # Up to the first input that arrives in the interval, and after it.
         first = jnp.min(jnp.where(arriving > 0, arriving, interval), initial=interval)
-        middle, _ = self._moved(state, state.plant_state, arriving, (0.0, first), before)
+        middle, _ = self._moved(
+            state, state.plant_state, arriving, (jnp.asarray(0.0), first), before
+        )
         after, acting = self._moved(state, middle, arriving, (first, interval), before)
         output = self.plant.output(after, self.params)
         noise_key, dropout_key = jax.random.split(jax.random.fold_in(self.key, state.n + 1))
@@ -203,7 +205,7 @@ class Hardware(eqx.Module):
         state: HardwareState,
         plant_state: Float[Array, " state"],
         arriving: Float[Array, "later input"],
-        part: tuple[Array | float, Array | float],
+        part: tuple[Array, Array],
         time: Float[Array, ""],
     ) -> tuple[Float[Array, " state"], Float[Array, " input"]]:
         """The plant's state after a part of the interval, and what acts at its end.
@@ -257,10 +259,11 @@ def num_written(delay: Callable[[Array], Array | None], num_coordinates: int, dt
     middle = delay(jnp.zeros(num_coordinates))
     if middle is None:
         return 3  # the one that acts, the one that comes, and a safe input after a trip
-    ends = [np.asarray(delay(end)) for end in (*np.eye(num_coordinates), *-np.eye(num_coordinates))]
-    parts = np.abs(np.array(ends).reshape(2, num_coordinates, -1) - np.asarray(middle))
-    longest = np.max(np.asarray(middle) + np.sum(np.max(parts, axis=0), axis=0))
-    return 3 + max(0, math.ceil(longest / dt - 1e-9))
+    longest = np.asarray(middle)
+    for end in jnp.eye(num_coordinates):
+        there = np.array([delay(end), delay(-end)])
+        longest = longest + np.max(np.abs(there - np.asarray(middle)), axis=0)
+    return 3 + max(0, math.ceil(np.max(longest) / dt - 1e-9))
 
 
 def at_interval(plant: AbstractPlant, num_readings: int) -> AbstractPlant:
@@ -275,16 +278,14 @@ _write = eqx.filter_jit(Hardware.write)
 class SimulatedRig(AbstractRig):
     """Simulated hardware as a rig."""
 
-    starts_at_rest = True
-
     def __init__(
         self, plant: AbstractPlant, hardware: Hardware, num_readings: int, is_real_time: bool
     ) -> None:
         """A rig of a plant.
 
         Args:
-            plant: sampled as experiments are.
-            hardware: the physics between readings.
+            plant: as it is known, sampled as experiments are.
+            hardware: the physics between readings; its plant may be another.
             num_readings: in one sampling time.
             is_real_time: whether readings come in real time.
 
@@ -299,6 +300,8 @@ class SimulatedRig(AbstractRig):
                 f"latency and jitter must be less than the sampling time of {plant.dt:g} s: "
                 f"got {hardware.latency:g} and {hardware.jitter:g} s"
             )
+        start = hardware.plant.initial_state[: len(plant.initial_state)]
+        self.starts_at_rest = bool(jnp.all(start == plant.initial_state))
         self._hardware, self._interval = hardware, float(plant.dt) / num_readings
 
     def open(self) -> None:

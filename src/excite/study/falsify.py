@@ -268,11 +268,11 @@ def falsify(
     name = _word(excitation)
     num_steps = experiment_length(found, name, steps, isinstance(excitation, Record))
     own = {} if spread is None and uncertainty is not None else made.get("uncertainty", {})
-    spread = made.get("spread", 0.3) if spread is None else spread
-    box = Uncertainty.of(chosen, spread, own if uncertainty is None else uncertainty)
+    reach = float(made.get("spread", 0.3)) if spread is None else spread
+    box = Uncertainty.of(chosen, reach, own if uncertainty is None else uncertainty)
     effort, play = Effort.of(budget), OnPlant(box, found, num_steps)
     if rig:
-        safety_filter = SafetyFilter.of(chosen, spread) if filter else NO_FILTER
+        safety_filter = SafetyFilter.of(chosen, reach) if filter else NO_FILTER
         play = OnRig.of(box, found, num_steps, safety_filter)
     result = search(play, effort, seed, progress)
     worst, params = box.at(result.worst.point[0])
