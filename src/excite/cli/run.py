@@ -39,7 +39,8 @@ _EXIT_CODES = {
 def _options(command: Callable[..., int]) -> Callable[..., int]:
     for option in reversed([
         click.option("--rig", default="simulated", show_default=True, metavar="NAME",
-                     help="simulated, quanser, a co-simulation unit FILE.fmu, or your class as "
+                     help="simulated, quanser, a co-simulation unit FILE.fmu, a simulated rig "
+                     "with the plant of a FILE.json (excite falsify), or your class as "
                      "path/to/file.py:ClassName."),
         click.option("--plant", help="Plant of the rig; needs JAX; default aero2_detailed."),
         click.option("--policy", metavar="NAME",
@@ -78,7 +79,10 @@ def _options(command: Callable[..., int]) -> Callable[..., int]:
                      "their scales."),
         click.option("--fault", "faults", type=NUMBERS, multiple=True,
                      help="Faults of a simulated rig: latency, jitter [s], dropout (probability "
-                     "of a lost reading)."),
+                     "of a lost reading); sensor_frozen, actuator_stuck, actuator_dead, "
+                     "actuator_sign (from when on [s]); sensor_slow (time constant [s]); "
+                     "sensor_bias_OUTPUT [its unit], sensor_bias_from [s]; effects of the true "
+                     "plant: gain_INPUT, delay_INPUT, lag_INPUT, ..."),
     ]):  # fmt: skip
         command = option(command)
     return command

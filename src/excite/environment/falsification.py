@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Protocol
 
 import equinox as eqx
 import jax
@@ -24,7 +25,7 @@ from ..plant.uncertainty import Uncertainty
 from ..safety import watched_levels
 from ..simulation import run_episode, sensor_noise
 
-_CHUNK = 64  # experiments of one call
+_CHUNKS = 8, 64  # experiments of one call, where there are few and where there are many
 _FIRST_STEP = 0.25  # of an ascent, in half widths of the box
 
 
@@ -47,6 +48,24 @@ class Cases(eqx.Module):
     point: Float[Array, "*case quantity"]
     seed: Int[Array, "*case"]
     noise: Float[Array, "*case sample output"] | None = None
+
+
+class Experiments(Protocol):
+    """What a search simulates: `OnPlant`, or `rig.falsification.OnRig`; a pytree.
+
+    Attributes:
+        uncertainty: the box.
+    """
+
+    uncertainty: Uncertainty
+
+    def __call__(self, case: Cases) -> Float[Array, ""]:
+        """The nearness of one case."""
+        ...
+
+    def noise(self, case: Cases) -> Float[Array, "sample output"]:
+        """The noise of a case's seed, in standard deviations."""
+        ...
 
 
 class OnPlant(eqx.Module):
@@ -143,7 +162,7 @@ class Found:
 
 
 def search(
-    play: OnPlant,
+    play: Experiments,
     effort: Effort,
     seed: int,
     progress: Callable[[str, int, int], None] = lambda *_: None,
@@ -209,20 +228,21 @@ def _joined(*parts: Cases) -> Cases:
 def _chunks(cases: Cases, progress: Callable[[int, int], None]) -> Iterator[tuple[Cases, int]]:
     """Parts of one size, so that one program is compiled; the last is filled up with its end."""
     count = len(cases.seed)
-    for first in range(0, count, _CHUNK):
+    size = _CHUNKS[count > _CHUNKS[0]]
+    for first in range(0, count, size):
         progress(first, count)
-        rows = np.minimum(np.arange(first, first + _CHUNK), count - 1)
-        yield jax.tree.map(lambda leaf, rows=rows: leaf[rows], cases), min(_CHUNK, count - first)
+        rows = np.minimum(np.arange(first, first + size), count - 1)
+        yield jax.tree.map(lambda leaf, rows=rows: leaf[rows], cases), min(size, count - first)
     progress(count, count)
 
 
 @eqx.filter_jit
-def _play_chunk(play: OnPlant, cases: Cases) -> Float[Array, " case"]:
+def _play_chunk(play: Experiments, cases: Cases) -> Float[Array, " case"]:
     return jax.vmap(play)(cases)
 
 
 def _played(
-    play: OnPlant, cases: Cases, progress: Callable[[int, int], None]
+    play: Experiments, cases: Cases, progress: Callable[[int, int], None]
 ) -> Float[np.ndarray, " case"]:
     """The nearness of every case."""
     parts = [np.asarray(_play_chunk(play, c))[:n] for c, n in _chunks(cases, progress)]
@@ -268,12 +288,12 @@ def climbed(
 
 
 @eqx.filter_jit
-def _climb_chunk(play: OnPlant, cases: Cases, num_steps: int, bound: Array) -> tuple:
+def _climb_chunk(play: Experiments, cases: Cases, num_steps: int, bound: Array) -> tuple:
     return jax.vmap(lambda first: climbed(play, first, num_steps, bound))(cases)
 
 
 def _climbed(
-    play: OnPlant,
+    play: Experiments,
     cases: Cases,
     num_steps: int,
     bound: float,

@@ -159,6 +159,16 @@ def is_plant_file(path: Path) -> bool:
         return False
 
 
+def known_plant(path: str | Path) -> AbstractPlant:
+    """The plant of a file's class with its usual numbers, without the effects of the file.
+
+    Raises:
+        ValueError: for a file that holds no plant.
+    """
+    _plant_of_file(Path(path))
+    return plain_kind(plant_named(read_json(Path(path))["plant"]))()
+
+
 def _plant_of_file(path: Path) -> AbstractPlant:
     """The plant in a file; ValueError for a file that holds none."""
     advice = "a file of a plant is written by 'excite falsify'"

@@ -266,10 +266,13 @@ class Policy:
             for name in ("nearness", "noise_nearness")
         )
         box = ", ".join(f"{n} {a:.3g} to {b:.3g}" for n, (a, b) in c["uncertainty"].items())
-        where = f"plants {c['plant']}" if "plant" in c else "plants"
+        plants = f"plants {c['plant']}" if "plant" in c else "plants"
+        where = " on the simulated rig" if c.get("rig") else ""
+        where += " behind the safety filter" if c.get("filter") else ""
         return (
-            f"largest output found in {c['experiments']:,} experiments: {largest}, {with_noise} "
-            f"with noise searched within {c['noise_bound']:g} sd; {where}: {box}; found, not proved"
+            f"largest output found in {c['experiments']:,} experiments{where}: {largest}, "
+            f"{with_noise} with noise searched within {c['noise_bound']:g} sd; {plants}: {box}; "
+            "found, not proved"
         )
 
     def certified(self, certificate: Mapping[str, Any] | None) -> Policy:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from ..excitation import AbstractExcitation
 from ..plant import AbstractPlant
@@ -44,6 +45,11 @@ class ExcitationPlayer(AbstractPlayer):
         """Passes the applied input to the excitation."""
         if type(self._excitation).applied is not AbstractExcitation.applied:
             self._state = _applied(self._excitation, self._state, jnp.asarray(input, float))
+
+
+def excitation_key(seed: int | Int[Array, ""]) -> PRNGKeyArray:
+    """A key other than that of a simulated rig, which uses the seed directly."""
+    return jax.random.fold_in(jax.random.key(seed), 1)
 
 
 @eqx.filter_jit

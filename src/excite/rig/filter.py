@@ -14,6 +14,7 @@ state: a derivative at rest would be zero in a dead zone.
 
 from __future__ import annotations
 
+import abc
 import itertools
 import math
 from collections.abc import Callable, Mapping
@@ -23,7 +24,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..plant import AbstractPlant, Params
 from ..safety import critical_levels, safe_input
@@ -48,7 +49,26 @@ class Memory(eqx.Module):
     num_unsafe: Int[Array, ""]
 
 
-class SafetyFilter(eqx.Module):
+class AbstractFilter(eqx.Module):
+    """What comes between an excitation and the supervisor, in simulated experiments."""
+
+    @abc.abstractmethod
+    def start(self) -> PyTree:
+        """Memory before the experiment."""
+
+    @abc.abstractmethod
+    def __call__(
+        self, memory: PyTree, measured: Float[Array, " output"], proposed: Float[Array, " input"]
+    ) -> tuple[PyTree, Float[Array, " input"], Bool[Array, ""]]:
+        """Memory before the next sample, the input to apply, and whether it was changed."""
+
+    def is_over(self, memory: PyTree) -> Bool[Array, ""]:
+        """Whether the experiment ends."""
+        del memory
+        return jnp.asarray(False)
+
+
+class SafetyFilter(AbstractFilter):
     """A filter for one plant and its prior.
 
     Attributes:
@@ -108,7 +128,8 @@ class SafetyFilter(eqx.Module):
         backup = self._within(self._backup(states), memory.input)
         share = jnp.linspace(0.0, 1.0, self.num_candidates)[:, None]
         candidates = wanted[None] + share * (backup - wanted)[None]
-        is_safe = jax.vmap(self._reach, (0, None))(candidates, states) < self.level
+        tried = jax.lax.stop_gradient((candidates, states))  # a choice has no derivative
+        is_safe = jax.vmap(self._reach, (0, None))(*tried) < self.level
         # The first safe input; where there is none, that of the backup law.
         best = jnp.where(jnp.any(is_safe), jnp.argmax(is_safe), self.num_candidates - 1)
         input = candidates[best]
@@ -116,11 +137,6 @@ class SafetyFilter(eqx.Module):
         memory = Memory(states, input, memory.num_unsafe + ~jnp.any(is_safe))
         is_finite = jnp.all(jnp.isfinite(proposed))
         return memory, jnp.where(is_finite, input, proposed), is_finite & (best > 0)
-
-    def is_over(self, memory: Memory) -> Bool[Array, ""]:
-        """Never: a filter does not end an experiment."""
-        del memory
-        return jnp.asarray(False)
 
     def _within(self, input: Array, before: Array) -> Array:
         """The nearest input within limits and slew."""

@@ -20,7 +20,7 @@ from ..plant.uncertainty import Uncertainty
 from ..safety import safe_input, watched_levels
 from ..simulation import step
 from . import guard
-from .filter import linear_model
+from .filter import AbstractFilter, linear_model
 from .guard import Belief, GuardRules, Model
 
 _WATCHED, _INPUT = 30.0, 0.1  # weights of the brake: outputs with a level, inputs
@@ -158,7 +158,7 @@ def _brake(plant: AbstractPlant) -> np.ndarray:
     return np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
 
 
-class GuardFilter(eqx.Module):
+class GuardFilter(AbstractFilter):
     """A guard between excitation and supervisor, for batches of simulated experiments.
 
     Attributes:

@@ -39,14 +39,17 @@ from .player import AbstractPlayer, PolicyPlayer, SignalPlayer, step_seconds
 from .recorder import Recorder
 
 if TYPE_CHECKING or HAS_JAX:
-    import jax
-    from jaxtyping import PRNGKeyArray
-
     from ..excitation.catalogue import ExcitationLike, excitation_and_origin, name_of
     from ..plant import AbstractPlant
-    from ..plant.catalogue import PlantLike, plant_from, require_inputs
+    from ..plant.catalogue import (
+        PLANT_ENDING,
+        PlantLike,
+        known_plant,
+        plant_from,
+        require_inputs,
+    )
     from ..simulation import experiment_length
-    from .excitation import ExcitationPlayer
+    from .excitation import ExcitationPlayer, excitation_key
     from .filter import FilteredPlayer, SafetyFilter
     from .live_estimate import LiveEstimate
 
@@ -212,7 +215,8 @@ def run(
     plant's name is played.
 
     Args:
-        rig: "simulated", "quanser", "FILE.fmu", "path/to/file.py:ClassName", or a rig.
+        rig: "simulated", "quanser", "FILE.fmu", "FILE.json" (a simulated rig whose true plant
+            is that of the file), "path/to/file.py:ClassName", or a rig.
         policy: a shipped policy's name, a file, or a policy.
         plant: name or object, where JAX is installed; by default `aero2_detailed`.
         signal: file of a designed input (.csv, .mat).
@@ -230,7 +234,10 @@ def run(
         dry_run: computes the inputs for a plant at rest; nothing is sent or written.
         seed: of a simulated rig's hidden parameters, noise and jitter, and of random signals.
         spread: of these parameters and of the filter's prior, as a fraction of their scales.
-        fault: latency [s], jitter [s] and dropout (probability) of a simulated rig.
+        fault: of a simulated rig, by name: latency [s], jitter [s], dropout (probability);
+            `sensor_frozen`, `actuator_dead` and others from a time on [s], see
+            `rig.faults.Faults`; `gain_voltage`, `delay_voltage` and other effects of which
+            policy, filter and estimate do not know.
         on_sample: called with every sample, after its input was applied.
         on_warning: called with a sentence, before the experiment, where the policy was trained
             on another plant.
@@ -262,7 +269,8 @@ def run(
     elif not dry_run:
         raise ValueError("--out FILE.csv is missing: every experiment must be recorded")
     known = _plant(plant, rig)
-    default = DEFAULT_POLICY if plant is None or known is None else known.definition.name
+    is_default = known is None or (plant is None and not _is_plant_file(rig))
+    default = DEFAULT_POLICY if known is None or is_default else known.definition.name
     source = _source(policy, signal, excitation, options or {}, default)
     rig_options = RigOptions(address, fast, seed, spread, fault or {})
     if isinstance(rig, str):
@@ -271,7 +279,9 @@ def run(
     elif isinstance(rig, AbstractRig):
         opened = rig
     else:
-        raise wrong_type("rig", rig, "a name, FILE.fmu, path/to/file.py:ClassName or a rig")
+        raise wrong_type(
+            "rig", rig, "a name, FILE.fmu, FILE.json, path/to/file.py:ClassName or a rig"
+        )
     description = opened.description
     if known is not None and not _fits(known.description, description):
         if plant is not None or filter or source.excitation is not None:
@@ -359,15 +369,11 @@ class _Source:
             plant, given = _required(plant, "--excitation"), self.excitation or self.name
             excitation, _ = excitation_and_origin(given, self.options, plant)
             length = experiment_length(excitation, self.name, steps, isinstance(given, Record))
-            return functools.partial(ExcitationPlayer, excitation, plant, length, _key(seed))
+            key = excitation_key(seed)
+            return functools.partial(ExcitationPlayer, excitation, plant, length, key)
         if steps is not None and steps > longest:
             raise ValueError(f"{self.name} was made for {longest} steps; --steps asks for {steps}")
         return make
-
-
-def _key(seed: int) -> PRNGKeyArray:
-    """A key other than that of a simulated rig, which uses the seed directly."""
-    return jax.random.fold_in(jax.random.key(seed), 1)
 
 
 def _required(plant: AbstractPlant | None, option: str) -> AbstractPlant:
@@ -410,10 +416,15 @@ def _source(
     return _Source(str(policy), read_policy(policy))
 
 
+def _is_plant_file(rig: str | AbstractRig) -> bool:
+    return HAS_JAX and isinstance(rig, str) and rig.endswith(PLANT_ENDING)
+
+
 def _plant(plant: PlantLike | None, rig: str | AbstractRig) -> AbstractPlant | None:
     """The plant; None without JAX."""
     if HAS_JAX:
-        chosen = plant_from(DEFAULT_POLICY if plant is None else plant)
+        usual = known_plant(str(rig)) if _is_plant_file(rig) else DEFAULT_POLICY
+        chosen = plant_from(usual if plant is None else plant)
         require_inputs(chosen)
         return chosen
     if plant is not None or rig == "simulated":

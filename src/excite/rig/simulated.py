@@ -8,7 +8,8 @@ enough. The true parameters are shown only at the end.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -20,7 +21,8 @@ from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
 from ..description import names_of
 from ..environment import Episodes, scored
 from ..excitation import AbstractExcitation
-from ..plant import AbstractPlant, Params, draw_params
+from ..plant import AbstractPlant, Params, draw_params, params_from
+from ..plant.extension import extended
 from ..safety import (
     Supervision,
     Trip,
@@ -32,9 +34,10 @@ from ..safety import (
     safe_input,
     tripped,
 )
-from ..simulation import Trajectory, measure, step
+from ..simulation import Trajectory, sensed, step
 from .contract import AbstractRig, Pacer, Reading
-from .filter import SafetyFilter
+from .faults import NO_FAULTS, Faults
+from .filter import AbstractFilter
 
 
 class HardwareState(eqx.Module):
@@ -42,18 +45,20 @@ class HardwareState(eqx.Module):
 
     Attributes:
         plant_state: true state.
-        acting: input that acts now.
-        written: input that was written last.
-        delay: time until that one acts [s].
+        inputs: those written last, the newest at the end.
+        due: time until each of them has come to the plant, whose delay is added [s].
+        acting: input that acted last.
+        followed: outputs as the sensor follows them.
         shown: last reading.
         n: number of readings so far.
         largest: largest magnitude of each true output.
     """
 
     plant_state: Float[Array, " state"]
+    inputs: Float[Array, "written input"]
+    due: Float[Array, " written"]
     acting: Float[Array, " input"]
-    written: Float[Array, " input"]
-    delay: Float[Array, ""]
+    followed: Float[Array, " output"]
     shown: Float[Array, " output"]
     n: Int[Array, ""]
     largest: Float[Array, " output"]
@@ -63,12 +68,14 @@ class Hardware(eqx.Module):
     """Plant, parameters and faults of a simulated rig.
 
     Attributes:
-        plant: with the interval between two readings as its dt.
+        plant: the true one, with the interval between two readings as its dt.
         params: its true parameters.
         latency: mean time from writing an input to its action [s].
         jitter: half the range in which that time is drawn for every input [s].
         dropout: probability that a reading repeats the one before it.
         key: of noise, jitter and dropouts.
+        faults: of sensor and actuator.
+        num_written: number of inputs that are kept until they act, see `num_written`.
     """
 
     plant: AbstractPlant
@@ -77,6 +84,8 @@ class Hardware(eqx.Module):
     jitter: Float[Array, ""]
     dropout: Float[Array, ""]
     key: PRNGKeyArray
+    faults: Faults = NO_FAULTS
+    num_written: int = eqx.field(static=True, default=3)
 
     @classmethod
     def draw(
@@ -85,6 +94,9 @@ class Hardware(eqx.Module):
         num_readings: int,
         spread: float,
         key: PRNGKeyArray,
+        *,
+        effects: Mapping[str, float] | None = None,
+        faults: Faults = NO_FAULTS,
         **numbers: float,
     ) -> Hardware:
         """Hardware with parameters drawn around the nominal ones.
@@ -94,59 +106,165 @@ class Hardware(eqx.Module):
             num_readings: in one sampling time.
             spread: of the parameters, as a fraction of their scales.
             key: of the parameters, and of noise, jitter and dropouts.
+            effects: values of extensions that the true plant has and `plant` has not, by name:
+                `gain_voltage`, `delay_voltage`, ...
+            faults: of sensor and actuator.
             numbers: `latency`, `jitter`, `dropout`; by default a tenth of dt, a thousandth
                 of dt, and zero.
         """
         params_key, rig_key = jax.random.split(key)
-        dt = float(plant.dt)
-        usual = {"latency": dt / 10, "jitter": dt / 1000, "dropout": 0.0} | numbers
+        dt, given = float(plant.dt), effects or {}
+        whole = extended(plant, list(given)) if given else plant
+        own = draw_params(plant, params_key, spread)
+        middle = jnp.asarray(plant.nominal)
+        scales = np.array([p.scale for p in plant.definition.parameters])
+
+        def true(own: Params) -> Params:
+            return params_from(whole, given)._replace(**own._asdict())
+
+        def delay(point: Array) -> Array | None:
+            return whole.delay(true(plant.Params(*(middle + spread * scales * point))))
+
         return cls(
-            plant=at_interval(plant, num_readings),
-            params=draw_params(plant, params_key, spread),
+            plant=at_interval(whole, num_readings),
+            params=true(own),
             key=rig_key,
-            **{name: jnp.asarray(value, float) for name, value in usual.items()},
+            faults=faults,
+            num_written=num_written(delay, len(scales), dt),
+            **usual_numbers(dt, numbers),
         )
 
-    def start(self) -> HardwareState:
-        """At rest, input zero, at the first reading."""
+    def start(self, noise: Float[Array, " output"] | None = None) -> HardwareState:
+        """At the plant's initial state, input zero, at the first reading.
+
+        Args:
+            noise: of the reading in standard deviations, in place of that of the key.
+        """
         plant = self.plant
         output = plant.output(plant.initial_state, self.params)
-        rest = jnp.asarray(safe_input(plant.definition))
-        shown = measure(plant, output, jax.random.fold_in(self.key, 0))
-        largest = jnp.abs(plant.true_output(plant.initial_state, self.params))
-        now, first = jnp.asarray(0.0), jnp.asarray(0)
-        return HardwareState(plant.initial_state, rest, rest, now, shown, first, largest)
+        rest, now = jnp.asarray(safe_input(plant.definition)), jnp.asarray(0.0)
+        noise = self._noise(jax.random.fold_in(self.key, 0)) if noise is None else noise
+        return HardwareState(
+            plant_state=plant.initial_state,
+            inputs=jnp.tile(rest, (self.num_written, 1)),
+            due=jnp.zeros(self.num_written),
+            acting=rest,
+            followed=output,
+            shown=sensed(plant, output + self.faults.bias(now), noise),
+            n=jnp.asarray(0),
+            largest=jnp.abs(plant.true_output(plant.initial_state, self.params)),
+        )
 
     def write(self, state: HardwareState, input: Float[Array, " input"]) -> HardwareState:
-        """State after an input was written; it acts after latency and jitter."""
+        """State after an input was written; it acts after latency and jitter, and in order."""
         late = jax.random.uniform(jax.random.fold_in(self.key, -1 - state.n), (), float, -1, 1)
-        delay = jnp.maximum(self.latency + self.jitter * late, 0.0)
-        return eqx.tree_at(lambda s: (s.written, s.delay), state, (input, delay))
+        due = jnp.maximum(self.latency + self.jitter * late, jnp.maximum(state.due[-1], 0.0))
+        written = (
+            jnp.concatenate([state.inputs[1:], input[None]]),
+            jnp.concatenate([state.due[1:], due[None]]),
+        )
+        return eqx.tree_at(lambda s: (s.inputs, s.due), state, written)
 
-    def advance(self, state: HardwareState) -> HardwareState:
-        """State one interval later, at the next reading."""
+    def advance(
+        self, state: HardwareState, noise: Float[Array, " output"] | None = None
+    ) -> HardwareState:
+        """State one interval later, at the next reading; noise as for `start`."""
         interval = self.plant.dt
-        before = jnp.clip(state.delay, 0.0, interval)  # how long the earlier input still acts
-        middle = self._moved(state.plant_state, state.acting, before)
-        after = self._moved(middle, state.written, interval - before)
+        before, now = state.n * interval, (state.n + 1) * interval
+        arriving = self._arriving(state)
+        # Up to the first input that arrives in the interval, and after it.
+        first = jnp.min(jnp.where(arriving > 0, arriving, interval), initial=interval)
+        middle, _ = self._moved(
+            state, state.plant_state, arriving, (jnp.asarray(0.0), first), before
+        )
+        after, acting = self._moved(state, middle, arriving, (first, interval), before)
         output = self.plant.output(after, self.params)
         noise_key, dropout_key = jax.random.split(jax.random.fold_in(self.key, state.n + 1))
-        measured = measure(self.plant, output, noise_key)
+        followed = self.faults.followed(output, state.followed, interval)
+        noise = self._noise(noise_key) if noise is None else noise
+        measured = sensed(self.plant, followed + self.faults.bias(now), noise)
         is_lost = jax.random.uniform(dropout_key) < self.dropout
         return HardwareState(
             plant_state=after,
-            acting=jnp.where(state.delay < interval, state.written, state.acting),
-            written=state.written,
-            delay=state.delay - interval,
-            shown=jnp.where(is_lost, state.shown, measured),
+            inputs=state.inputs,
+            due=state.due - interval,
+            acting=acting,
+            followed=followed,
+            shown=jnp.where(is_lost | self.faults.is_frozen(now), state.shown, measured),
             n=state.n + 1,
             largest=jnp.maximum(state.largest, jnp.abs(self.plant.true_output(after, self.params))),
         )
 
-    def _moved(self, state: Array, input: Array, duration: Array) -> Array:
-        """The plant's state after part of an interval."""
-        plant = eqx.tree_at(lambda p: p.dt, self.plant, duration)
-        return step(plant, state, input, self.params)
+    def _arriving(self, state: HardwareState) -> Float[Array, "later input"]:
+        """Time until each input but the oldest acts on the plant [s], by channel."""
+        delay, due = self.plant.delay(self.params), state.due[1:, None]
+        delay = jnp.zeros(state.inputs.shape[1]) if delay is None else jnp.maximum(delay, 0.0)
+        return due + delay[None]
+
+    def _moved(
+        self,
+        state: HardwareState,
+        plant_state: Float[Array, " state"],
+        arriving: Float[Array, "later input"],
+        part: tuple[Array, Array],
+        time: Float[Array, ""],
+    ) -> tuple[Float[Array, " state"], Float[Array, " input"]]:
+        """The plant's state after a part of the interval, and what acts at its end.
+
+        Where inputs change within the part, a linear input has their mean and first moment, as
+        in `simulation.delayed`.
+        """
+        begin, end = part
+        duration = end - begin
+        share = jnp.clip((end - arriving) / jnp.where(duration > 0, duration, 1.0), 0.0, 1.0)
+        share = jnp.where(arriving <= begin, 1.0, share)
+        change = jnp.diff(state.inputs, axis=0)
+        mean = state.inputs[0] + jnp.sum(share * change, axis=0)
+        half = jnp.sum(3 * share * (1 - share) * change, axis=0)
+        last = state.inputs[0] + jnp.sum(jnp.where(arriving <= end, change, 0.0), axis=0)
+        from_input, to_input, last = (
+            self.faults.acting(input, state.acting, time)
+            for input in (mean - half, mean + half, last)
+        )
+        moved = step(self.plant, plant_state, from_input, self.params, duration, to_input)
+        return moved, last
+
+    def reading_noise(self, num_readings: int) -> Float[Array, "reading output"]:
+        """The noise of the first readings, in standard deviations of the sensor."""
+        first = self._noise(jax.random.fold_in(self.key, 0))
+
+        def later(n: Array) -> Array:
+            return self._noise(jax.random.split(jax.random.fold_in(self.key, n))[0])
+
+        others = jax.vmap(later)(jnp.arange(1, num_readings))
+        return jnp.concatenate([first[None], others])
+
+    def _noise(self, key: PRNGKeyArray) -> Float[Array, " output"]:
+        return jax.random.normal(key, (len(self.plant.definition.outputs),), float)
+
+
+def usual_numbers(dt: float, given: Mapping[str, float]) -> dict[str, Float[Array, ""]]:
+    """Latency, jitter and dropout of a simulated rig, where they are not given."""
+    usual = {"latency": dt / 10, "jitter": dt / 1000, "dropout": 0.0}
+    return {name: jnp.asarray(value, float) for name, value in (usual | dict(given)).items()}
+
+
+def num_written(delay: Callable[[Array], Array | None], num_coordinates: int, dt: float) -> int:
+    """Number of inputs that a rig keeps until they act.
+
+    Args:
+        delay: of a plant at a point of [-1, 1]^num_coordinates; each adds its part to it.
+        num_coordinates: of the point.
+        dt: sampling time [s].
+    """
+    middle = delay(jnp.zeros(num_coordinates))
+    if middle is None:
+        return 3  # the one that acts, the one that comes, and a safe input after a trip
+    longest = np.asarray(middle)
+    for end in jnp.eye(num_coordinates):
+        there = np.array([delay(end), delay(-end)])
+        longest = longest + np.max(np.abs(there - np.asarray(middle)), axis=0)
+    return 3 + max(0, math.ceil(np.max(longest) / dt - 1e-9))
 
 
 def at_interval(plant: AbstractPlant, num_readings: int) -> AbstractPlant:
@@ -161,16 +279,14 @@ _write = eqx.filter_jit(Hardware.write)
 class SimulatedRig(AbstractRig):
     """Simulated hardware as a rig."""
 
-    starts_at_rest = True
-
     def __init__(
         self, plant: AbstractPlant, hardware: Hardware, num_readings: int, is_real_time: bool
     ) -> None:
         """A rig of a plant.
 
         Args:
-            plant: sampled as experiments are.
-            hardware: the physics between readings.
+            plant: as it is known, sampled as experiments are.
+            hardware: the physics between readings; its plant may be another.
             num_readings: in one sampling time.
             is_real_time: whether readings come in real time.
 
@@ -185,6 +301,8 @@ class SimulatedRig(AbstractRig):
                 f"latency and jitter must be less than the sampling time of {plant.dt:g} s: "
                 f"got {hardware.latency:g} and {hardware.jitter:g} s"
             )
+        start = hardware.plant.initial_state[: len(plant.initial_state)]
+        self.starts_at_rest = bool(jnp.all(start == plant.initial_state))
         self._hardware, self._interval = hardware, float(plant.dt) / num_readings
 
     def open(self) -> None:
@@ -215,7 +333,7 @@ class SimulatedRig(AbstractRig):
 
     def facts(self) -> Mapping[str, Any]:
         """True parameters and largest true outputs."""
-        names = names_of(self.description.parameters)
+        names = names_of(self._hardware.plant.definition.parameters)
         return {
             "simulated": True,
             "true_params": dict(zip(names, map(float, self._hardware.params), strict=True)),
@@ -245,7 +363,7 @@ class Runs(eqx.Module):
     memory: PyTree = None
 
 
-class NoFilter(eqx.Module):
+class NoFilter(AbstractFilter):
     """Lets every input pass, in place of a safety filter."""
 
     def start(self) -> None:
@@ -258,11 +376,6 @@ class NoFilter(eqx.Module):
         del measured
         return memory, proposed, jnp.asarray(False)
 
-    def is_over(self, memory: None) -> Bool[Array, ""]:
-        """Never."""
-        del memory
-        return jnp.asarray(False)
-
 
 NO_FILTER = NoFilter()
 
@@ -274,7 +387,7 @@ def run_batch(
     rules: Supervision,
     num_steps: int,
     num_readings: int,
-    safety_filter: SafetyFilter | NoFilter = NO_FILTER,
+    safety_filter: AbstractFilter = NO_FILTER,
 ) -> Runs:
     """One experiment for each hardware, as the real-time loop would run it.
 
@@ -288,25 +401,34 @@ def run_batch(
     """
 
     def one(hardware: Hardware) -> Runs:
-        return _one_run(hardware, excitation, rules, num_steps, num_readings, safety_filter)
+        return one_run(hardware, excitation, rules, num_steps, num_readings, safety_filter)
 
     return jax.vmap(one)(hardware)
 
 
-def _one_run(
+def one_run(
     hardware: Hardware,
     excitation: AbstractExcitation,
     rules: Supervision,
     num_steps: int,
     num_readings: int,
-    safety_filter: SafetyFilter | NoFilter,
+    safety_filter: AbstractFilter,
+    noise: Float[Array, "reading output"] | None = None,
+    key: PRNGKeyArray | None = None,
 ) -> Runs:
+    """One experiment; see `run_batch`.
+
+    Args:
+        key: of the excitation; default the hardware's.
+        noise: of all (num_steps + 1) num_readings + 1 readings in standard deviations; default
+            that of the hardware's key.
+    """
     interval = rules.dt / num_readings
     latency = jnp.round(hardware.latency / interval).astype(int)
 
-    def reading(carry: tuple, _: None) -> tuple[tuple, Array]:
+    def reading(carry: tuple, noise: Array | None) -> tuple[tuple, Array]:
         state, watch = carry
-        state = hardware.advance(state)
+        state = hardware.advance(state, noise)
         was_running = watch.trip == int(Trip.NONE)
         watch = check_reading(jnp, rules, watch, state.shown, interval)
         is_new = was_running & (watch.trip != int(Trip.NONE))
@@ -314,14 +436,17 @@ def _one_run(
         state = jax.tree.map(lambda a, b: jnp.where(is_new, a, b), safe, state)
         return (state, watch), state.shown
 
-    def hold(state: HardwareState, watch: Watch, input: Array) -> tuple[tuple, Array]:
+    def hold(
+        state: HardwareState, watch: Watch, input: Array, noise: Array | None
+    ) -> tuple[tuple, Array]:
         """The readings of one sampling time, and the one at which the input begins to act."""
         now = state.shown
         carry = hardware.write(state, input), watch
-        carry, shown = jax.lax.scan(reading, carry, None, length=num_readings)
+        carry, shown = jax.lax.scan(reading, carry, noise, length=num_readings)
         return carry, jnp.concatenate([now[None], shown])[latency]
 
-    def sample(carry: tuple, _: None) -> tuple[tuple, tuple]:
+    @jax.checkpoint  # a gradient keeps the states at sampling instants alone
+    def sample(carry: tuple, noise: Array | None) -> tuple[tuple, tuple]:
         state, watch, player, memory, count = carry
         measured = watch.reading
         watch = check_sample(jnp, rules, watch)
@@ -330,21 +455,25 @@ def _one_run(
         watch = tripped(jnp, watch, safety_filter.is_over(memory), Trip.UNEXPLAINED)
         watch, input = allowed(jnp, rules, watch, proposed)
         player = excitation.applied(player, input)
-        (state, watch), acted_on = hold(state, watch, input)
+        (state, watch), acted_on = hold(state, watch, input, noise)
         return (state, watch, player, memory, count + is_changed), (input, acted_on)
 
-    state = hardware.start()
+    first = by_sample = last = None
+    if noise is not None:
+        first, later = noise[0], noise[1:].reshape(num_steps + 1, num_readings, -1)
+        by_sample, last = later[:-1], later[-1]
+    state = hardware.start(first)
     # A signal is made for the sampling time, not for the interval between two readings.
     plant = eqx.tree_at(lambda p: p.dt, hardware.plant, jnp.asarray(rules.dt))
-    player = excitation.init(plant, num_steps, hardware.key)
+    player = excitation.init(plant, num_steps, hardware.key if key is None else key)
     watch = Watch.start(jnp, rules, state.shown)
     carry = state, watch, player, safety_filter.start(), jnp.asarray(0)
     (state, watch, _, memory, count), (inputs, measured) = jax.lax.scan(
-        sample, carry, None, length=num_steps
+        sample, carry, by_sample, length=num_steps
     )
     trip, safe = watch.trip, jnp.asarray(rules.safe_input, float)
-    (state, _), last = hold(state, watch, safe)
-    measured = jnp.concatenate([measured, last[None]])
+    (state, _), last_acted_on = hold(state, watch, safe, last)
+    measured = jnp.concatenate([measured, last_acted_on[None]])
     is_over = is_violation(state.largest[None], jnp.asarray(rules.critical))
     return Runs(state.largest, is_over, trip, count, inputs, measured, memory)
 
@@ -354,12 +483,12 @@ def drawn_hardware(
     num_readings: int,
     spread: float,
     keys: Key[Array, " run"],
-    **numbers: float,
+    **options: Any,
 ) -> Hardware:
     """Hardware for each key, with the same plant as in `run_episodes`; see `Hardware.draw`."""
 
     def draw(key: PRNGKeyArray) -> Hardware:
-        return Hardware.draw(plant, num_readings, spread, key, **numbers)
+        return Hardware.draw(plant, num_readings, spread, key, **options)
 
     return eqx.filter_vmap(draw)(keys)
 
@@ -375,7 +504,7 @@ def evaluate_on_rig(
     hardware: Hardware,
     rules: Supervision,
     num_steps: int,
-    safety_filter: SafetyFilter | NoFilter = NO_FILTER,
+    safety_filter: AbstractFilter = NO_FILTER,
 ) -> tuple[Episodes, Runs]:
     """One experiment for each hardware, scored as `run_episodes` scores those on plants.
 
@@ -400,8 +529,9 @@ def _scored(plant: AbstractPlant, params: Params, runs: Runs) -> Episodes:
     """Every run as an experiment; its safety is that of all readings, not only of samples."""
 
     def score(params: Params, run: Runs) -> Episodes:
+        known = plant.Params(*(getattr(params, name) for name in plant.Params._fields))
         time = jnp.arange(len(run.measured)) * plant.dt
-        return scored(plant, params, Trajectory(time, run.inputs, run.measured, run.measured))
+        return scored(plant, known, Trajectory(time, run.inputs, run.measured, run.measured))
 
     episodes = jax.vmap(score)(params, runs)
     safety = runs.is_violation, runs.max_abs_output

@@ -120,7 +120,8 @@ class _Writer:
             collected.append(given[num_carry:])
         if params["reverse"]:
             collected.reverse()
-        stacked = [self._operation("stack", list(c), {"axis": 0}) for c in zip(*collected)]
+        series = zip(*collected, strict=True)
+        stacked = [self._operation("stack", list(rows), {"axis": 0}) for rows in series]
         return [*carry, *stacked]
 
     def program(self, result: int) -> Program:

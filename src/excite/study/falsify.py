@@ -43,6 +43,9 @@ from ..policy import POLICY_ENDING, Policy, policy_path, read_policy, shown_near
 from ..record import Record
 from ..report.numbers import number
 from ..report.tables import html_table, text_table
+from ..rig.falsification import OnRig
+from ..rig.filter import SafetyFilter
+from ..rig.simulated import NO_FILTER
 from ..safety import watched_levels
 from ..simulation import Experiment, Trajectory, experiment_length, run_episode
 from ..training.checkpoint import Progress
@@ -79,6 +82,8 @@ class Falsification:
         noise: that noise, in standard deviations.
         noise_record: its experiment.
         seed: of the search.
+        rig: whether experiments were made on the plant's simulated rig.
+        filter: whether they were made there behind the predictive safety filter.
     """
 
     plant: PlantDescription
@@ -98,6 +103,8 @@ class Falsification:
     noise: Float[np.ndarray, "sample output"]
     noise_record: Record
     seed: int
+    rig: bool = False
+    filter: bool = False
 
     @property
     def is_safe(self) -> bool:
@@ -117,6 +124,8 @@ class Falsification:
             },
             "num_steps": self.num_steps,
             "uncertainty": {name: list(ends) for name, ends in self.ranges.items()},
+            "rig": self.rig,
+            "filter": self.filter,
             "seed": self.seed,
             "experiments": sum(stage.experiments for stage in self.stages),
             "violations": sum(stage.violations for stage in self.stages),
@@ -173,7 +182,10 @@ class Falsification:
         return html_table(*self._table()) + "".join(f"<p>{line}</p>" for line in self._sentences())
 
     def _table(self) -> tuple[str, list[str], list[list[str]]]:
-        title = f"{self.excitation} on {self.plant.name}: largest output over its critical level"
+        where = on_rig(self.rig, self.filter)
+        title = (
+            f"{self.excitation} on {self.plant.name}{where}: largest output over its critical level"
+        )
         rows = [
             [s.name, f"{s.experiments:,}", f"{s.violations:,}", shown_nearness(s.nearness)]
             for s in self.stages
@@ -250,6 +262,8 @@ def falsify(
     steps: int | None = None,
     budget: int = 10_000,
     seed: int = 0,
+    rig: bool = False,
+    filter: bool = False,
     progress: Progress = lambda *_: None,
 ) -> Falsification:
     """Searches a declared uncertainty for the plant on which an excitation is least safe.
@@ -272,6 +286,9 @@ def falsify(
         steps: length [samples]; default 500, or that of a policy or a signal.
         budget: number of simulated experiments, about.
         seed: of the search.
+        rig: whether experiments are made on the plant's simulated rig, with its latency, readings
+            between the samples and supervisor.
+        filter: whether they are made there behind the predictive safety filter.
         progress: called with a text, how much is done, and the total.
 
     Raises:
@@ -279,6 +296,8 @@ def falsify(
             critical level.
         TypeError: for an argument of another type.
     """
+    if filter and not rig:
+        raise ValueError("the safety filter is part of a rig: filter (--filter) needs rig (--rig)")
     policy = _policy_of(excitation)
     if plant is None:
         if policy is None:
@@ -310,13 +329,12 @@ def falsify(
         warnings.warn(f"{name}: {origin['warning']}", stacklevel=2)
     num_steps = experiment_length(found, name, steps, isinstance(excitation, Record))
     usual_spread, usual = _trained_in(policy, chosen)
-    box = Uncertainty.of(
-        chosen,
-        usual_spread if spread is None else spread,
-        usual if uncertainty is None else uncertainty,
-    )
-    effort = Effort.of(budget)
-    play = OnPlant(box, found, num_steps)
+    reach = usual_spread if spread is None else spread
+    box = Uncertainty.of(chosen, reach, usual if uncertainty is None else uncertainty)
+    effort, play = Effort.of(budget), OnPlant(box, found, num_steps)
+    if rig:
+        safety_filter = SafetyFilter.of(chosen, reach) if filter else NO_FILTER
+        play = OnRig.of(box, found, num_steps, safety_filter)
     result = search(play, effort, seed, progress)
     with_noise = result.worst_noise or result.worst
 
@@ -328,9 +346,12 @@ def falsify(
         own = jax.tree.map(lambda leaf: leaf[0], case)
         (worst, params), key = box.at(own.point), int(own.seed)
         experiment = Experiment(worst, params, found, name, origin, num_steps, key)
-        run = run_episode(worst, params, found, num_steps, experiment.key, own.noise)
+        if isinstance(play, OnRig):
+            run, size = play.replayed(own)
+        else:
+            run = run_episode(worst, params, found, num_steps, experiment.key, own.noise)
+            size = float(nearness(worst, run.outputs))
         values = dict(zip(box.names, box.values(own.point).tolist(), strict=True))
-        size = float(nearness(worst, run.outputs))
         tuned = with_nominal(worst, {n: float(x) for n, x in params._asdict().items()})
         return experiment.record(_until_diverged(run)), size, values, tuned
 
@@ -354,6 +375,8 @@ def falsify(
         noise=np.asarray(_noise(play, with_noise)),
         noise_record=noise_record,
         seed=seed,
+        rig=rig,
+        filter=filter,
     )
 
 
@@ -361,7 +384,7 @@ def _is_signal(word: str) -> bool:
     return word.removeprefix(LOOP) in EXCITATIONS or word.endswith(SIGNAL_ENDINGS)
 
 
-def _noise(play: OnPlant, cases: Cases) -> Float[Array, "sample output"]:
+def _noise(play: OnPlant | OnRig, cases: Cases) -> Float[Array, "sample output"]:
     """Of the first case, in standard deviations."""
     return (
         play.noise(jax.tree.map(lambda leaf: leaf[0], cases))
@@ -391,6 +414,11 @@ def _until_diverged(run: Trajectory) -> Trajectory:
     count = len(run.time) if np.all(is_finite) else max(2, int(np.argmin(is_finite)))
     time, inputs, *outputs = run.time[:count], run.inputs[: count - 1], run.measured, run.outputs
     return Trajectory(time, inputs, *(rows[:count] for rows in outputs))
+
+
+def on_rig(rig: bool, filter: bool) -> str:
+    """Where experiments were made, after the plant's name; empty for the plant itself."""
+    return "'s simulated rig" * rig + " behind the safety filter" * filter
 
 
 def _word(excitation: ExcitationLike) -> str:
