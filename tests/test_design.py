@@ -19,7 +19,9 @@ from excite.record import read_record
 from excite.training.design import design
 from excite.training.signals import (
     CLAIRVOYANT,
+    FULL_MARGIN,
     ROBUST,
+    _margin,
     clairvoyant_signals,
     robust_signal,
     signal_env,
@@ -48,8 +50,17 @@ def test_a_clairvoyant_signal_beats_the_chirp_on_its_own_plant_and_is_safe():
         assert not episodes.is_violation[0]
         prior = 3 * np.log(1 / prior_sd_of(0.3) ** 2)
         np.testing.assert_allclose(design.worth[i] + prior, own[0], rtol=1e-4)
-    assert np.all(design.nearness < 1)
+    assert np.all(design.nearness < CLAIRVOYANT.near)
+    assert np.all(design.nearness > CLAIRVOYANT.near - 2e-3)  # the whole level is used
     np.testing.assert_array_equal(design.worth, design.worth_by_start.max(axis=1))
+
+
+def test_the_margin_of_a_search_closes_at_its_end():
+    margins = [float(_margin(CLAIRVOYANT, i, FULL_MARGIN)) for i in range(0, 3001, 250)]
+    assert margins[:9] == [CLAIRVOYANT.margin] * 9
+    assert np.all(np.diff(margins[8:]) > 0)
+    assert margins[-1] == pytest.approx(FULL_MARGIN[1])
+    assert float(_margin(CLAIRVOYANT, 2999, None)) == CLAIRVOYANT.margin
 
 
 def test_a_search_gives_the_same_signal_again():

@@ -32,7 +32,7 @@ from excite.report.figures import (
     information_figure,
 )
 from excite.report.numbers import digits_for, number
-from excite.report.rows import Difference, EstimateSummary, Row, StudyFacts
+from excite.report.rows import CountsBySeed, Difference, EstimateSummary, Row, StudyFacts
 from excite.report.study_figures import agents_figure, curves_figure
 from excite.report.study_table import StudyTable, footnotes
 from excite.report.tables import fitting_tables, html_table, text_table
@@ -237,8 +237,41 @@ def test_footnotes_tell_what_was_inferred_and_where_rows_were_published():
     assert text.startswith("# A title\n")
     assert all(f"\n{note}\n" in text for note in notes)
     bare = StudyTable(rows=ROWS, study=StudyFacts.model_validate(BARE))
-    assert len(footnotes(bare.study)) == 1
+    assert len(footnotes(bare.study)) == 2
     assert bare.markdown().startswith("# bare\n")
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({}, "parameters within ± 30 %, all else as in the plant's description)"),
+        ({"rig": {"filter": False}}, "all else as on its simulated rig)"),
+        ({"uncertainty": {"delay_voltage": [0, 0.1], "initial_state": "2%"}},
+         "± 30 %, in addition delay_voltage 0 to 0.1, initial_state ± 2 %)"),
+        ({"agents": {"a": {"method": "ppo"}}, "seeds": 3}, "its 3 seeds share the 50 plants"),
+        ({"agents": {"a": {"method": "ppo"}}, "seeds": 3, "safety_episodes": 2000},
+         "each seed on 2,000 plants of its own"),
+    ],
+)  # fmt: skip
+def test_a_count_of_violations_comes_with_its_conditions(settings, words):
+    notes = footnotes(StudyFacts.model_validate({**STUDY, "note": "First.", **settings}))
+    assert notes[0] == "First."
+    (note,) = (note for note in notes if note.startswith("Violations"))
+    assert words in note
+
+
+@pytest.mark.parametrize(
+    ("counts", "cell"),
+    [
+        ((0, 0, 0), "0/2000 in 3 of 3 seeds"),
+        ((7, 0, 2), "0–2–7 of 2000 (3 seeds)"),
+        ((1, 0, 2, 4), "0–1.5–4 of 2000 (4 seeds)"),
+    ],
+)
+def test_violations_of_several_seeds_are_shown_by_seed(counts, cell):
+    by_seed = CountsBySeed(evaluations=2000, violations=counts, own_plants=True)
+    header, (cells, *_) = table_of([ROWS[0].model_copy(update={"by_seed": by_seed})]).cells()
+    assert cells[header.index("violations (95 %)")] == cell
 
 
 def test_csv_reads_back_to_the_numbers_of_the_rows():

@@ -12,18 +12,22 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 import scipy.stats
 from cluster import Cluster, wait_for
 from commands import PATIENCE, excite
 
+from excite.environment import run_episodes
+from excite.excitation import PolicyExcitation
+from excite.files import write_json
 from excite.policy import read_policy
 from excite.report.rows import SeedMetrics
 from excite.study import table
 from excite.study.engine import local_engine
 from excite.study.folder import seed_folder, study_of
-from excite.study.run import _live, _require_trainer, opened, run_tasks
+from excite.study.run import _live, _require_trainer, opened, run_study, run_tasks
 from excite.study.spec import read_study, study_from
 from excite.study.table import (
     across_seeds,
@@ -565,6 +569,31 @@ def test_no_study_is_one_sentence(tmp_path):
     assert "nowhere: no such folder" in done.stderr
 
 
+def test_violations_of_trained_policies_are_counted_on_plants_of_each_seed(run, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(run, folder)
+    study = study_from({**study_of(run).model_dump(), "safety_episodes": 6}, "settings")
+    write_json(folder / "study.json", study.model_dump())
+    with pytest.raises(ValueError, match="not finished, its violations by seed"):
+        study_table(folder)
+    done = []
+    table = run_study(study, folder, workers=1, on_done=done.append)
+    names = [f"{agent} seed {seed}" for seed in range(2) for agent in ("RL(all)", "RL(K_pu)")]
+    assert sorted(done) == sorted(f"{name}, violations" for name in names)  # nothing is trained
+    plants = []
+    for seed in range(2):
+        policy = read_policy(seed_folder(folder, "RL(all)", seed) / "policy.safetensors")
+        keys = jax.random.split(jax.random.fold_in(jax.random.key(study.seed), seed + 1), 6)
+        episodes = run_episodes(study.build_plant(), PolicyExcitation.of(policy), 60, 0.3, keys)
+        plants.append(np.asarray(episodes.params.J_p))
+        (row,) = (r for r in table.rows if (r.method, r.estimator) == ("RL(all)", "arx-rls"))
+        assert row.by_seed is not None
+        assert row.by_seed.violations[seed] == int(episodes.is_violation.sum())
+        assert (row.by_seed.evaluations, row.by_seed.own_plants) == (6, True)
+    assert not np.isin(*plants).any()
+    assert "each seed on 6 plants of its own" in table.markdown()
+
+
 # Rows across seeds
 
 
@@ -596,6 +625,7 @@ def test_means_are_over_viable_seeds_and_counts_over_all():
     assert row["max_abs_output"]["mean"] == 4.0
     assert (row["viable_seeds"], row["seeds"]) == (2, 3)
     assert (row["violations"], row["evaluations"]) == (5, 30)
+    assert row["by_seed"] == {"evaluations": 10, "violations": [0, 4, 1], "own_plants": False}
     assert (row["failed"], row["failures"]) == (3, {"x": 3})
     assert row["train_seconds"] == 180.0
 

@@ -64,11 +64,15 @@ from .options import (
     show_default=True,
     help="Seed of the search.",
 )
-@click.option("--starts", type=WholeNumber(1), help="Starts of a search by gradient; default 4.")
+@click.option(
+    "--starts",
+    type=WholeNumber(1),
+    help="Starts of a search by gradient; default 4 (robust) or 8 (clairvoyant).",
+)
 @click.option(
     "--updates",
     type=WholeNumber(1),
-    help="Gradient updates; default 1000 (robust) or 1500 (clairvoyant).",
+    help="Gradient updates; default 1000 (robust) or 3000 (clairvoyant).",
 )
 @click.option("--trials", type=WholeNumber(1), help="Trials of a tuning; default 400.")
 @plot_option

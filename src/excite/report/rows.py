@@ -90,6 +90,15 @@ class LargestOutput(MeanSd):
     unit: str
 
 
+class CountsBySeed(Saved):
+    """Experiments of each of an agent's seeds that reached a critical level."""
+
+    evaluations: Count
+    violations: tuple[Count, ...]
+    own_plants: Annotated[bool, Strict()]
+    """Whether every seed has plants of its own; otherwise the seeds share them."""
+
+
 class RigCounts(Saved):
     """Experiments on a simulated rig that the supervisor ended, and the safety filter's part."""
 
@@ -116,6 +125,7 @@ class Row(Saved):
     failures: dict[str, Count]
     violations: Count
     violation_rate: Rate
+    by_seed: CountsBySeed | None = None
     on_rig: RigCounts | None = None
     max_abs_output: LargestOutput
     log_det_information: Number
@@ -222,6 +232,7 @@ class ClairvoyantFacts(Saved):
 
     plants: int
     starts: int
+    updates: int = 1500
 
 
 class StudyFacts(Saved):
@@ -240,12 +251,14 @@ class StudyFacts(Saved):
     estimators: dict[str, Options]
     agents: dict[str, AgentFacts] = {}
     seeds: int = 1
+    safety_episodes: int | None = None
     decision: Options = {}
     training: Options = {}
     gradient: Options = {}
     clairvoyant: ClairvoyantFacts | None = None
     lengths: list[int] = []
     rig: Options | None = None
+    note: str = ""
     inferred: list[str] = []
     ours: list[str] = []
     reference: dict[str, PublishedRow] = {}

@@ -6,6 +6,7 @@ import csv
 import io
 import math
 import re
+import statistics
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -154,6 +155,8 @@ class StudyTable(Saved):
         if _is_trained(rows):
             columns["viable_seeds"] = [_known(row.viable_seeds) for row in rows]
             columns["seeds"] = [_known(row.seeds) for row in rows]
+            if any(row.by_seed is not None for row in rows):
+                columns |= _columns_by_seed(rows)
             columns["train_seconds"] = [_known(row.train_seconds) for row in rows]
         for key in sorted(RigCounts.model_fields):
             if getattr(rows[0].on_rig, key, None) is not None:
@@ -183,6 +186,20 @@ class StudyTable(Saved):
         labels = [["method", "estimator"], *([row.method, row.estimator] for row in self.rows)]
         numbers = csv.reader(csv_text(self.columns()).splitlines())
         return _csv([*pair, *values] for pair, values in zip(labels, numbers, strict=True))
+
+
+def _columns_by_seed(rows: Sequence[Row]) -> dict[str, list[float]]:
+    """Smallest, median and largest number of violations of a seed, and its evaluations."""
+    counts = [row.by_seed for row in rows]
+    ranges = [(math.nan,) * 3 if c is None else _min_median_max(c.violations) for c in counts]
+    names = [f"violations_by_seed_{part}" for part in ("min", "median", "max")]
+    evaluations = [math.nan if c is None else c.evaluations for c in counts]
+    columns = {n: list(values) for n, values in zip(names, zip(*ranges, strict=True), strict=True)}
+    return {**columns, "evaluations_by_seed": evaluations}
+
+
+def _min_median_max(values: Sequence[int]) -> tuple[float, float, float]:
+    return min(values), statistics.median(values), max(values)
 
 
 def _known(value: float | None) -> float:
@@ -220,10 +237,9 @@ def _cells(rows: Sequence[Row], row: Row) -> list[str]:
         if row.viable_seeds != row.seeds and error.all_seeds is not None:
             text += f" (all seeds: {mean_sd(error.all_seeds.mean, error.all_seeds.sd)})"
         cells += [text, number(row.cramer_rao_percent[name], 2)]
-    low, high = row.violation_rate.ci95
     cells += [
         mean_sd(row.max_abs_output.mean, row.max_abs_output.sd),
-        f"{row.violations}/{row.evaluations} ({100 * low:.1f}–{100 * high:.1f} %)",
+        _violations(row),
         f"{row.failed}/{row.evaluations}",
         *_rig_cells(row.on_rig, row.evaluations).values(),
         number(row.log_det_information, 4),
@@ -231,6 +247,19 @@ def _cells(rows: Sequence[Row], row: Row) -> list[str]:
     if any(other.d_efficiency is not None for other in rows):
         cells.append(number(row.d_efficiency, 2))
     return cells + _training_cells(row) * _is_trained(rows)
+
+
+def _violations(row: Row) -> str:
+    """Count and interval of the rate; for several seeds, that of the seeds."""
+    counts = row.by_seed
+    if counts is None:
+        low, high = row.violation_rate.ci95
+        return f"{row.violations}/{row.evaluations} ({100 * low:.1f}–{100 * high:.1f} %)"
+    seeds = len(counts.violations)
+    if not any(counts.violations):
+        return f"0/{counts.evaluations} in {seeds} of {seeds} seeds"
+    parts = (f"{value:g}" for value in _min_median_max(counts.violations))
+    return f"{'–'.join(parts)} of {counts.evaluations} ({seeds} seeds)"
 
 
 def _rig_cells(seen: RigCounts | None, count: int) -> dict[str, str]:
@@ -268,7 +297,7 @@ def _published_cells(rows: Sequence[Row], row: Row, published: PublishedRow) -> 
 
 def footnotes(study: StudyFacts) -> list[str]:
     """The footnotes of the table."""
-    notes = [
+    notes = [study.note] * bool(study.note) + [
         "Errors are relative errors in percent, mean ± standard deviation over the estimates "
         "that did not fail. The bound is the mean Cramér-Rao bound of the same data, a standard "
         "deviation: the mean error of an efficient estimator is 0.80 of it.",
@@ -277,23 +306,23 @@ def footnotes(study: StudyFacts) -> list[str]:
         notes.append(
             f"Agents: cross-seed mean ± standard deviation of the mean errors of {study.seeds} "
             f"training seeds, {study.episodes} evaluation episodes each, over viable seeds (a "
-            "seed has collapsed where the RMS input is below 1 % of its limit); violations and "
-            "failures over all evaluations of all seeds. The policy is evaluated without "
-            "exploration noise."
+            "seed has collapsed where the RMS input is below 1 % of its limit); failures over "
+            "all evaluations of all seeds. The policy is evaluated without exploration noise."
         )
+    notes.append(violations_note(study))
     if study.clairvoyant:
         count = min(study.clairvoyant.plants, study.episodes)
         notes.append(
             "log det is that of the relative Fisher information. The D-efficiency compares it, on "
-            f"the first {count} plants, with signals designed for each plant as if its parameters "
-            "were known (local search)."
+            f"the first {count} plants, with the best signals that our search found for each plant "
+            f"as if its parameters were known ({study.clairvoyant.starts} starts, "
+            f"{study.clairvoyant.updates:,} updates); it is no upper limit."
         )
     if study.uncertainty:
-        box = ", ".join(f"{name} {_range(ends)}" for name, ends in study.uncertainty.items())
         signals = "; the clairvoyant signals are for plants of the spread alone"
         notes.append(
-            f"The plants differ in more than the spread: {box}; the estimators and the bound take "
-            f"only the parameters as unknown{signals * bool(study.clairvoyant)}."
+            "The estimators and the bound take only the parameters as unknown"
+            f"{signals * bool(study.clairvoyant)}."
         )
     if study.rig:
         notes.append(
@@ -310,9 +339,38 @@ def footnotes(study: StudyFacts) -> list[str]:
     return notes
 
 
-def _range(given: object) -> str:
-    """A range of a declared uncertainty as it is written, or its two ends."""
-    return " to ".join(f"{x:g}" for x in given) if isinstance(given, list | tuple) else str(given)
+def violations_note(study: StudyFacts) -> str:
+    """What the violations of a table were counted on, in words."""
+    declared = f"parameters within ± {100 * study.spread:g} %"
+    if study.uncertainty:
+        ranges = ", ".join(f"{name} {_range(value)}" for name, value in study.uncertainty.items())
+        declared += f", in addition {ranges}"
+    else:
+        where = "on its simulated rig" if study.rig else "in the plant's description"
+        declared += f", all else as {where}"
+    note = (
+        f"Violations: experiments that reached a critical level, on plants drawn at random "
+        f"({declared}). They are sampled: 'excite falsify' searches for the worst plant."
+    )
+    if study.agents and study.seeds > 1 and study.safety_episodes is None:
+        note += (
+            f" Those of an agent are given by seed (smallest, median, largest); its {study.seeds} "
+            f"seeds share the {study.episodes} plants."
+        )
+    elif study.agents and study.safety_episodes is not None:
+        note += (
+            " Those of an agent are given by seed (smallest, median, largest), each seed on "
+            f"{study.safety_episodes:,} plants of its own."
+        )
+    return note
+
+
+def _range(value: object) -> str:
+    """A declared range as a person would write it."""
+    if isinstance(value, list | tuple):
+        return " to ".join(f"{part:g}" for part in value)
+    text = str(value)
+    return f"± {text.removesuffix('%')} %" if text.endswith("%") else text
 
 
 def _latex_row(cells: Sequence[str]) -> str:

@@ -184,6 +184,6 @@ class GuardFilter(AbstractFilter):
         after = guard.moved(jnp, self.rules, model, belief, input)
         return after, input, belief.num_braked > 0
 
-    def is_over(self, belief: Belief) -> Bool[Array, ""]:
-        """Whether the experiment ends."""
-        return belief.is_over
+    def is_over(self, memory: Belief) -> Bool[Array, ""]:
+        """Whether the brake has done its work."""
+        return memory.is_over

@@ -60,6 +60,7 @@ _REMEDIES = {
     "run.json": "if the folder is of this study, delete the file: 'excite study run' writes it",
     "clairvoyant.json": "delete it: 'excite study run' designs them again",
     "methods.json": "delete it: 'excite study run' computes it again",
+    "safety.json": "delete it: 'excite study run' counts the violations again",
     "table.json": "delete it: 'excite study run' writes it again",
 }
 

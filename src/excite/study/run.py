@@ -36,7 +36,7 @@ from ..plant import AbstractPlant
 from ..policy import POLICY_ENDING, read_policy
 from ..record.read import SIGNAL_ENDINGS
 from ..report.frontier import frontier_figure, lengths_figure
-from ..report.rows import Rows
+from ..report.rows import CountsBySeed, Rows
 from ..report.study_figures import agents_figure, curves_figure
 from ..report.study_table import StudyTable, differences_csv
 from ..training.checkpoint import Progress
@@ -44,23 +44,28 @@ from .catalogue import study_path
 from .cluster import dask_engine
 from .engine import Engine, local_engine, run
 from .example_episodes import episodes_data, example_episodes
-from .folder import agent_settings, fingerprint, read_json, seed_folder, study_of
+from .folder import advice, agent_settings, fingerprint, read_json, seed_folder, study_of
 from .methods import compared, method_rows
 from .pool import num_cores
 from .progress import read_progress, read_search, remove_progress
 from .spec import Study, read_study
 from .table import best_seeds, learning_curves, study_table, too_near
-from .tasks import clairvoyant_task, methods_task, seed_task
+from .tasks import clairvoyant_task, methods_task, safety_task, seed_task
 from .worker import OF_PPO
 
 KIND = "excite study"
-FREE = {"name", "title", "inferred", "ours", "reference", "source"}
-FREE |= {"agents", "decision", "training", "gradient", "seeds"}
+FREE = {"name", "title", "note", "inferred", "ours", "reference", "source"}
+FREE |= {"agents", "decision", "training", "gradient", "seeds", "safety_episodes"}
 """Settings that may change when a study is resumed; each seed stores its settings."""
 
 _Target = tuple[str, str, int]
 
-_TASKS = {"methods": methods_task, "clairvoyant": clairvoyant_task, "seed": seed_task}
+_TASKS = {
+    "methods": methods_task,
+    "clairvoyant": clairvoyant_task,
+    "seed": seed_task,
+    "safety": safety_task,
+}
 
 
 class StudyFailedError(RuntimeError):
@@ -359,6 +364,12 @@ def _compared(study: Study) -> dict[str, Any]:
 def _is_finished(study: Study, plant: AbstractPlant, target: _Target, folder: Path) -> bool:
     """Whether a task's results exist; ValueError where they are of another training."""
     kind, agent, seed = target
+    if kind == "safety":
+        place = seed_folder(folder, agent, seed)
+        if not all((place / name).is_file() for name in ("metrics.json", "safety.json")):
+            return False
+        counts = CountsBySeed.read(place / "safety.json", advice(place / "safety.json"))
+        return counts.evaluations == study.safety_episodes
     if kind != "seed":
         return (folder / f"{kind}.json").is_file()
     path = seed_folder(folder, agent, seed) / "metrics.json"
@@ -434,8 +445,24 @@ def run_tasks(
         failures = {}
         for kind, function in _TASKS.items():
             chosen = {n: t for n, t in tasks.items() if targets[n][0] == kind}
+            if kind == "safety":
+                chosen = _with_policies(chosen, targets, folder)
             failures |= run(function, chosen, engine, on_done=finished, on_tick=tick)
         return failures
+
+
+def _with_policies(
+    tasks: Mapping[str, dict[str, Any]], targets: Mapping[str, _Target], folder: Path
+) -> dict[str, dict[str, Any]]:
+    """The tasks whose seed is trained, with its policy."""
+    found = {}
+    for name, task in tasks.items():
+        _, agent, seed = targets[name]
+        place = seed_folder(folder, agent, seed)
+        if (place / "metrics.json").is_file():
+            policy = (place / "policy.safetensors").read_bytes()
+            found[name] = {**task, "seed": seed, "policy": policy}
+    return found
 
 
 def _names(study: Study) -> dict[str, _Target]:
@@ -445,6 +472,9 @@ def _names(study: Study) -> dict[str, _Target]:
         names["clairvoyant"] = ("clairvoyant", "", 0)
     for seed in range(study.seeds):
         names |= {f"{agent} seed {seed}": ("seed", agent, seed) for agent in study.agents}
+        if study.safety_episodes is not None:
+            for agent in study.agents:
+                names[f"{agent} seed {seed}, violations"] = ("safety", agent, seed)
     return names
 
 
@@ -471,10 +501,10 @@ def _missing(
 def _keep(target: _Target, folder: Path, result: Any) -> None:
     """Writes the result of a task; the file that marks it as finished is the last."""
     kind, agent, seed = target
-    if kind != "seed":
-        write_json(folder / f"{kind}.json", result)
-        return
     place = seed_folder(folder, agent, seed)
+    if kind != "seed":
+        write_json((place if kind == "safety" else folder) / f"{kind}.json", result)
+        return
     write_bytes(place / "policy.safetensors", result["policy"])
     columns = {name: [row[name] for row in result["curve"]] for name in result["curve"][0]}
     write_bytes(place / "curve.csv", csv_text(columns).encode())
@@ -486,9 +516,10 @@ def _keep(target: _Target, folder: Path, result: Any) -> None:
 def _live(study: Study, target: _Target, folder: Path) -> tuple[float, str]:
     """Progress of a task, and its newest validation of the policy."""
     kind, agent, seed = target
-    if kind != "seed":
-        return float((folder / f"{kind}.json").is_file()), ""
     place = seed_folder(folder, agent, seed)
+    if kind != "seed":
+        where = place if kind == "safety" else folder
+        return float((where / f"{kind}.json").is_file()), ""
     if (place / "metrics.json").is_file():
         return 1.0, ""
     row = read_progress(place)

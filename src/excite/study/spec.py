@@ -34,6 +34,7 @@ from ..plant.uncertainty import Uncertainty
 from ..policy import POLICY_ENDING
 from ..record.read import SIGNAL_ENDINGS
 from ..training.settings import GradientSettings, PPOSettings
+from ..training.signals import CLAIRVOYANT, CLAIRVOYANT_STARTS
 from .agent import REWARD_TABLES, Agent, AgentSettings, DecisionSettings
 from .catalogue import study_path
 from .settings import Choice, Count, EstimatorSettings, Magnitude, Settings, checked, sentence
@@ -58,10 +59,12 @@ class ClairvoyantSettings(Settings):
     Attributes:
         plants: for how many of the evaluation episodes' plants.
         starts: of the search for each.
+        updates: steps of each search.
     """
 
     plants: Count = 32
-    starts: Count = 4
+    starts: Count = CLAIRVOYANT_STARTS
+    updates: Count = CLAIRVOYANT.num_updates
 
 
 class RigSettings(Settings):
@@ -113,11 +116,15 @@ class Study(Settings):
         methods, estimators: by the name that tables show.
         agents: to be trained, by the name that tables show.
         seeds: trainings of each agent, with the seeds 0, 1, ...
+        safety_episodes: of every seed of an agent, on plants that no other seed has, to count
+            violations alone; without it they are counted in the `episodes`, whose plants the
+            seeds share.
         decision: settings of all agents.
         training, gradient: hyper-parameters of all agents trained by PPO, and by gradient.
         clairvoyant: signals as a reference for the methods.
         lengths: numbers of steps at which every method's Cramér-Rao bound is computed.
         rig: where experiments are made on a simulated rig.
+        note: sentences that come first in the text under the table.
         inferred: settings that the source of the study does not state, in words.
         ours: settings that differ from the source's, in words.
         reference: published rows by method, shown in tables for comparison.
@@ -137,12 +144,14 @@ class Study(Settings):
     estimators: dict[str, EstimatorSettings]
     agents: dict[str, AgentSettings] = {}
     seeds: Count = 10
+    safety_episodes: Count | None = None
     decision: dict[str, object] = {}
     training: dict[str, object] = {}
     gradient: dict[str, object] = {}
     clairvoyant: ClairvoyantSettings | None = None
     lengths: list[Count] = []
     rig: RigSettings | None = None
+    note: str = ""
     inferred: list[str] = []
     ours: list[str] = []
     reference: dict[str, ReferenceRow] = {}

@@ -13,6 +13,7 @@ from ..description import PlantDescription, names_of
 from ..policy import read_policy, shown_nearness
 from ..report.rows import (
     BoundByLength,
+    CountsBySeed,
     Difference,
     ErrorStatistics,
     Gap,
@@ -56,8 +57,9 @@ def study_table(folder: Path) -> StudyTable:
         names = [(m, e) for m in study.methods for e in study.estimators]
         found = _rows(folder / "methods.json", names, params)
         rows += [row.model_copy(update=untrained) for row in found]
-    for metrics in seeds.values():
-        rows += [across_seeds(metrics, e) for e in range(len(study.estimators))]
+    for agent, metrics in seeds.items():
+        counts = _counts(study, folder, agent)
+        rows += [across_seeds(metrics, e, counts) for e in range(len(study.estimators))]
     if study.clairvoyant is not None:
         rows = _with_efficiency(study, folder, rows)
     table = StudyTable(rows=tuple(rows), study=facts(study))
@@ -121,6 +123,22 @@ def _metrics(study: Study, folder: Path, agent: str, seed: int) -> SeedMetrics:
     return metrics
 
 
+def _counts(study: Study, folder: Path, agent: str) -> CountsBySeed | None:
+    """Violations by seed on plants of their own; None where the study has none."""
+    if study.safety_episodes is None:
+        return None
+    paths = [seed_folder(folder, agent, seed) / "safety.json" for seed in range(study.seeds)]
+    counts = [CountsBySeed.read(path, advice(path)) for path in paths]
+    for path, count in zip(paths, counts, strict=True):
+        if (count.evaluations, len(count.violations)) != (study.safety_episodes, 1):
+            raise damaged(path)
+    return CountsBySeed(
+        evaluations=study.safety_episodes,
+        violations=tuple(count.violations[0] for count in counts),
+        own_plants=True,
+    )
+
+
 def _require_finished(
     study: Study, folder: Path, seeds: Mapping[str, Sequence[SeedMetrics]]
 ) -> None:
@@ -128,6 +146,16 @@ def _require_finished(
     what = f"{missing} of {study.seeds * len(study.agents)} trainings are missing"
     if not missing and study.methods and not (folder / "methods.json").is_file():
         what = "its methods are not evaluated yet"
+    elif (
+        not missing
+        and study.safety_episodes
+        and not all(
+            (seed_folder(folder, agent, seed) / "safety.json").is_file()
+            for agent in study.agents
+            for seed in range(study.seeds)
+        )
+    ):
+        what = "its violations by seed are not counted yet"
     elif not missing and study.clairvoyant and not (folder / "clairvoyant.json").is_file():
         what = "its clairvoyant signals are not designed yet"
     elif not missing:
@@ -137,18 +165,28 @@ def _require_finished(
     )
 
 
-def across_seeds(metrics: Sequence[SeedMetrics], estimator: int) -> Row:
+def across_seeds(
+    metrics: Sequence[SeedMetrics], estimator: int, counts: CountsBySeed | None = None
+) -> Row:
     """One row of an agent: means over its viable seeds, counts over all of them.
 
     The seed is the unit of replication: standard deviations are those between the means of
     the seeds. A seed without a successful estimate has no mean and is left out. Without
     viable seeds there are no means.
+
+    Args:
+        metrics: of every seed.
+        estimator: its place in the study.
+        counts: of violations on plants of the seeds' own, where they were counted.
     """
     rows = [m.rows[estimator] for m in metrics]
     viable = [row for m, row in zip(metrics, rows, strict=True) if m.viable]
     first, names = rows[0], rows[0].parameters
     evaluations, violations = sum(r.evaluations for r in rows), sum(r.violations for r in rows)
     largest = _mean_sd([r.max_abs_output.mean for r in viable])
+    if counts is None and len(rows) > 1:
+        by_seed = tuple(r.violations for r in rows)
+        counts = CountsBySeed(evaluations=first.evaluations, violations=by_seed, own_plants=False)
 
     def error(name: str) -> ErrorStatistics:
         errors = [r.relative_error_percent[name] for r in viable]
@@ -187,6 +225,8 @@ def across_seeds(metrics: Sequence[SeedMetrics], estimator: int) -> Row:
         seeds=len(rows),
         train_seconds=sum(m.train_seconds for m in metrics),
     )
+    if counts is not None:
+        row = row.model_copy(update={"by_seed": counts})
     return row.model_copy(update=_where_asked_for(rows, viable))
 
 

@@ -27,13 +27,13 @@ from ..excitation import PolicyExcitation, Replay
 from ..files import write_bytes
 from ..plant import AbstractPlant
 from ..policy import Policy
-from ..report.rows import Rows, SeedMetrics
+from ..report.rows import CountsBySeed, Rows, SeedMetrics
 from ..training.checkpoint import Checkpoint, Trained
-from ..training.signals import clairvoyant_signals, signal_env
+from ..training.signals import CLAIRVOYANT, clairvoyant_signals, signal_env
 from .agent import Agent
 from .falsify import falsify
 from .folder import agent_settings, fingerprint
-from .methods import episode_keys, evaluate_method, method_rows, scores
+from .methods import CHUNK, episode_keys, evaluate_method, method_rows, player_of, scores
 from .progress import write_progress, write_search
 from .spec import Study, study_from
 from .statistics import table_row
@@ -196,6 +196,22 @@ def methods_task(study: Mapping[str, object], plant: Mapping[str, str | None]) -
         return Rows(rows=tuple(method_rows(chosen))).data()
 
 
+def safety_task(
+    study: Mapping[str, object], plant: Mapping[str, str | None], seed: int, policy: bytes
+) -> Data:
+    """Violations of a trained policy on plants that are those of its seed alone."""
+    with unpacked(study, plant) as (chosen, built):
+        play, count = player_of(chosen, built), chosen.safety_episodes or 0
+        own = jax.random.fold_in(jax.random.key(chosen.seed), seed + 1)
+        keys, excitation = (
+            jax.random.split(own, count),
+            PolicyExcitation.of(Policy.from_bytes(policy)),
+        )
+        parts = [play(excitation, keys[i : i + CHUNK])[0] for i in range(0, count, CHUNK)]
+        violations = sum(int(part.is_violation.sum()) for part in parts)
+        return CountsBySeed(evaluations=count, violations=(violations,), own_plants=True).data()
+
+
 METHOD = "clairvoyant"
 
 
@@ -206,7 +222,8 @@ def clairvoyant_task(study: Mapping[str, object], plant: Mapping[str, str | None
             raise ValueError("the study has no clairvoyant signals")
         keys = episode_keys(chosen)[: chosen.clairvoyant.plants]
         env = signal_env(built, chosen.num_steps, chosen.spread)
-        design = clairvoyant_signals(env, keys, chosen.clairvoyant.starts)
+        settings = dataclasses.replace(CLAIRVOYANT, num_updates=chosen.clairvoyant.updates)
+        design = clairvoyant_signals(env, keys, chosen.clairvoyant.starts, settings)
         episodes = _played(built, jnp.asarray(design.inputs), chosen.spread, keys)
         rows = [
             table_row(chosen, built.description, (METHOD, name), scores(built, e, episodes))

@@ -37,7 +37,14 @@ from ..record import Record, require_record_path, write_record
 from ..report.tables import html_table
 from ..simulation import response, run_episode
 from .checkpoint import Progress
-from .signals import CLAIRVOYANT, ROBUST, clairvoyant_signals, robust_signal, signal_env
+from .signals import (
+    CLAIRVOYANT,
+    CLAIRVOYANT_STARTS,
+    ROBUST,
+    clairvoyant_signals,
+    robust_signal,
+    signal_env,
+)
 
 if TYPE_CHECKING:
     import matplotlib.figure
@@ -169,8 +176,8 @@ def design(
             too, and tested on plants drawn from it.
         noise: standard deviation by output, in its unit, where it differs from the plant's.
         seed: of the search, and of the plants on which the input is tested.
-        starts: of a search by gradient, default 4.
-        updates: gradient updates, default 1000 (robust) or 1500 (clairvoyant).
+        starts: of a search by gradient, default 4 (robust) or 8 (clairvoyant).
+        updates: gradient updates, default 1000 (robust) or 3000 (clairvoyant).
         trials: of a tuning, default 400.
         out: file to write, .csv or .mat.
         overwrite: whether the file may exist.
@@ -251,7 +258,8 @@ def _searched(
         found = robust_signal(env, seed, starts or 4, settings, progress)
     else:
         key = jax.random.split(jax.random.key(seed), 1)
-        found = clairvoyant_signals(env, key, starts or 4, settings, progress, seed=seed)
+        count = starts or CLAIRVOYANT_STARTS
+        found = clairvoyant_signals(env, key, count, settings, progress, seed=seed)
     return jnp.asarray(found.inputs[0]), tuple(found.worth_by_start[0].tolist())
 
 

@@ -137,6 +137,7 @@ def update(
     now: Optimisation,
     keys: Key[Array, " plant"],
     is_adversarial: bool = False,
+    margin: Float[Array, ""] | None = None,
 ) -> tuple[Optimisation, Scores]:
     """One step of Adam on the plants of these keys, and the experiments before it.
 
@@ -146,7 +147,9 @@ def update(
         now: before the step.
         keys: of the plants.
         is_adversarial: whether the worst plants of the declared uncertainty are penalised too.
+        margin: in place of that of the settings.
     """
+    start = settings.margin if margin is None else margin
     box, adversaries = env.uncertainty, now.adversaries
     if is_adversarial and box is not None and adversaries is not None:
         play = OnPlant(box, now.player.excitation(env.layout), env.layout.num_steps)
@@ -154,7 +157,7 @@ def update(
         adversaries = _adversaries(play, settings, adversaries, key)
 
     def loss(player: PyTree) -> tuple[Array, tuple[Scores, Array]]:
-        batch = experiments(env, player, keys, settings.margin)
+        batch = experiments(env, player, keys, start)
         excess, nearest = jnp.mean(batch.excess), batch.nearness
         if is_adversarial and box is not None and adversaries is not None:
             play = OnPlant(box, player.excitation(env.layout), env.layout.num_steps)
@@ -219,7 +222,7 @@ def _excess(
 
 
 update_all = eqx.filter_jit(
-    eqx.filter_vmap(update, in_axes=(None, None, eqx.if_array(0), eqx.if_array(0), None))
+    eqx.filter_vmap(update, in_axes=(None, None, eqx.if_array(0), eqx.if_array(0), None, None))
 )
 """`update` for several parallel trainings; their axis is the first of progress and keys."""
 

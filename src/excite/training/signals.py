@@ -10,7 +10,7 @@ then scales the amplitude up to the limit.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -47,16 +47,23 @@ def signal_env(
     return Env.of(plant, objective=objective, layout=layout, spread=spread, uncertainty=uncertainty)
 
 
-CLAIRVOYANT = GradientSettings(num_updates=1500, learning_rate=0.03, margin=0.97, near=0.9975)
-"""Its outputs may reach 0.9975 of the critical level (39.9 of 40 degrees)."""
+CLAIRVOYANT = GradientSettings(num_updates=3000, learning_rate=0.1, margin=0.97, near=0.99975)
+"""Its outputs may reach 0.99975 of the critical level (39.99 of 40 degrees)."""
+
+CLAIRVOYANT_STARTS = 8
+
+FULL_MARGIN = 2 / 3, 0.997
+"""After this fraction of a clairvoyant search its penalty begins ever closer to the level, at
+the end at this fraction of it: a signal with a wider margin leaves a part of the level unused."""
 
 ROBUST = GradientSettings(num_updates=1000, num_plants=32, learning_rate=0.03)
 
 NUM_JUDGES = 1000
 """Number of plants, not used in the search, for which a robust signal must be safe."""
 
-AMPLITUDES = np.linspace(0.8, 1.04, 25)
-"""Factors of the line search."""
+AMPLITUDES = np.linspace(-1, 1, 25)
+FIRST, WIDTHS = 0.92, (0.12, 0.01, 8e-4)
+"""Of the line search: factors around the first, then around the best, ever closer."""
 
 
 class OpenLoop(eqx.Module):
@@ -123,8 +130,8 @@ def clairvoyant_signals(
     """
     own = jnp.repeat(keys, num_starts)[:, None]
     starts = _first_signals(env, jax.random.split(jax.random.key(seed), len(own)))
-    found = _search(env, settings, starts, lambda _: own, report)
-    return _at_the_limit(env, found, own, settings.near, len(keys))
+    found = _search(env, settings, starts, lambda _: own, report, FULL_MARGIN)
+    return _at_the_limit(env, found, own, settings.near, len(keys), WIDTHS)
 
 
 def robust_signal(
@@ -148,7 +155,7 @@ def robust_signal(
     starts = _first_signals(env, jax.random.split(first, num_starts))
     found = _search(env, settings, starts, fresh, report)
     judges = jnp.tile(jax.random.split(second, NUM_JUDGES)[None], (num_starts, 1))
-    return _at_the_limit(env, found, judges, settings.near, 1)
+    return _at_the_limit(env, found, judges, settings.near, 1, WIDTHS[:1])
 
 
 def _search(
@@ -157,14 +164,32 @@ def _search(
     player: OpenLoop,
     keys: Callable[[int], Key[Array, "search plant"]],
     report: Progress,
+    closing: tuple[float, float] | None = None,
 ) -> Float[Array, "search time input"]:
-    """Actions at the end of all searches, side by side."""
+    """Actions at the end of all searches, side by side.
+
+    Args:
+        closing: from which fraction of the updates the distance of the margin from the level
+            shrinks, geometrically, and the margin at the end.
+    """
     now = eqx.filter_vmap(lambda p: Optimisation.start(p, settings, env))(player)
     for i in range(settings.num_updates):
         is_adversarial = settings.has_adversaries(i) and env.uncertainty is not None
-        now, _ = update_all(env, settings, now, keys(i), is_adversarial)
+        margin = _margin(settings, i, closing)
+        now, _ = update_all(env, settings, now, keys(i), is_adversarial, margin)
         report(f"updating {i + 1:,} of {settings.num_updates:,}", i + 1, settings.num_updates)
     return jnp.tanh(now.player.latent)
+
+
+def _margin(
+    settings: GradientSettings, update: int, closing: tuple[float, float] | None
+) -> Float[Array, ""]:
+    """Of the penalty at this update."""
+    if closing is None:
+        return jnp.asarray(settings.margin)
+    begin, end = closing
+    part = max(0.0, (update / settings.num_updates - begin) / (1 - begin))
+    return jnp.asarray(1 - (1 - settings.margin) ** (1 - part) * (1 - end) ** part)
 
 
 @eqx.filter_jit
@@ -180,20 +205,22 @@ def _at_the_limit(
     keys: Key[Array, "search plant"],
     limit: float,
     num_plants: int,
+    widths: Sequence[float],
 ) -> FoundSignals:
     """Every signal at its best safe amplitude, and of every plant the best of its starts."""
     worth = np.full(len(actions), -np.inf)
-    nearness, factors = np.zeros(len(actions)), np.ones(len(actions))
-    for factor in AMPLITUDES:
-        scaled = jnp.clip(factor * actions, -1, 1)
-        batch = _played(env, scaled, keys)
-        own, nearest = np.mean(batch.worth, axis=1), np.max(batch.nearness, axis=1)
-        if env.uncertainty is not None:
-            nearest = np.maximum(nearest, _worst(env, scaled))
-        is_better = (nearest < limit) & (own > worth)
-        worth = np.where(is_better, own, worth)
-        nearness = np.where(is_better, nearest, nearness)
-        factors = np.where(is_better, factor, factors)
+    nearness, best = np.zeros(len(actions)), np.full(len(actions), FIRST)
+    for width in widths:
+        for factors in best + width * AMPLITUDES[:, None]:
+            scaled = jnp.clip(factors[:, None, None] * actions, -1, 1)
+            batch = _played(env, scaled, keys)
+            own, nearest = np.mean(batch.worth, axis=1), np.max(batch.nearness, axis=1)
+            if env.uncertainty is not None:
+                nearest = np.maximum(nearest, _worst(env, scaled))
+            is_better = (nearest < limit) & (own > worth)
+            worth = np.where(is_better, own, worth)
+            nearness = np.where(is_better, nearest, nearness)
+            best = np.where(is_better, factors, best)
     by_start = worth.reshape(num_plants, -1)
     if np.any(np.isneginf(by_start.max(axis=1))):
         raise ValueError(
@@ -201,10 +228,10 @@ def _at_the_limit(
             "spread, a shorter experiment or a longer search may help"
         )
     num_starts = by_start.shape[1]
-    best = np.arange(num_plants) * num_starts + np.argmax(by_start, axis=1)
-    chosen = np.clip(factors[best, None, None] * np.asarray(actions)[best], -1, 1)
+    first = np.arange(num_plants) * num_starts + np.argmax(by_start, axis=1)
+    chosen = np.clip(best[first, None, None] * np.asarray(actions)[first], -1, 1)
     middle, half = np.array(env.layout.input_middle), np.array(env.layout.input_half)
-    return FoundSignals(middle + half * chosen, by_start.max(axis=1), nearness[best], by_start)
+    return FoundSignals(middle + half * chosen, by_start.max(axis=1), nearness[first], by_start)
 
 
 @eqx.filter_jit
