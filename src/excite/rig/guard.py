@@ -19,13 +19,14 @@ As for a supervisor (`excite.safety`), the functions are pure, over arrays of Nu
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
 
 from ..policy import AnyArray
+from ..safety import Supervision
 
 NUM_RECENT = 10
 """Innovations of which the mean is watched."""
@@ -82,6 +83,11 @@ class GuardRules:
     def num_states(self) -> int:
         """Of the plant; the quantities follow."""
         return len(self.state_scale)
+
+
+def beside(rules: Supervision) -> Supervision:
+    """A supervisor's rules beside a guard: a frozen sensor is left to the guard and its brake."""
+    return replace(rules, num_still=_LONGEST, num_dead=max(rules.num_dead, _LONGEST))
 
 
 class Model(NamedTuple):

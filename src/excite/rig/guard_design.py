@@ -5,7 +5,9 @@ A guard is made once, where JAX is installed; see `rig.guard`.
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import equinox as eqx
@@ -15,15 +17,21 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Array, Bool, Float
 
+from ..environment.falsification import Cases
+from ..excitation import AbstractExcitation
 from ..plant import AbstractPlant
-from ..plant.uncertainty import Uncertainty
-from ..safety import safe_input, watched_levels
+from ..plant.uncertainty import Range, Uncertainty
+from ..safety import Supervision, safe_input, watched_levels
 from ..simulation import step
 from . import guard
+from .falsification import OnRig
 from .filter import AbstractFilter, linear_model
 from .guard import Belief, GuardRules, Model
 
 _WATCHED, _INPUT = 30.0, 0.1  # weights of the brake: outputs with a level, inputs
+_LATENCY = 0.2  # of a rig, at most, in samples
+_MARGIN, _MARGIN_OUTSIDE = 1.3, 0.15  # of the thresholds above the largest score
+_CHUNK = 100  # experiments of one call
 _VISIBLE = 0.01  # of an output's scale
 _WALK = 1e-3  # unexplained change in one sample, of a state in its scales and of a quantity
 
@@ -158,6 +166,64 @@ def _brake(plant: AbstractPlant) -> np.ndarray:
     return np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
 
 
+def guard_for(
+    plant: AbstractPlant,
+    excitation: AbstractExcitation,
+    spread: float,
+    ranges: Mapping[str, Range],
+    *,
+    num_steps: int = 500,
+    num_runs: int = 500,
+    seed: int = 0,
+    progress: Callable[[str, int, int], None] = lambda *_: None,
+) -> GuardFilter:
+    """The guard of an excitation, with thresholds that declared plants do not reach.
+
+    The excitation is played on simulated rigs with plants drawn from the declared uncertainty. A
+    threshold is the largest score of all these experiments, and some more.
+
+    Args:
+        plant: for which the excitation was made.
+        excitation: plays.
+        spread, ranges: declared uncertainty, see `Uncertainty.of`.
+        num_steps: of an experiment.
+        num_runs: experiments.
+        seed: of these.
+        progress: called with a text, how many experiments are done, and their number.
+
+    Raises:
+        ValueError: for a plant that linear feedback cannot bring to rest.
+    """
+    box = Uncertainty.of(plant, spread, ranges)
+    # A rig acts a part of a sampling time late: the guard must not take that for a fault.
+    short, declared = _LATENCY * float(plant.dt), box.ranges()
+    late = {
+        name: (0.0, max(short, declared.get(name, (0.0, 0.0))[1]))
+        for name in (f"delay_{i.name}" for i in plant.definition.inputs)
+    }
+    model = GuardModel.of(Uncertainty.of(plant, spread, {**ranges, **late}))
+    open_guard = GuardFilter(model, rules_of(plant, model))
+    play = OnRig.of(box, excitation, num_steps, open_guard)
+    keys = jax.random.split(jax.random.key(seed), num_runs)
+    cases = Cases(jax.vmap(box.draw)(keys), jnp.arange(num_runs) + seed * num_runs)
+    largest = []
+    for first in range(0, num_runs, _CHUNK):
+        progress("calibrating the guard", first, num_runs)
+        rows = np.arange(first, min(first + _CHUNK, num_runs))
+        chunk = jax.tree.map(lambda leaf, rows=rows: leaf[rows], cases)
+        largest.append(np.asarray(_scores(play, chunk)))
+    progress("calibrating the guard", num_runs, num_runs)
+    top = np.nanmax(np.concatenate(largest), axis=0)
+    thresholds = np.append(_MARGIN * top[:2], top[2] + _MARGIN_OUTSIDE)
+    return GuardFilter(model, dataclasses.replace(open_guard.rules, thresholds=thresholds))
+
+
+@eqx.filter_jit
+def _scores(play: OnRig, cases: Cases) -> Float[Array, "case 3"]:
+    """The largest scores of the guard in each case."""
+    return jax.vmap(lambda case: play.run(case).memory.largest)(cases)
+
+
 class GuardFilter(AbstractFilter):
     """A guard between excitation and supervisor, for batches of simulated experiments.
 
@@ -187,3 +253,7 @@ class GuardFilter(AbstractFilter):
     def is_over(self, memory: Belief) -> Bool[Array, ""]:
         """Whether the brake has done its work."""
         return memory.is_over
+
+    def supervision(self, rules: Supervision) -> Supervision:
+        """A supervisor's rules beside this guard, which notices a frozen sensor and brakes."""
+        return guard.beside(rules)

@@ -328,7 +328,7 @@ def falsify(
     if "warning" in origin:
         warnings.warn(f"{name}: {origin['warning']}", stacklevel=2)
     num_steps = experiment_length(found, name, steps, isinstance(excitation, Record))
-    usual_spread, usual = _trained_in(policy, chosen)
+    usual_spread, usual = trained_in(policy, chosen)
     reach = usual_spread if spread is None else spread
     box = Uncertainty.of(chosen, reach, usual if uncertainty is None else uncertainty)
     effort, play = Effort.of(budget), OnPlant(box, found, num_steps)
@@ -397,7 +397,7 @@ def _is_plant(word: str) -> bool:
     return word.split("+")[0] in PLANTS or ".py:" in word or word.endswith(PLANT_ENDING)
 
 
-def _trained_in(policy: Policy | None, plant: AbstractPlant) -> tuple[float, Mapping[str, Range]]:
+def trained_in(policy: Policy | None, plant: AbstractPlant) -> tuple[float, Mapping[str, Range]]:
     """Spread and ranges of the plants that a policy was trained for."""
     made = {} if policy is None else policy.provenance
     decision = made.get("decision") or {}
