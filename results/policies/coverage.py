@@ -4,12 +4,13 @@ Rotor lag, dead zone, asymmetry and curvature of every plant differ from the val
 estimator takes as known, with a standard deviation of 2 %. The intervals are computed with
 these values as exact, and as `excite identify --uncertain tau=2%,dead_zone=2%,...` does.
 
-    python docs/figures/coverage.py
+    python results/policies/coverage.py
 """
 
 from __future__ import annotations
 
 import math
+import sys
 
 import equinox as eqx
 import jax
@@ -63,11 +64,12 @@ def main() -> None:
             errors.append(np.abs(params / own - 1))
             exact.append(np.sqrt(variance) / own)
             uncertain.append(np.sqrt(variance + np.sum(effect**2, axis=1)) / own)
-    print(f"{len(errors)} of {COUNT} estimates successful")
+    lines = [f"{len(errors)} of {COUNT} estimates successful"]
     for title, errs in (("exact", exact), ("uncertain", uncertain)):
         inside = np.mean(np.array(errors) < HALF_95 * np.array(errs), axis=0)
         for name, share, error in zip(plant.nominal._fields, inside, np.mean(errs, 0), strict=True):
-            print(f"{title}: {name} {100 * share:.1f} %, standard error {100 * error:.3f} %")
+            lines.append(f"{title}: {name} {100 * share:.1f} %, standard error {100 * error:.3f} %")
+    sys.stdout.write("\n".join([*lines, ""]))
 
 
 if __name__ == "__main__":
