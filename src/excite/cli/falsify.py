@@ -71,6 +71,11 @@ from .options import (
     metavar="FILE",
     help="Write the policy with this search as its certificate (.safetensors).",
 )
+@click.option(
+    "--guard",
+    is_flag=True,
+    help="Make a guard for rigs, too, in the file of --certify: see excite run --guard.",
+)
 @click.option("--overwrite", is_flag=True, help="Replace these files if they exist.")
 @plot_option
 @json_option
@@ -90,6 +95,8 @@ def falsify(
 
     if out is not None:
         require_plant_path(out, overwrite)
+    if options["guard"] and certify is None:
+        raise click.UsageError("--guard needs --certify FILE, where it is kept")
     if certify is not None:
         require_certifiable(excitation, certify, overwrite, options["steps"])
     if plot is not None:

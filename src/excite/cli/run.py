@@ -61,6 +61,9 @@ def _options(command: Callable[..., int]) -> Callable[..., int]:
         click.option("--filter", is_flag=True,
                      help="Predictive safety filter: changes an input where a plant of the prior "
                      "could no longer be brought to rest before its critical level."),
+        click.option("--guard", is_flag=True,
+                     help="Brake where no plant of the policy's declared uncertainty explains the "
+                     "measurements (excite falsify --guard)."),
         click.option("--require-certificate", is_flag=True,
                      help="Refuse a policy without a certificate (excite falsify) for this plant "
                      "and spread."),

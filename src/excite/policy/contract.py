@@ -205,6 +205,7 @@ class Policy:
         weights: float32 matrices and biases.
         provenance: how it was made, JSON-ready.
         certificate: what a search for the least safe plant found (`excite falsify`), JSON-ready.
+        guard: what a guard on a rig needs (`excite.rig.guard`), JSON-ready.
     """
 
     plant: PlantDescription
@@ -212,6 +213,7 @@ class Policy:
     weights: Weights
     provenance: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     certificate: Mapping[str, Any] | None = None
+    guard: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
         layers = tuple(
@@ -245,12 +247,13 @@ class Policy:
             f"{self.plant.dt:g} s; network {'-'.join(map(str, widths))}\n"
             f"  trained by {', '.join(words) or 'unknown'}\n"
             f"  {self.claim}\n"
+            f"{'  with a guard (excite run --guard)' + chr(10) if self.guard else ''}"
             f"  hash {self.hash}"
         )
 
     @property
     def hash(self) -> str:
-        """SHA-256 of contract and weights, without the certificate: what the policy does."""
+        """SHA-256 of contract and weights, without certificate and guard: what the policy does."""
         return str(checksum_of(self.certified(None).to_bytes()))
 
     @property
@@ -275,9 +278,11 @@ class Policy:
             "found, not proved"
         )
 
-    def certified(self, certificate: Mapping[str, Any] | None) -> Policy:
-        """The same policy with another certificate."""
-        return dataclasses.replace(self, certificate=certificate)
+    def certified(
+        self, certificate: Mapping[str, Any] | None, guard: Mapping[str, Any] | None = None
+    ) -> Policy:
+        """The same policy with another certificate and guard."""
+        return dataclasses.replace(self, certificate=certificate, guard=guard)
 
     def save(self, path: str | Path, overwrite: bool = False) -> None:
         """Writes the policy's file (.safetensors); `read_policy` reads it back.
@@ -301,6 +306,8 @@ class Policy:
         }
         if self.certificate is not None:
             contract["certificate"] = dict(self.certificate)
+        if self.guard is not None:
+            contract["guard"] = dict(self.guard)
         tensors = {
             f"{i}.{part}": array
             for i, layer in enumerate(self.weights)
@@ -337,7 +344,8 @@ class Policy:
             certificate = contract.get("certificate")
             if certificate is not None:
                 _check_certificate(certificate)
-            return cls(plant, layout, weights, dict(contract["provenance"]), certificate)
+            made, guard = dict(contract["provenance"]), contract.get("guard")
+            return cls(plant, layout, weights, made, certificate, guard)
         except (KeyError, TypeError, AttributeError, OverflowError) as error:
             raise ValueError(f"{where}: incomplete or malformed contract ({error})") from None
         except ValueError as error:

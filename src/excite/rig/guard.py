@@ -18,15 +18,17 @@ As for a supervisor (`excite.safety`), the functions are pure, over arrays of Nu
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from types import ModuleType
-from typing import NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
 from ..policy import AnyArray
 from ..safety import Supervision
+from .player import AbstractPlayer
+from .program import Program
 
 NUM_RECENT = 10
 """Innovations of which the mean is watched."""
@@ -88,6 +90,67 @@ class GuardRules:
 def beside(rules: Supervision) -> Supervision:
     """A supervisor's rules beside a guard: a frozen sensor is left to the guard and its brake."""
     return replace(rules, num_still=_LONGEST, num_dead=max(rules.num_dead, _LONGEST))
+
+
+@dataclass(frozen=True, eq=False)
+class Guard:
+    """A guard as it is kept in a policy's certificate.
+
+    Attributes:
+        rules: what it knows.
+        advance, output: the model's functions, for as many points as the filter has.
+        replay, replay_output: the same for the points of a replay.
+    """
+
+    rules: GuardRules
+    advance: Program
+    output: Program
+    replay: Program
+    replay_output: Program
+
+    @property
+    def model(self) -> Model:
+        """The declared plants."""
+        few = 1 + 2 * NUM_REPLAYED
+
+        def advance(points: np.ndarray, past: np.ndarray) -> np.ndarray:
+            return (self.replay if len(points) == few else self.advance)(points, past)
+
+        def output(points: np.ndarray) -> np.ndarray:
+            if len(points) == few:
+                return self.replay_output(points)
+            rows = 2 * len(self.rules.mean) + 1
+            return self.output(np.resize(points, (rows, points.shape[1])))[: len(points)]
+
+        return Model(advance, output)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The guard as JSON-ready data."""
+        rules = {
+            name: value.tolist() if isinstance(value, np.ndarray) else value
+            for name, value in vars(self.rules).items()
+        }
+        programs = {name: getattr(self, name).to_dict() for name in _PROGRAMS}
+        return {"rules": rules, **programs}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Self:
+        """The guard that `to_dict` wrote.
+
+        Raises:
+            ValueError: for data of another form.
+        """
+        try:
+            rules = dict(data["rules"])
+            depth, watched = int(rules.pop("depth")), np.array(rules.pop("watched"), int)
+            arrays = {name: np.array(value, float) for name, value in rules.items()}
+            programs = (Program.from_dict(data[name]) for name in _PROGRAMS)
+            return cls(GuardRules(depth=depth, watched=watched, **arrays), *programs)
+        except (KeyError, TypeError, AttributeError) as error:
+            raise ValueError(f"the guard is damaged ({error!r})") from None
+
+
+_PROGRAMS = "advance", "output", "replay", "replay_output"
 
 
 class Model(NamedTuple):
@@ -179,21 +242,22 @@ def observed(
     score = xp.stack([square, xp.mean(recent), outside])
     trips = ~is_braking & ~(score < xp.asarray(rules.thresholds)).all()
     was_frozen = (measured == belief.measured[-1]).any()
-    is_blind = xp.where(trips, was_frozen, belief.is_blind)
-    keeps = is_blind & (is_braking | trips)
+    is_blind = belief.is_blind | ((is_braking | trips) & was_frozen)
+    starts_again = trips | (is_blind & ~belief.is_blind)
     if xp is np and not (trips or is_braking):  # on a rig, what is not needed takes time
         state, sign = mean[: rules.num_states], belief.sign
     else:
         state, sign = _replayed(xp, rules, model, belief, measured)
-    sign = xp.where((is_braking | trips) & ~keeps, sign, belief.sign)
+    sign = xp.where(is_braking | trips, xp.where(is_blind, 1.0, sign), belief.sign)
     quantities = xp.clip(belief.mean[rules.num_states :], -1.0, 1.0)
     braking_mean = xp.concatenate([state, quantities])
     braking_root = xp.diag(
         xp.concatenate([_WIDE * xp.asarray(rules.state_scale), xp.zeros(len(quantities))])
     )
-    mean = xp.where(trips, braking_mean, xp.where(keeps, belief.mean, mean))
-    root = xp.where(trips, braking_root, xp.where(keeps, belief.root, root))
-    size = abs(measured[rules.watched]) / xp.asarray(rules.critical)
+    mean = xp.where(starts_again, braking_mean, xp.where(is_blind, belief.mean, mean))
+    root = xp.where(starts_again, braking_root, xp.where(is_blind, belief.root, root))
+    shown = xp.where(is_blind, model.output(mean[None])[0], measured)  # what is believed
+    size = abs(shown[rules.watched]) / xp.asarray(rules.critical)
     num_quiet = xp.where((size < _QUIET).all(), belief.num_quiet + 1, 0)
     return belief._replace(
         mean=mean,
@@ -311,3 +375,51 @@ def _replayed(
     is_clear = (error[best] < _CLEARLY * error[as_now]) & (error[as_now] > NUM_REPLAYED)
     best = xp.where(is_clear, best, as_now)
     return points[best, :n], xp.asarray(signs)[best]
+
+
+class GuardedPlayer(AbstractPlayer):
+    """A player and its guard; NumPy alone."""
+
+    def __init__(self, player: AbstractPlayer, guard: Guard) -> None:
+        """Before the first sample."""
+        self._player, self._rules, self._model = player, guard.rules, guard.model
+        self.num_steps = player.num_steps
+        self._belief = start(np, guard.rules)
+
+    def __call__(self, k: int, measured: np.ndarray) -> np.ndarray:
+        """The player's input, or that of the brake."""
+        with np.errstate(all="ignore"):  # what is not finite trips
+            belief = observed(np, self._rules, self._model, self._belief, np.asarray(measured))
+            self._belief = belief
+            proposed = self._rules.rest if belief.num_braked > 0 else self._player(k, measured)
+            return np.array(decided(np, self._rules, belief, proposed))
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the brake has done its work."""
+        return bool(self._belief.is_over)
+
+    def applied(self, input: np.ndarray) -> None:
+        """Passes the applied input to the player, and moves the belief to the next sample."""
+        self._player.applied(input)
+        with np.errstate(all="ignore"):
+            self._belief = moved(np, self._rules, self._model, self._belief, np.asarray(input))
+
+    def origin(self) -> Mapping[str, object]:
+        """As for the player without guard."""
+        return self._player.origin()
+
+    def facts(self) -> Mapping[str, object]:
+        """Also whether and when the guard tripped, and how near to its thresholds it came."""
+        belief, names = self._belief, ("innovation", "mean of innovations", "outside the box")
+        has_tripped = bool(belief.num_braked > 0)
+        shares = zip(names, belief.largest.tolist(), self._rules.thresholds.tolist(), strict=True)
+        return {
+            **self._player.facts(),
+            "guard": {
+                "tripped_at": int(belief.tripped_at) if has_tripped else None,
+                "largest_and_threshold": {name: [a, b] for name, a, b in shares},
+                "actuator_sign": float(belief.sign),
+                "sensor_frozen": bool(belief.is_blind),
+            },
+        }

@@ -26,13 +26,14 @@ from ..simulation import step
 from . import guard
 from .falsification import OnRig
 from .filter import AbstractFilter, linear_model
-from .guard import Belief, GuardRules, Model
+from .guard import Belief, Guard, GuardRules, Model
+from .tracing import program_of
 
 _WATCHED, _INPUT = 30.0, 0.1  # weights of the brake: outputs with a level, inputs
 _LATENCY = 0.2  # of a rig, at most, in samples
 _MARGIN, _MARGIN_OUTSIDE = 1.3, 0.15  # of the thresholds above the largest score
 _CHUNK = 100  # experiments of one call
-_VISIBLE = 0.01  # of an output's scale
+_VISIBLE = 0.003  # of an output's scale
 _WALK = 1e-3  # unexplained change in one sample, of a state in its scales and of a quantity
 
 
@@ -257,3 +258,17 @@ class GuardFilter(AbstractFilter):
     def supervision(self, rules: Supervision) -> Supervision:
         """A supervisor's rules beside this guard, which notices a frozen sensor and brakes."""
         return guard.beside(rules)
+
+    def guard(self) -> Guard:
+        """The same guard for NumPy.
+
+        Raises:
+            ValueError: for a plant with equations that a program cannot have.
+        """
+        rules, model = self.rules, self.model.functions()
+        n, shape = len(rules.mean), (rules.depth, len(rules.rest))
+        programs = []
+        for count in (2 * n + 1, 1 + 2 * guard.NUM_REPLAYED):
+            points, past = np.zeros((count, n)), np.zeros((count, *shape))
+            programs += [program_of(model.advance, points, past), program_of(model.output, points)]
+        return Guard(rules, *programs)

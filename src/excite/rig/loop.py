@@ -359,6 +359,8 @@ def _play(
         is_last = k == player.num_steps
         proposed = rig.safe_input if is_last or run.is_over else player(k, run.last.outputs)
         run.look_at_player()
+        if player.is_over:
+            run.trip(Trip.UNEXPLAINED)
         run.watch, input = allowed(np, run.rules, run.watch, proposed)
         rig.alive()
         rig.write(input)

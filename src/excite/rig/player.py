@@ -25,6 +25,11 @@ class AbstractPlayer(abc.ABC):
 
     num_steps: int
 
+    @property
+    def is_over(self) -> bool:
+        """Whether it ends the experiment before its time."""
+        return False
+
     @abc.abstractmethod
     def __call__(self, k: int, measured: np.ndarray) -> np.ndarray:
         """Proposed input at sampling instant k, in the plant's units."""

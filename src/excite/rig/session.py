@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -34,6 +34,7 @@ from ..report.tables import html_table, text_table
 from ..safety import Supervision, Watch, allowed
 from .catalogue import HAS_JAX, RigOptions, rig_named
 from .contract import AbstractRig, Interval, Sample
+from .guard import Guard, GuardedPlayer, beside
 from .loop import ENDS_OF_PROGRAM, Outcome, Stop, interruptible, run_loop
 from .player import AbstractPlayer, PolicyPlayer, SignalPlayer, step_seconds
 from .recorder import Recorder
@@ -113,6 +114,8 @@ class RunResult:
             unsafe = outcome.player["filter_without_safe_input"]
             told = f"; at {unsafe} samples no input was safe for every plant" if unsafe else ""
             rows.append(["filter interventions", f"{changed}{told}"])
+        if isinstance(guard := outcome.player.get("guard"), Mapping):
+            rows.append(["guard", _told(guard)])
         true = outcome.rig.get("true_params")
         for name, (value, half) in self.live_estimate.items():
             told = f"; true {true[name]:.5g}" if isinstance(true, Mapping) and name in true else ""
@@ -126,6 +129,18 @@ class RunResult:
     def _repr_html_(self) -> str:
         """The same for a notebook."""
         return html_table(self.title, ["", ""], [*self.rows(), ["record", str(self.path)]])
+
+
+def _told(guard: Mapping[str, Any]) -> str:
+    """What a guard did, as a sentence."""
+    share = max(value / limit for value, limit in guard["largest_and_threshold"].values())
+    if guard["tripped_at"] is None:
+        return f"did not trip: at most {100 * share:.0f} % of its thresholds"
+    causes = {1.0: "", -1.0: "; the actuator acts with the wrong sign", 0.0: "; no actuator acts"}
+    cause = (
+        "; the sensor stands still" if guard["sensor_frozen"] else causes[guard["actuator_sign"]]
+    )
+    return f"tripped at sample {guard['tripped_at']}{cause}"
 
 
 @dataclass(frozen=True)
@@ -198,6 +213,7 @@ def run(
     steps: int | None = None,
     slew: float = math.inf,
     filter: bool = False,
+    guard: bool = False,
     require_certificate: bool = False,
     address: str = "0",
     fast: bool = False,
@@ -227,6 +243,8 @@ def run(
         steps: number of samples; by default all of a policy or signal, else 500.
         slew: largest change of an input in one second, in its unit.
         filter: adds a predictive safety filter for parameters within ± `spread`.
+        guard: watches whether a declared plant explains the measurements, and brakes where none
+            does; for a policy with a guard in its file (`excite falsify --guard`).
         require_certificate: refuses a policy without a certificate that a search on this plant,
             with this `spread`, found it safe.
         address: board identifier of the Quanser rig.
@@ -296,15 +314,19 @@ def run(
         on_warning(warning)
     if require_certificate:
         source.check_certificate(description, spread)
+    watching = source.guard(description) if guard else None
     make = source.maker(description, known, steps, seed)
     prior = _required(known, "--filter") if filter else None
     safety_filter = None if prior is None else SafetyFilter.of(prior, spread, slew)
 
     def make_player() -> AbstractPlayer:
-        bare = make()
-        return bare if safety_filter is None else FilteredPlayer(bare, safety_filter)
+        player = make()
+        if safety_filter is not None:
+            player = FilteredPlayer(player, safety_filter)
+        return player if watching is None else GuardedPlayer(player, watching)
 
     rules = Supervision.of(description, slew)
+    rules = rules if watching is None else beside(rules)
     session = _Session(opened, known, source.name, make_player, rules)
     if path is None or dry_run:
         return DryRun(description, source.name, session.dry_run(), warnings)
@@ -313,6 +335,7 @@ def run(
         "address": address,
         "slew": slew,
         "filtered": filter,
+        "guarded": guard,
         "spread": spread,
         "seed": seed,
         "fault": [dict(fault)] if fault else [],
@@ -350,6 +373,19 @@ class _Source:
             require_certified(self.policy, plant, spread)
         except ValueError as error:
             raise ValueError(f"{self.name}: {error}") from None
+
+    def guard(self, plant: PlantDescription) -> Guard:
+        """The guard in the policy's file; ValueError where there is none for this plant."""
+        if self.policy is None:
+            raise ValueError(f"{self.name} is no policy: only policies have a guard")
+        if self.policy.guard is None:
+            raise ValueError(
+                f"{self.name}: the policy has no guard ('excite falsify --guard --certify FILE' "
+                "makes one)"
+            )
+        if self.policy.plant.hash != plant.hash:
+            raise ValueError(f"{self.name}: the policy's guard is not for this {plant.name!r}")
+        return Guard.from_dict(self.policy.guard)
 
     def maker(
         self,

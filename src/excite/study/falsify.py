@@ -45,6 +45,8 @@ from ..report.numbers import number
 from ..report.tables import html_table, text_table
 from ..rig.falsification import OnRig
 from ..rig.filter import SafetyFilter
+from ..rig.guard import Guard
+from ..rig.guard_design import guard_for
 from ..rig.simulated import NO_FILTER
 from ..safety import watched_levels
 from ..simulation import Experiment, Trajectory, experiment_length, run_episode
@@ -82,6 +84,7 @@ class Falsification:
         noise: that noise, in standard deviations.
         noise_record: its experiment.
         seed: of the search.
+        guard: for rigs, of a policy; None where it was not asked for.
         rig: whether experiments were made on the plant's simulated rig.
         filter: whether they were made there behind the predictive safety filter.
     """
@@ -103,6 +106,7 @@ class Falsification:
     noise: Float[np.ndarray, "sample output"]
     noise_record: Record
     seed: int
+    guard: Guard | None = None
     rig: bool = False
     filter: bool = False
 
@@ -148,7 +152,8 @@ class Falsification:
         if self.policy is None:
             raise ValueError(f"only a policy has a certificate; {self.excitation} is none")
         _require_whole(self.policy, self.num_steps)
-        return self.policy.certified(self.certificate())
+        guard = None if self.guard is None else self.guard.to_dict()
+        return self.policy.certified(self.certificate(), guard)
 
     def save(self, path: str | Path, overwrite: bool = False) -> None:
         """Writes the worst plant as JSON, a plant for every verb: `ex.simulate("worst.json")`.
@@ -264,6 +269,7 @@ def falsify(
     seed: int = 0,
     rig: bool = False,
     filter: bool = False,
+    guard: bool = False,
     progress: Progress = lambda *_: None,
 ) -> Falsification:
     """Searches a declared uncertainty for the plant on which an excitation is least safe.
@@ -289,6 +295,7 @@ def falsify(
         rig: whether experiments are made on the plant's simulated rig, with its latency, readings
             between the samples and supervisor.
         filter: whether they are made there behind the predictive safety filter.
+        guard: makes a guard of the policy for rigs, too, see `excite.rig.guard`.
         progress: called with a text, how much is done, and the total.
 
     Raises:
@@ -296,6 +303,8 @@ def falsify(
             critical level.
         TypeError: for an argument of another type.
     """
+    if guard and _policy_of(excitation) is None:
+        raise ValueError(f"only a policy has a guard; {_word(excitation)!r} is none")
     if filter and not rig:
         raise ValueError("the safety filter is part of a rig: filter (--filter) needs rig (--rig)")
     policy = _policy_of(excitation)
@@ -330,7 +339,8 @@ def falsify(
     num_steps = experiment_length(found, name, steps, isinstance(excitation, Record))
     usual_spread, usual = trained_in(policy, chosen)
     reach = usual_spread if spread is None else spread
-    box = Uncertainty.of(chosen, reach, usual if uncertainty is None else uncertainty)
+    ranges = usual if uncertainty is None else uncertainty
+    box = Uncertainty.of(chosen, reach, ranges)
     effort, play = Effort.of(budget), OnPlant(box, found, num_steps)
     if rig:
         safety_filter = SafetyFilter.of(chosen, reach) if filter else NO_FILTER
@@ -355,6 +365,11 @@ def falsify(
         tuned = with_nominal(worst, {n: float(x) for n, x in params._asdict().items()})
         return experiment.record(_until_diverged(run)), size, values, tuned
 
+    made = None
+    if guard:
+        made = guard_for(
+            chosen, found, reach, ranges, num_steps=num_steps, seed=seed, progress=progress
+        ).guard()
     record, largest, values, tuned = replayed(result.worst)
     noise_record, noise_largest, noise_values, _ = replayed(with_noise)
     return Falsification(
@@ -375,6 +390,7 @@ def falsify(
         noise=np.asarray(_noise(play, with_noise)),
         noise_record=noise_record,
         seed=seed,
+        guard=made,
         rig=rig,
         filter=filter,
     )
