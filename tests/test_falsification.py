@@ -275,6 +275,7 @@ def certified():
         ({"noise_nearness": None}, {}, "is not safe"),
         ({}, {"plant": "aero2_lag"}, "for another plant"),
         ({}, {"spread": 0.4}, "for another uncertainty: J_p"),
+        ({"filter": True}, {}, "behind the safety filter: add --filter"),
     ],
 )
 def test_a_run_that_needs_a_certificate_refuses_any_other(certified, change, options, words):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 import excite as ex
-from excite.environment.falsification import Cases, Effort, search
+from excite.environment.falsification import Cases
 from excite.excitation import Chirp, Replay
 from excite.plant import Aero2, CartPole
 from excite.plant.catalogue import with_sensor
@@ -19,6 +20,7 @@ from excite.plant.uncertainty import Uncertainty
 from excite.rig.catalogue import RigOptions, rig_named
 from excite.rig.falsification import OnRig
 from excite.rig.faults import Faults
+from excite.rig.filter import SafetyFilter
 from excite.rig.simulated import (
     NO_FILTER,
     Hardware,
@@ -35,12 +37,7 @@ READINGS, STEPS = 10, 40
 INTERVAL = 0.1 / READINGS
 CHIRP = Chirp(amplitude=4.0)
 INPUTS = CHIRP.sequence(PLANT, STEPS, jax.random.key(0))
-AT_ONCE = {"latency": 0.0, "jitter": 0.0}
-
-
-@eqx.filter_jit
-def played(hardware: Hardware):
-    return one_run(hardware, CHIRP, RULES, STEPS, READINGS, NO_FILTER)
+AT_ONCE: dict[str, Any] = {"latency": 0.0, "jitter": 0.0}
 
 
 @eqx.filter_jit
@@ -67,25 +64,27 @@ def hardware(plant=PLANT, effects=None, **options) -> Hardware:
 # ----------------------------------------------------------------------------------- delays
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.1, 0.3, 0.04, 0.17])
-def test_a_delay_acts_on_the_rig_as_in_an_episode(delay):
+def test_a_delay_acts_on_the_rig_as_in_an_episode():
     """Exactly for whole samples; parts of them are an approximation in the episode."""
-    rig = hardware(effects={"delay_voltage": delay})
-    plant = extended(PLANT, ["delay_voltage"])
-    episode = run_episode(plant, rig.params, CHIRP, STEPS, jax.random.key(0))
-    runs = played(rig)
-    is_whole = math.isclose(delay % 0.1, 0, abs_tol=1e-9) or math.isclose(delay % 0.1, 0.1)
-    np.testing.assert_allclose(runs.inputs, episode.inputs, rtol=1e-12)
-    size = float(np.max(np.abs(episode.outputs)))
-    bound = (1e-6 if is_whole else 3e-3) * size  # steps of integration are shorter on the rig
-    np.testing.assert_allclose(runs.measured, episode.outputs, rtol=0, atol=bound)
-    # Of the same steps, it is exact for parts too: the input is constant between readings.
-    late = round(delay / INTERVAL)
-    held = jnp.repeat(INPUTS, READINGS, axis=0)
-    held = jnp.concatenate([jnp.zeros((late, 1)), held])[: len(held)]
-    fine = at_interval(PLANT, READINGS)
-    true = response(fine, fine.Params(*rig.params[:3]), held)[::READINGS]
-    np.testing.assert_allclose(runs.measured, true, rtol=0, atol=1e-12)
+    plant, delays = extended(PLANT, ["delay_voltage"]), (0.0, 0.1, 0.3, 0.04, 0.17)
+    longest = hardware(effects={"delay_voltage": 0.3})
+
+    def both(delay):
+        rig = dataclasses.replace(longest, params=plant.Params(*longest.params[:3], delay))
+        episode = run_episode(plant, rig.params, CHIRP, STEPS, jax.random.key(0))
+        return one_run(rig, CHIRP, RULES, STEPS, READINGS, NO_FILTER), episode
+
+    runs, episodes = jax.jit(jax.vmap(both))(jnp.array(delays))
+    np.testing.assert_allclose(runs.inputs, episodes.inputs, rtol=1e-12)
+    fine, size = at_interval(PLANT, READINGS), float(np.max(np.abs(episodes.outputs)))
+    for i, delay in enumerate(delays):
+        bound = (1e-6 if i < 3 else 3e-3) * size  # steps of integration are shorter on the rig
+        np.testing.assert_allclose(runs.measured[i], episodes.outputs[i], rtol=0, atol=bound)
+        # With the same steps it is exact for parts of a sample, too.
+        late, held = round(delay / INTERVAL), jnp.repeat(INPUTS, READINGS, axis=0)
+        held = jnp.concatenate([jnp.zeros((late, 1)), held])[: len(held)]
+        true = response(fine, fine.Params(*longest.params[:3]), held)[::READINGS]
+        np.testing.assert_allclose(runs.measured[i], true, rtol=0, atol=1e-12)
 
 
 def test_latency_and_delay_are_one_time():
@@ -94,7 +93,7 @@ def test_latency_and_delay_are_one_time():
     np.testing.assert_allclose(readings(late)[0], readings(both)[0], rtol=0, atol=1e-12)
 
 
-def test_each_input_has_its_own_delay_within_a_reading():
+def test_a_delay_that_is_no_whole_number_of_readings():
     """Against fine steps, in which each input is constant."""
     plant = Aero2()
     delays = jnp.array([0.013, 0.047, 0.111, 0.358])
@@ -115,11 +114,12 @@ def test_each_input_has_its_own_delay_within_a_reading():
 
 def test_a_safe_input_does_not_overtake_those_before_it():
     rig = hardware(effects={"delay_voltage": 0.25}, latency=0.01)
+    advance, write = eqx.filter_jit(Hardware.advance), eqx.filter_jit(Hardware.write)
     state, acted = rig.start(), []
     for n in range(60):
         if n in (0, 10, 13):  # two samples, and a trip soon after the second
-            state = rig.write(state, jnp.array({0: [3.0], 10: [5.0], 13: [0.0]}[n]))
-        state = rig.advance(state)
+            state = write(rig, state, jnp.array({0: [3.0], 10: [5.0], 13: [0.0]}[n]))
+        state = advance(rig, state)
         acted.append(float(state.acting[0]))
     late = 26  # readings; what acts at the end of an interval is shown
     expected = np.repeat([0.0, 3.0, 5.0, 0.0], [late - 1, 10, 3, 60 - late - 12])
@@ -150,10 +150,8 @@ def test_effects_leave_the_drawn_parameters_and_the_known_plant():
     np.testing.assert_array_equal(np.array(wrong.params)[:3], bare.params)
     for i in range(3):
         rigs = [jax.tree.map(lambda leaf, i=i: leaf[i], many) for many in (bare, wrong)]
-        # The plant is odd: with the wrong sign, outputs have the opposite one.
-        np.testing.assert_allclose(
-            *(s * readings(r)[0] for s, r in zip((1, -1), rigs, strict=True))
-        )
+        usual, turned = (readings(rig)[0] for rig in rigs)
+        np.testing.assert_allclose(turned, -usual)  # the plant is odd
 
 
 # ----------------------------------------------------------------------------------- faults
@@ -171,15 +169,15 @@ AFTER = round(FROM / INTERVAL)  # readings
 
 def test_a_frozen_sensor_repeats_and_a_biased_one_is_off_from_a_time_on():
     true, usual, _ = readings(hardware())
-    np.testing.assert_array_equal(true, usual)
+    np.testing.assert_allclose(true, usual, rtol=0, atol=1e-15)
     _, frozen, _ = readings(hardware(faults=Faults(sensor_frozen=FROM)))
-    np.testing.assert_array_equal(frozen[: AFTER - 1], true[: AFTER - 1])
-    np.testing.assert_array_equal(frozen[AFTER - 1 :], true[AFTER - 2])
+    np.testing.assert_allclose(frozen[: AFTER - 1], true[: AFTER - 1], rtol=0, atol=1e-15)
+    assert set(np.asarray(frozen[AFTER - 1 :, 0]).tolist()) == {float(frozen[AFTER - 2, 0])}
     bias = Faults(sensor_bias=[0.07], sensor_bias_from=FROM)
     same, biased, _ = readings(hardware(faults=bias))
-    np.testing.assert_array_equal(same, true)
+    np.testing.assert_allclose(same, true, rtol=0, atol=1e-15)
     off = biased - true
-    np.testing.assert_array_equal(off[: AFTER - 1], 0.0)
+    np.testing.assert_allclose(off[: AFTER - 1], 0.0, atol=1e-15)
     np.testing.assert_allclose(off[AFTER - 1 :], 0.07, rtol=1e-12)
 
 
@@ -189,7 +187,7 @@ def test_a_slow_sensor_is_a_first_order_lag():
     for output in np.asarray(true)[:, 0]:
         expected.append(share * expected[-1] + (1 - share) * output)
     np.testing.assert_allclose(slow[:, 0], expected[1:], rtol=0, atol=1e-12)
-    assert np.max(np.abs(slow - true)) > 0.01
+    assert np.max(np.abs(slow - true)) > 0.15 * np.max(np.abs(true))
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.15])
@@ -223,14 +221,15 @@ def test_a_stuck_actuator_holds_its_input_also_after_a_trip():
 # --------------------------------------------------------------------------------- by name
 
 
-@pytest.fixture
-def worst(tmp_path):
+@pytest.fixture(scope="module")
+def worst(tmp_path_factory):
     """The file of a plant with a delay, as a search writes it."""
     found = ex.falsify(
         "chirp", "aero2", steps=20, budget=100, rig=True, uncertainty={"delay_voltage": (0, 0.3)}
     )
-    found.save(tmp_path / "worst.json")
-    return found, str(tmp_path / "worst.json")
+    path = tmp_path_factory.mktemp("worst") / "worst.json"
+    found.save(path)
+    return found, str(path)
 
 
 def facts(fault, name="simulated", plant=PLANT):
@@ -286,21 +285,25 @@ def test_a_fault_that_is_not_allowed_is_one_sentence(fault, words):
 
 def test_a_case_on_the_rig_is_the_run_of_its_plant_and_seed():
     plant = Aero2()
-    box = Uncertainty.of(plant, 0.3, {"delay_voltage": (0.0, 0.25), "initial_pitch": (-0.1, 0.1)})
+    box = Uncertainty.of(plant, 0.3, {"delay_voltage": (0.0, 0.2), "initial_pitch": (-0.1, 0.1)})
     play = OnRig.of(box, CHIRP, STEPS, num_readings=READINGS, **AT_ONCE)
-    assert play.num_written == 6
+    assert play.num_written == 5
     case = Cases(jnp.array([0.3, -0.4, 0.8, 1.0, -0.5]), jnp.asarray(5))
     made, params = box.at(case.point)
-    rig = play.hardware(case)
-    assert rig.params == params
+    assert play.hardware(case).params == params
     episode = run_episode(made, params, CHIRP, STEPS, jax.random.key(0))
-    size = np.max(np.abs(episode.outputs)) / RULES.critical[0]
-    found = eqx.filter_jit(play)(case)
-    assert size * (1 - 1e-3) < found < 1.1 * size  # between samples it may be larger
+    played = eqx.filter_jit(lambda play, case: (play.run(case), play(case)))
+    run, nearness = played(play, case)
+    far = np.abs(run.measured - episode.outputs)
+    assert np.max(far) < 5 * float(plant.sensor.noise_sd[0])
+    np.testing.assert_allclose(nearness, run.max_abs_output[0] / RULES.critical[0], rtol=1e-12)
+    assert run.max_abs_output[0] >= np.max(np.abs(episode.outputs)) * (1 - 1e-5)
     noise = play.noise(case)
     assert noise.shape == ((STEPS + 1) * READINGS + 1, 1)
-    given = eqx.filter_jit(OnRig.run)(play, Cases(case.point, case.seed, noise))
-    np.testing.assert_array_equal(given.measured, eqx.filter_jit(OnRig.run)(play, case).measured)
+    given, _ = played(play, Cases(case.point, case.seed, noise))
+    np.testing.assert_allclose(given.measured, run.measured, rtol=0, atol=1e-15)
+    silent, _ = played(play, Cases(case.point, case.seed, 0 * noise))
+    np.testing.assert_allclose(silent.measured, episode.outputs, rtol=0, atol=1e-5)
 
 
 def test_a_gradient_through_the_rig_is_that_of_differences():
@@ -321,42 +324,41 @@ def test_a_gradient_through_the_rig_is_that_of_differences():
         np.testing.assert_allclose(slope[i], differences, rtol=0.02)
 
 
-def test_a_search_on_the_rig_climbs_and_is_the_same_again():
-    box = Uncertainty.of(Aero2(), 0.3, {"delay_voltage": (0.0, 0.2)})
-    play = OnRig.of(box, CHIRP, 30, num_readings=5)
-    few = Effort(random=8, corners=4, noises=1, starts=4, steps=6, more_noises=2, searched_noises=2)
-    first, again = (search(play, few, seed=1) for _ in range(2))
-    assert first.stages == again.stages
-    random, corners, climbed, *_ = (stage.nearness for stage in first.stages)
-    assert climbed > max(random, corners)
-    with_noise = first.worst_noise
-    assert with_noise is not None
-    assert with_noise.noise.shape[1] == 31 * 5 + 1
-
-
 def test_the_worst_plant_on_the_rig_is_replayed_from_its_file(worst, tmp_path):
     found, path = worst
     assert found.certificate()["rig"] is True
     assert found.certificate()["filter"] is False
     assert "aero2's simulated rig" in repr(found)
     options = {"excitation": "chirp", "fast": True, "steps": 20, "seed": found.worst_seed}
-    again = ex.run(rig=path, out=tmp_path / "replay.csv", **options)
+    again: Any = ex.run(rig=path, out=tmp_path / "replay.csv", **options)
     np.testing.assert_allclose(again.record.outputs, found.record.outputs, atol=1e-9)
     np.testing.assert_allclose(again.record.inputs[:-1], found.record.inputs[:-1], atol=1e-9)
     true = again.outcome.rig["true_params"]
     assert true == {n: v for n, v in found.worst.items() if n in true}
     assert again.description.name == "aero2"
-    largest = again.outcome.rig["true_max_abs_output"][0] / RULES.critical[0]
-    np.testing.assert_allclose(largest, found.nearness, rtol=1e-6)
+    largest = np.ravel(again.outcome.rig["true_max_abs_output"])[0] / RULES.critical[0]
+    # A search also looks at the sample after the last one.
+    assert largest * (1 - 1e-9) <= found.nearness < 1.02 * largest
+    stages = {stage.name: stage.nearness for stage in found.stages}
+    assert stages["ascents"] > stages["random plants"]
 
 
-def test_a_search_behind_the_filter_finds_less():
-    options = {"steps": 12, "budget": 100, "options": {"amplitude": 20.0}, "rig": True}
-    bare = ex.falsify("square", "aero2", **options)
-    filtered = ex.falsify("square", "aero2", filter=True, **options)
-    assert filtered.nearness < bare.nearness
-    assert filtered.certificate()["filter"] is True
-    assert "behind the safety filter" in repr(filtered)
+def test_a_case_behind_the_filter_stays_below_the_level():
+    box, loud = Uncertainty.of(Aero2(), 0.3), Chirp(amplitude=20.0)
+    case = Cases(jnp.array([1.0, 1.0, -1.0]), jnp.asarray(0))
+    near = [
+        float(eqx.filter_jit(OnRig.of(box, loud, 150, safety, num_readings=2))(case))
+        for safety in (NO_FILTER, SafetyFilter.of(Aero2(), 0.3))
+    ]
+    assert near[1] < 1 < near[0], near
+
+
+def test_what_was_searched_is_said(worst):
+    found, _ = worst
+    filtered = dataclasses.replace(found, filter=True, policy=ex.read_policy("aero2"))
+    assert "aero2's simulated rig behind the safety filter" in repr(filtered)
+    claim = filtered.certified().claim
+    assert "experiments on the simulated rig behind the safety filter" in claim
 
 
 def test_a_filter_without_a_rig_is_refused():

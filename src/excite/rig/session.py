@@ -295,7 +295,7 @@ def run(
     for warning in warnings:
         on_warning(warning)
     if require_certificate:
-        source.check_certificate(description, spread)
+        source.check_certificate(description, spread, filter)
     make = source.maker(description, known, steps, seed)
     prior = _required(known, "--filter") if filter else None
     safety_filter = None if prior is None else SafetyFilter.of(prior, spread, slew)
@@ -342,12 +342,12 @@ class _Source:
             raise ValueError(f"{self.name}: {error}") from None
         return [] if warning is None else [f"{self.name}: {warning}"]
 
-    def check_certificate(self, plant: PlantDescription, spread: float) -> None:
+    def check_certificate(self, plant: PlantDescription, spread: float, filtered: bool) -> None:
         """Raises ValueError for what is played without a certificate of its safety."""
         if self.policy is None:
             raise ValueError(f"{self.name} is no policy: only policies have certificates")
         try:
-            require_certified(self.policy, plant, spread)
+            require_certified(self.policy, plant, spread, filtered)
         except ValueError as error:
             raise ValueError(f"{self.name}: {error}") from None
 

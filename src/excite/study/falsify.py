@@ -73,6 +73,7 @@ class Falsification:
         seed: of the search.
         rig: whether experiments were made on the plant's simulated rig.
         filter: whether they were made there behind the predictive safety filter.
+        spread: of parameters without a range, and of the filter's prior.
     """
 
     plant: PlantDescription
@@ -91,6 +92,7 @@ class Falsification:
     seed: int
     rig: bool = False
     filter: bool = False
+    spread: float = 0.3
 
     @property
     def is_safe(self) -> bool:
@@ -296,6 +298,7 @@ def falsify(
         seed=seed,
         rig=rig,
         filter=filter,
+        spread=reach,
     )
 
 
