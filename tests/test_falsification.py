@@ -548,6 +548,7 @@ def certified():
         ({"num_steps": 19}, {}, "first 19 of 20 steps"),
         ({}, {"plant": "aero2_lag"}, "for another plant"),
         ({}, {"spread": 0.4}, "for another uncertainty: J_p"),
+        ({"filter": True}, {}, "behind the safety filter: add --filter"),
     ],
 )
 def test_a_run_that_needs_a_certificate_refuses_any_other(certified, change, options, words):

@@ -232,7 +232,7 @@ REFUSALS = {
         ("--out", "r.csv", "--excitation", "chirp", "--rig", "own.py:Foreign"),
         "the rig is of 'dc_motor'",
     ),
-    "fault": ((*SIGNAL, *FAST, "--fault", "wind=0.1"), "--fault wind=0.1 is not allowed"),
+    "fault": ((*SIGNAL, *FAST, "--fault", "wind=0.1"), "unknown fault of a simulated rig 'wind'"),
     "fault of no number": ((*SIGNAL, *FAST, "--fault", "latency=nan"), "is not allowed"),
     "negative fault": ((*SIGNAL, *FAST, "--fault", "dropout=-0.1"), "is not allowed"),
     "latency": ((*SIGNAL, *FAST, "--fault", "latency=0.2"), "must be less than the sampling time"),

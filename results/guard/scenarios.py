@@ -114,7 +114,9 @@ class Play:
         """Of one scenario."""
         spread = effects.get("parameters", self.spread)
         more = {k: (v, v) for k, v in effects.items() if k != "parameters"}
-        own = {k: v for k, v in self.ranges.items() if "parameters" not in effects or k != "parameters"}
+        own = {
+            k: v for k, v in self.ranges.items() if "parameters" not in effects or k != "parameters"
+        }
         box = Uncertainty.of(self.plant, spread, {**own, **more})
         hardware = hardware_of(box, faults, self.num_readings, runs)
         without, guarded = (

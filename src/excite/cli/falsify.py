@@ -64,6 +64,8 @@ from .options import (
     show_default=True,
     help="Seed of the search.",
 )
+@click.option("--rig", is_flag=True, help="Search on the plant's simulated rig.")
+@click.option("--filter", is_flag=True, help="With --rig: behind the predictive safety filter.")
 @click.option("--out", type=OUT_FILE, metavar="FILE", help="Write the worst plant (.json).")
 @click.option(
     "--certify",
@@ -119,8 +121,13 @@ def falsify(
             chosen = "".join(
                 f" --set {name}={json.dumps(value)}" for name, value in settings.items()
             )
+            replay = f"excite simulate {out}"
+            if found.rig:
+                known = "" if options["plant"] is None else f" --plant {options['plant']}"
+                filtered = f" --filter --spread {found.spread:g}" if found.filter else ""
+                replay = f"excite run --rig {out}{known}{filtered} --fast --out replay.csv"
             click.echo(
-                f"worst plant: {out}\nreplay: excite simulate {out} --excitation {excitation}"
+                f"worst plant: {out}\nreplay: {replay} --excitation {excitation}"
                 f"{chosen} --steps {found.num_steps} --seed {found.worst_seed}"
             )
     if certify is not None:

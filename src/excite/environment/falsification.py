@@ -9,9 +9,9 @@ where it finds none (Y. Annpureddy et al., S-TaLiRo: temporal logic falsificatio
 
 from __future__ import annotations
 
+import abc
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Protocol
 
 import equinox as eqx
 import jax
@@ -50,25 +50,25 @@ class Cases(eqx.Module):
     noise: Float[Array, "*case sample output"] | None = None
 
 
-class Experiments(Protocol):
-    """What a search simulates: `OnPlant`, or `rig.falsification.OnRig`; a pytree.
+class AbstractExperiments(eqx.Module):
+    """What a search simulates: `OnPlant`, or `OnRig` of `excite.rig.falsification`.
 
     Attributes:
         uncertainty: the box.
     """
 
-    uncertainty: Uncertainty
+    uncertainty: eqx.AbstractVar[Uncertainty]
 
+    @abc.abstractmethod
     def __call__(self, case: Cases) -> Float[Array, ""]:
         """The nearness of one case."""
-        ...
 
+    @abc.abstractmethod
     def noise(self, case: Cases) -> Float[Array, "sample output"]:
         """The noise of a case's seed, in standard deviations."""
-        ...
 
 
-class OnPlant(eqx.Module):
+class OnPlant(AbstractExperiments):
     """Experiments of an excitation on the plants of a box.
 
     Attributes:
@@ -162,7 +162,7 @@ class Found:
 
 
 def search(
-    play: Experiments,
+    play: AbstractExperiments,
     effort: Effort,
     seed: int,
     progress: Callable[[str, int, int], None] = lambda *_: None,
@@ -237,12 +237,12 @@ def _chunks(cases: Cases, progress: Callable[[int, int], None]) -> Iterator[tupl
 
 
 @eqx.filter_jit
-def _play_chunk(play: Experiments, cases: Cases) -> Float[Array, " case"]:
+def _play_chunk(play: AbstractExperiments, cases: Cases) -> Float[Array, " case"]:
     return jax.vmap(play)(cases)
 
 
 def _played(
-    play: Experiments, cases: Cases, progress: Callable[[int, int], None]
+    play: AbstractExperiments, cases: Cases, progress: Callable[[int, int], None]
 ) -> Float[np.ndarray, " case"]:
     """The nearness of every case."""
     parts = [np.asarray(_play_chunk(play, c))[:n] for c, n in _chunks(cases, progress)]
@@ -288,12 +288,12 @@ def climbed(
 
 
 @eqx.filter_jit
-def _climb_chunk(play: Experiments, cases: Cases, num_steps: int, bound: Array) -> tuple:
+def _climb_chunk(play: AbstractExperiments, cases: Cases, num_steps: int, bound: Array) -> tuple:
     return jax.vmap(lambda first: climbed(play, first, num_steps, bound))(cases)
 
 
 def _climbed(
-    play: Experiments,
+    play: AbstractExperiments,
     cases: Cases,
     num_steps: int,
     bound: float,

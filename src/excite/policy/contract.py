@@ -444,17 +444,24 @@ def mismatch(policy: Policy, plant: PlantDescription) -> str | None:
     )
 
 
-def require_certified(policy: Policy, plant: PlantDescription, spread: float) -> None:
+def require_certified(
+    policy: Policy, plant: PlantDescription, spread: float, filtered: bool = False
+) -> None:
     """Raises ValueError where no certificate says that a search found the policy safe.
 
     Args:
         policy: to be played.
         plant: on which the search must have been made.
         spread: of its parameters, which the search must have covered.
+        filtered: whether it is played behind the safety filter.
     """
     certificate = policy.certificate
     if certificate is None:
         raise ValueError("the policy has no certificate ('excite falsify --certify' makes one)")
+    if certificate.get("filter") and not filtered:
+        raise ValueError(
+            "the policy's certificate is for experiments behind the safety filter: add --filter"
+        )
     largest = [certificate["nearness"], certificate["noise_nearness"]]
     if None in largest or max(largest) >= 1 or certificate.get("violations", 0):
         raise ValueError(f"the policy's certificate says that it is not safe ({policy.claim})")

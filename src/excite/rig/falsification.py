@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..environment.falsification import Cases, nearness
+from ..environment.falsification import AbstractExperiments, Cases, nearness
 from ..excitation import AbstractExcitation
 from ..plant.uncertainty import Uncertainty
 from ..safety import Supervision
@@ -32,7 +32,7 @@ from .simulated import (
 )
 
 
-class OnRig(eqx.Module):
+class OnRig(AbstractExperiments):
     """Experiments of an excitation on simulated rigs with the plants of a box.
 
     Attributes:
@@ -117,7 +117,7 @@ class OnRig(eqx.Module):
         size = nearness(self.uncertainty.plant, run.max_abs_output[None])
         return Trajectory(time, run.inputs, run.measured, run.measured), float(size)
 
-    def noise(self, case: Cases) -> Float[Array, "reading output"]:
+    def noise(self, case: Cases) -> Float[Array, "sample output"]:
         """The noise of a case's seed at all readings, in standard deviations."""
         count = (self.num_steps + 1) * self.num_readings + 1
         return self.hardware(case).reading_noise(count)

@@ -313,7 +313,7 @@ def run(
     for warning in warnings:
         on_warning(warning)
     if require_certificate:
-        source.check_certificate(description, spread)
+        source.check_certificate(description, spread, filter)
     watching = source.guard(description) if guard else None
     make = source.maker(description, known, steps, seed)
     prior = _required(known, "--filter") if filter else None
@@ -365,12 +365,12 @@ class _Source:
             raise ValueError(f"{self.name}: {error}") from None
         return [] if warning is None else [f"{self.name}: {warning}"]
 
-    def check_certificate(self, plant: PlantDescription, spread: float) -> None:
+    def check_certificate(self, plant: PlantDescription, spread: float, filtered: bool) -> None:
         """Raises ValueError for what is played without a certificate of its safety."""
         if self.policy is None:
             raise ValueError(f"{self.name} is no policy: only policies have certificates")
         try:
-            require_certified(self.policy, plant, spread)
+            require_certified(self.policy, plant, spread, filtered)
         except ValueError as error:
             raise ValueError(f"{self.name}: {error}") from None
 

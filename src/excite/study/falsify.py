@@ -87,6 +87,7 @@ class Falsification:
         guard: for rigs, of a policy; None where it was not asked for.
         rig: whether experiments were made on the plant's simulated rig.
         filter: whether they were made there behind the predictive safety filter.
+        spread: of parameters without a range, and of the filter's prior.
     """
 
     plant: PlantDescription
@@ -109,6 +110,7 @@ class Falsification:
     guard: Guard | None = None
     rig: bool = False
     filter: bool = False
+    spread: float = 0.3
 
     @property
     def is_safe(self) -> bool:
@@ -393,6 +395,7 @@ def falsify(
         guard=made,
         rig=rig,
         filter=filter,
+        spread=reach,
     )
 
 
