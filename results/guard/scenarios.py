@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from pathlib import Path
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 import excite as ex
@@ -22,7 +22,7 @@ from excite.excitation.catalogue import excitation_and_origin
 from excite.plant.catalogue import plant_from
 from excite.plant.uncertainty import Uncertainty
 from excite.rig.faults import Faults
-from excite.rig.guard_design import GuardFilter, guard_for
+from excite.rig.guard_design import guard_for
 from excite.rig.simulated import (
     Hardware,
     at_interval,
@@ -54,13 +54,8 @@ def main() -> None:
             continue
         runs = given.declared if name == "as declared" else given.runs
         rows.append(play.row(name, effects, faults, runs))
-        r = rows[-1]
-        print(
-            f"{name:22s} violations without {r['without']:4d}, with {r['with']:4d}, new "
-            f"{r['new']:3d} of {runs}; detected {r['detected']:4d}, median sample "
-            f"{r['median_sample']}; largest {r['largest']:.3f}",
-            flush=True,
-        )
+        sys.stdout.write(json.dumps(rows[-1]) + "\n")
+        sys.stdout.flush()
         if given.out:
             given.out.write_text(json.dumps({"policy": given.policy, "rows": rows}, indent=1))
 
@@ -108,7 +103,6 @@ class Play:
         self.num_readings = readings_per_sample(plant)
         self.rules = Supervision.of(plant.description)
         self.guard = guard_for(plant, self.excitation, spread, ranges)
-        print("thresholds", self.guard.rules.thresholds, flush=True)
 
     def row(self, name, effects, faults, runs):
         """Of one scenario."""
@@ -146,10 +140,13 @@ class Play:
 
 def hardware_of(box, faults, num_readings, runs):
     """Rigs with plants drawn from a box; the leading axis is the run."""
-    plant, dt = box.plant, float(box.plant.dt)
-    middle = [jnp.asarray(p) for p in (box.lower, box.upper)]
-    delay = lambda point: (lambda there: there[0].delay(there[1]))(box.at(point))  # noqa: E731
-    count = num_written(delay, len(middle[0]), dt)
+    dt = float(box.plant.dt)
+
+    def delay(point):
+        there, params = box.at(point)
+        return there.delay(params)
+
+    count = num_written(delay, len(box.names), dt)
 
     def draw(key):
         point, rig, fault = jax.random.split(key, 3)

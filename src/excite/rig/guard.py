@@ -230,9 +230,19 @@ def start(xp: ModuleType, rules: GuardRules) -> Belief:
 
 
 def observed(
-    xp: ModuleType, rules: GuardRules, model: Model, belief: Belief, measured: AnyArray
+    xp: ModuleType,
+    rules: GuardRules,
+    model: Model,
+    belief: Belief,
+    measured: AnyArray,
+    is_asked: AnyArray = False,
 ) -> Belief:
-    """The belief after a measurement; it says whether the guard trips."""
+    """The belief after a measurement; it says whether the guard trips.
+
+    Args:
+        measured: outputs.
+        is_asked: whether it trips in any case.
+    """
     is_braking = belief.num_braked > 0
     mean, root, innovation = _corrected(xp, rules, model, belief, measured)
     square = xp.sum(innovation**2)
@@ -240,7 +250,8 @@ def observed(
     sd = xp.sqrt(xp.sum(root**2, axis=1))[rules.num_states :]
     outside = xp.max(abs(mean[rules.num_states :]) - 1 - 3 * sd, initial=-1.0)
     score = xp.stack([square, xp.mean(recent), outside])
-    trips = ~is_braking & ~(score < xp.asarray(rules.thresholds)).all()
+    is_explained = (score < xp.asarray(rules.thresholds)).all() & ~xp.asarray(is_asked)
+    trips = ~is_braking & ~is_explained
     was_frozen = (measured == belief.measured[-1]).any()
     is_blind = belief.is_blind | ((is_braking | trips) & was_frozen)
     starts_again = trips | (is_blind & ~belief.is_blind)
@@ -311,7 +322,7 @@ def _walk_of_brake(xp: ModuleType, rules: GuardRules) -> AnyArray:
 def _points(xp: ModuleType, mean: AnyArray, root: AnyArray) -> AnyArray:
     """The mean, and points on both sides of it along every column of the root."""
     reach = _SQUARE**0.5 * root.T
-    return xp.concatenate([mean[None], mean + reach, mean - reach])
+    return xp.concatenate([mean[None], mean[None] + reach, mean[None] - reach])
 
 
 def _moments(xp: ModuleType, values: AnyArray, n: int) -> tuple[AnyArray, AnyArray, AnyArray]:
@@ -322,7 +333,7 @@ def _moments(xp: ModuleType, values: AnyArray, n: int) -> tuple[AnyArray, AnyArr
     middle, after, before = values[0], values[1 : n + 1], values[n + 1 :]
     mean = (_SQUARE - n) / _SQUARE * middle + xp.sum(after + before, axis=0) / (2 * _SQUARE)
     first = (after - before).T / (2 * _SQUARE**0.5)
-    second = (_SQUARE - 1) ** 0.5 / (2 * _SQUARE) * (after + before - 2 * middle).T
+    second = (_SQUARE - 1) ** 0.5 / (2 * _SQUARE) * (after + before - 2 * middle[None]).T
     return mean, first, second
 
 
@@ -368,8 +379,8 @@ def _replayed(
     for i in range(NUM_REPLAYED):
         states = model.advance(points, inputs[:, i + 1 : i + 1 + depth])
         points = xp.concatenate([states, points[:, n:]], axis=1)
-        off = (model.output(points) - seen[i]) / xp.asarray(rules.visible)
-        error = error + xp.sum(xp.where(xp.isfinite(seen[i]), off, 0.0) ** 2, axis=1)
+        off = (model.output(points) - seen[i][None]) / xp.asarray(rules.visible)[None]
+        error = error + xp.sum(xp.where(xp.isfinite(seen[i])[None], off, 0.0) ** 2, axis=1)
     error = xp.where(xp.isfinite(error), error, xp.inf)
     best, as_now = xp.argmin(error), xp.argmin(xp.where(signs == belief.sign, error, xp.inf))
     is_clear = (error[best] < _CLEARLY * error[as_now]) & (error[as_now] > NUM_REPLAYED)

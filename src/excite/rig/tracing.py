@@ -79,6 +79,8 @@ class _Writer:
             name, after = equation.primitive.name, equation.outvars[0].aval
             is_same = name in _SAME and equation.invars[0].aval == after
             gives = takes if is_same else self._equation(name, takes, equation.params)
+            if len(gives) < len(equation.outvars):  # no operation that programs have
+                gives = gives * len(equation.outvars)
             places |= dict(zip(equation.outvars, gives, strict=False))
         return [place(atom) for atom in jaxpr.outvars]
 

@@ -1,0 +1,250 @@
+"""The guard of a rig: its filter, its brake, its programs for NumPy, and experiments behind it."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from commands import excite
+
+import excite as ex
+from excite.excitation import Chirp
+from excite.plant import Aero2, DCMotor
+from excite.plant.catalogue import plant_named
+from excite.plant.uncertainty import Uncertainty
+from excite.policy import Layout
+from excite.rig import guard
+from excite.rig.faults import Faults
+from excite.rig.filter import linear_model
+from excite.rig.guard import Guard, GuardedPlayer
+from excite.rig.guard_design import GuardFilter, GuardModel, guard_for, rules_of
+from excite.rig.player import SignalPlayer
+from excite.rig.program import Program
+from excite.rig.simulated import drawn_hardware, run_batch
+from excite.rig.tracing import program_of
+from excite.safety import Supervision, Trip
+
+SHIPPED = ["aero2", "aero2_detailed", "aero2_lag", "cart_pole", "dc_motor", "emps"]
+STEPS, READINGS = 60, 5
+
+
+def model_of(name: str) -> tuple[GuardModel, guard.GuardRules]:
+    plant = plant_named(name)
+    first, dt = plant.definition.inputs[0].name, float(plant.dt)
+    ranges = {f"delay_{first}": (0, dt), f"lag_{first}": (0, 2 * dt), "initial_state": "2%"}
+    model = GuardModel.of(Uncertainty.of(plant, 0.3, ranges))
+    return model, rules_of(plant, model)
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_program_computes_what_the_plant_computes(name):
+    model, rules = model_of(name)
+    rng, n = np.random.default_rng(0), len(rules.mean)
+    spread = 0.3 * np.concatenate([rules.state_scale, np.ones(n - rules.num_states)])
+    points = rules.mean + rng.normal(size=(2 * n + 1, n)) * spread
+    past = rng.normal(size=(2 * n + 1, model.depth, len(rules.rest)))
+    functions = model.functions()
+    for function, arrays in ((functions.advance, (points, past)), (functions.output, (points,))):
+        program = program_of(function, *arrays)
+        again = Program.from_dict(json.loads(json.dumps(program.to_dict())))
+        expected = np.asarray(jax.jit(function)(*arrays))
+        np.testing.assert_allclose(again(*arrays), expected, rtol=1e-9, atol=1e-12)
+
+
+def test_a_program_writes_out_loops_products_and_conditions():
+    def function(x, y):
+        def add(total, row):
+            return total + jnp.where(row > 0, row, 2 * row), jnp.tanh(total)
+
+        total, seen = jax.lax.scan(add, x[0], x)
+        backwards, _ = jax.lax.scan(lambda c, r: (0.5 * c + r, None), x[0], x, reverse=True)
+        return jnp.stack([total, seen[2], x.T @ y[:, 0], backwards, jnp.sum(x, axis=0) ** 3])
+
+    x, y = np.random.default_rng(1).normal(size=(4, 3)), np.ones((4, 2))
+    program = program_of(function, x, y)
+    np.testing.assert_allclose(program(2 * x, y), function(2 * x, y), rtol=1e-12)
+
+
+def test_a_function_that_numpy_cannot_have_is_refused():
+    with pytest.raises(ValueError, match=r"the plant.s equations use .*without JAX"):
+        program_of(lambda x: jnp.linalg.inv(x), np.eye(2))
+
+
+def test_a_program_from_a_file_can_only_do_arithmetic():
+    whole = program_of(lambda x: jnp.sin(x) + 1.0, np.ones(2)).to_dict()
+    foreign = json.loads(json.dumps(whole).replace('"sin"', '"__import__"'))
+    with pytest.raises(ValueError, match="unknown operation '__import__'"):
+        Program.from_dict(foreign)
+    with pytest.raises(ValueError, match="damaged"):
+        Program.from_dict({"num_inputs": 1})
+    with pytest.raises(ValueError, match="unknown type 'object'"):
+        Program.from_dict(json.loads(json.dumps(whole).replace('"float64"', '"object"')))
+
+
+def test_for_a_linear_plant_the_filter_is_kalmans():
+    plant = DCMotor()
+    model = GuardModel.of(Uncertainty.of(plant, 0.0, {"initial_state": "5%"}))
+    rules, functions = rules_of(plant, model), model.functions()
+    A, B, C = linear_model(plant)
+    n, rng = rules.num_states, np.random.default_rng(3)
+    mean, P = rules.mean[:n], (rules.root @ rules.root.T)[:n, :n]
+    Q, R = np.diag(rules.walk[:n] ** 2), np.diag(rules.noise**2)
+    belief = guard.start(jnp, rules)
+    observed = jax.jit(lambda b, y: guard.observed(jnp, rules, functions, b, y))
+    moved = jax.jit(lambda b, u: guard.moved(jnp, rules, functions, b, u))
+    for _ in range(15):
+        y, u = C @ mean + rng.normal(size=len(C)) * 0.1, rng.normal(size=1)
+        belief = observed(belief, jnp.asarray(y))
+        S = C @ P @ C.T + R
+        gain, error = P @ C.T @ np.linalg.inv(S), y - C @ mean
+        np.testing.assert_allclose(belief.score[0], error @ np.linalg.solve(S, error), rtol=1e-6)
+        mean, P = mean + gain @ error, P - gain @ S @ gain.T
+        np.testing.assert_allclose(belief.mean[:n], mean, rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose((belief.root @ belief.root.T)[:n, :n], P, rtol=1e-5, atol=1e-12)
+        belief = moved(belief, jnp.asarray(u))
+        mean, P = A @ mean + B @ u, A @ P @ A.T + Q
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_the_brake_stabilises_the_nominal_plant(name):
+    plant = plant_named(name)
+    A, B, _ = linear_model(plant)
+    feedback = model_of(name)[1].feedback
+    assert feedback.shape == B.T.shape
+    assert np.max(np.abs(np.linalg.eigvals(A - B @ feedback))) < 1
+
+
+PLANT = Aero2()
+CHIRP = Chirp(amplitude=8.0)
+RULES = Supervision.of(PLANT.description)
+
+
+@pytest.fixture(scope="module")
+def guarding() -> GuardFilter:
+    ranges = {"delay_voltage": (0, 0.05), "initial_state": "2%"}
+    return guard_for(PLANT, CHIRP, 0.3, ranges, num_steps=STEPS, num_runs=100)
+
+
+def played(guarding: GuardFilter, faults=None, **effects):
+    """Eight runs behind the guard."""
+    keys = jax.random.split(jax.random.key(8), 8)
+    hardware = drawn_hardware(
+        PLANT, READINGS, 0.3, keys, effects=effects, **({"faults": faults} if faults else {})
+    )
+    rules = guarding.supervision(RULES)
+    return run_batch(hardware, CHIRP, rules, STEPS, READINGS, guarding)
+
+
+def test_declared_plants_do_not_trip(guarding):
+    runs = played(guarding)
+    np.testing.assert_array_equal(runs.trip, Trip.NONE)
+    assert (np.asarray(runs.memory.largest) < guarding.rules.thresholds).all()
+
+
+def test_a_wrong_sign_is_found_at_once_and_ends_the_experiment_at_rest(guarding):
+    runs = played(guarding, gain_voltage=-1.0)
+    np.testing.assert_array_equal(runs.trip, Trip.UNEXPLAINED)
+    assert (np.asarray(runs.memory.tripped_at) <= 6).all()
+    assert not np.asarray(runs.is_violation).any()
+
+
+def test_after_a_flip_the_brake_turns_its_sign_too(guarding):
+    runs = played(guarding, Faults(actuator_sign=3.0))
+    assert (np.asarray(runs.memory.tripped_at) >= 30).all()
+    assert (np.asarray(runs.memory.sign) < 1).all()
+    assert np.abs(np.asarray(runs.measured)[:, -1]).max() < 0.2
+
+
+def test_a_sensor_that_stands_still_is_not_believed(guarding):
+    runs = played(guarding, Faults(sensor_frozen=3.0))
+    assert np.asarray(runs.memory.is_blind).all()
+    np.testing.assert_array_equal(runs.memory.sign, 1.0)
+    last = np.asarray(runs.max_abs_output)
+    assert (last < RULES.critical).all()
+
+
+def test_numpy_and_jax_come_to_the_same_belief(guarding):
+    own = Guard.from_dict(json.loads(json.dumps(guarding.guard().to_dict())))
+    record = ex.simulate(PLANT, CHIRP, steps=STEPS, params={"J_p": 0.025}, seed=2)
+    player = GuardedPlayer(SignalPlayer(record.inputs), own)
+    belief, functions = guard.start(jnp, guarding.rules), guarding.model.functions()
+    observed = jax.jit(lambda b, y: guard.observed(jnp, guarding.rules, functions, b, y))
+    moved = jax.jit(lambda b, u: guard.moved(jnp, guarding.rules, functions, b, u))
+    for k in range(20):
+        # The input that is told is another from sample 12 on, so that both trip and brake.
+        measured = record.outputs[k]
+        input = player(k, measured)
+        belief = observed(belief, jnp.asarray(measured))
+        proposed = jnp.asarray(record.inputs[k])
+        expected = guard.decided(jnp, guarding.rules, belief, proposed)
+        np.testing.assert_allclose(input, expected, rtol=1e-6, atol=1e-6)
+        told = input if k < 12 else -3 - input
+        player.applied(told)
+        belief = moved(belief, jnp.asarray(told))
+    assert int(belief.num_braked) > 0
+    facts = player.facts()["guard"]
+    assert isinstance(facts, dict)
+    assert facts["tripped_at"] == int(belief.tripped_at)
+
+
+def lively_policy(steps: int = 30) -> ex.Policy:
+    """A policy whose input follows two clocks."""
+    layout = Layout.of(Aero2().description, 2, steps)
+    layout = Layout(**{**vars(layout), "clocks": (0.07,)})
+    weights = np.zeros((1, layout.size))
+    weights[0, -2:] = 0.4
+    return ex.Policy(Aero2().description, layout, ((weights, np.zeros(1)),), {"spread": 0.2})
+
+
+@pytest.fixture(scope="module")
+def guarded_file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("guard") / "guarded.safetensors"
+    ex.falsify(lively_policy(), budget=100, guard=True).certified().save(path)
+    return path
+
+
+def test_the_guard_travels_in_the_policys_file_and_leaves_its_hash(guarded_file):
+    policy = ex.read_policy(guarded_file)
+    assert policy.guard is not None
+    assert policy.hash == lively_policy().hash
+    assert "with a guard" in repr(policy)
+
+
+def test_run_plays_behind_the_guard_and_records_what_it_did(guarded_file, tmp_path):
+    good = ex.run(policy=guarded_file, plant="aero2", guard=True, fast=True, spread=0.2,
+                  out=tmp_path / "good.csv")  # fmt: skip
+    assert good.outcome.is_complete
+    assert "did not trip" in str(good)
+    bad = ex.run(policy=guarded_file, plant="aero2", guard=True, fast=True, spread=0.2,
+                 fault={"gain_voltage": -1.0}, out=tmp_path / "bad.csv")  # fmt: skip
+    assert bad.outcome.trip == Trip.UNEXPLAINED
+    assert "no plant of the declared uncertainty" in bad.outcome.reason
+    facts = bad.outcome.player["guard"]
+    assert isinstance(facts, dict)
+    assert facts["tripped_at"] < 10
+    assert np.abs(bad.record.outputs).max() < np.deg2rad(40)
+
+
+def test_a_guard_is_refused_where_there_is_none(tmp_path, guarded_file):
+    bare = tmp_path / "bare.safetensors"
+    lively_policy().save(bare)
+    out = ["--out", str(tmp_path / "r.csv")]
+    refused = excite("run", "--plant", "aero2", "--policy", str(bare), "--guard", *out)
+    assert refused.returncode == 2
+    assert "the policy has no guard" in refused.stderr
+    refused = excite("run", "--plant", "aero2", "--excitation", "chirp", "--guard", *out)
+    assert refused.returncode == 2
+    assert "only policies have a guard" in refused.stderr
+    refused = excite("falsify", "aero2", "--guard")
+    assert refused.returncode == 2
+    assert "--certify" in refused.stderr
+    with pytest.raises(ValueError, match="only a policy has a guard"):
+        ex.falsify("chirp", "aero2", guard=True, budget=100)
+
+
+def test_a_damaged_guard_is_one_sentence(guarded_file, tmp_path):
+    policy = ex.read_policy(guarded_file)
+    broken = policy.certified(policy.certificate, {"rules": {}})
+    with pytest.raises(ValueError, match="the guard is damaged"):
+        ex.run(policy=broken, plant="aero2", guard=True, fast=True, out=tmp_path / "r.csv")
