@@ -35,23 +35,24 @@ def main(*names: str) -> None:
             continue
         if name == "aero2":
             for words, ranges in DIFFERENT.items():
-                print(f"{name}, {words}: {told(name, ranges, 2000)}", flush=True)
+                show(name, words, ranges, 2000)
         declared = read_policy(name).provenance["uncertainty"]
-        print(f"{name}, declared uncertainty: {told(name, declared, count)}", flush=True)
+        show(name, "declared uncertainty", declared, count)
 
 
-def told(name: str, ranges: Mapping[str, Range], count: int) -> str:
-    """The number of violations on plants of a box, and the largest output over its level."""
+def show(name: str, words: str, ranges: Mapping[str, Range], count: int) -> None:
+    """Prints the number of violations on plants of a box, and the largest output."""
     plant = plant_named(read_policy(name).plant.name)
     box = Uncertainty.of(plant, SPREAD, ranges)
     play = OnPlant(box, excitation_named(name, {}, plant), 500)
     least = Effort(count, corners=1, noises=1, starts=2, steps=1, more_noises=1, searched_noises=0)
     drawn = search(play, least, SEED).stages[0]
     within = ", ".join(f"{n} {low:g} to {high:g}" for n, (low, high) in box.ranges().items())
-    return (
-        f"{drawn.violations} violations in {drawn.experiments:,} experiments, largest output "
-        f"{drawn.nearness:.3f} of its critical level ({within})"
+    sys.stdout.write(
+        f"{name}, {words}: {drawn.violations} violations in {drawn.experiments:,} experiments, "
+        f"largest output {drawn.nearness:.3f} of its critical level ({within})\n"
     )
+    sys.stdout.flush()
 
 
 if __name__ == "__main__":
