@@ -14,14 +14,14 @@ from excite.simulation import run_episode
 ROOT = Path(__file__).parents[2]
 METHODS = {  # excitation: title, row of results/frontier, colour
     "chirp": ("chirp, ±7.2 V", "chirp", "#767676"),
-    "aero2": ("learned, ±24 V", "gradient D", "#0072B2"),
+    "aero2-ideal": ("learned, ±24 V", "gradient D", "#0072B2"),
 }
 
 
 def main() -> None:
     plt.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False})
     figure, panels = plt.subplot_mosaic(
-        [["u chirp", "u aero2", "bound"], ["y chirp", "y aero2", "bound"]],
+        [["u chirp", "u aero2-ideal", "bound"], ["y chirp", "y aero2-ideal", "bound"]],
         figsize=(10, 3.6), layout="constrained",
     )  # fmt: skip
     rows = json.loads((ROOT / "results" / "frontier" / "table.json").read_text())["rows"]

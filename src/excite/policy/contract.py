@@ -13,6 +13,7 @@ import dataclasses
 import itertools
 import math
 import sys
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -241,12 +242,13 @@ class Policy:
         layout, made = self.layout, self.provenance
         widths = [layout.size, *(len(bias) for _, bias in self.weights)]
         words = [f"{word} {made[word]}" for word in ("method", "agent", "study") if word in made]
+        claim = textwrap.fill(self.claim, 80, initial_indent="  ", subsequent_indent="    ")
         return (
             f"Policy for the plant {self.plant.name}\n"
             f"  observes {layout.window} samples, for {layout.num_steps} steps of "
             f"{self.plant.dt:g} s; network {'-'.join(map(str, widths))}\n"
             f"  trained by {', '.join(words) or 'unknown'}\n"
-            f"  {self.claim}\n"
+            f"{claim}\n"
             f"{'  with a guard (excite run --guard)' + chr(10) if self.guard else ''}"
             f"  hash {self.hash}"
         )
