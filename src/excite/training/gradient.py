@@ -273,7 +273,7 @@ def train_all(
         on_boundary(partial(course.checkpoint, steps), row)
         if i < settings.num_updates:
             is_adversarial = settings.has_adversaries(i) and env.uncertainty is not None
-            course.now, _ = update_all(env, settings, course.now, keys(i), is_adversarial)
+            course.now, _ = update_all(env, settings, course.now, keys(i), is_adversarial, None)
             course.num_updates += 1
     best = course.best.weights
     weights = [jax.tree.map(lambda x, s=s: np.asarray(x[s]), best) for s in range(len(seeds))]
