@@ -54,7 +54,8 @@ class GuardRules:
         root: of their covariance, its lower triangular root.
         walk: standard deviation of their unexplained change in one sample.
         noise: standard deviation of a measurement.
-        feedback: of the brake, input = rest - feedback (state - start).
+        feedback: of the brake, of the distance of the states from the start.
+        past_feedback: of the brake, of the distance of the last inputs from rest, oldest first.
         rest: input at rest.
         lower, upper: input limits.
         watched: indices of the outputs with a critical level.
@@ -71,6 +72,7 @@ class GuardRules:
     walk: np.ndarray
     noise: np.ndarray
     feedback: np.ndarray
+    past_feedback: np.ndarray
     rest: np.ndarray
     lower: np.ndarray
     upper: np.ndarray
@@ -288,8 +290,11 @@ def observed(
 
 def decided(xp: ModuleType, rules: GuardRules, belief: Belief, proposed: AnyArray) -> AnyArray:
     """The input to apply: the proposed one, or that of the brake."""
-    away = (belief.mean - xp.asarray(rules.mean))[: rules.feedback.shape[1]]
-    brake = belief.sign * (xp.asarray(rules.rest) - xp.asarray(rules.feedback) @ away)
+    away, rest = (belief.mean - xp.asarray(rules.mean))[: rules.num_states], xp.asarray(rules.rest)
+    count = rules.depth - 1
+    past = belief.sign * belief.inputs[len(belief.inputs) - count :] - rest[None]
+    brake = xp.asarray(rules.feedback) @ away + xp.asarray(rules.past_feedback) @ xp.ravel(past)
+    brake = belief.sign * (rest - brake)
     brake = xp.clip(xp.where(xp.isfinite(brake), brake, rules.rest), rules.lower, rules.upper)
     return xp.where(belief.num_braked > 0, brake, proposed)
 

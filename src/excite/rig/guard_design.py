@@ -24,7 +24,7 @@ from ..safety import Supervision, safe_input, watched_levels
 from ..simulation import step
 from . import guard
 from .falsification import OnRig
-from .filter import AbstractFilter, linear_model
+from .filter import AbstractFilter
 from .guard import Belief, Guard, GuardRules, Model
 from .tracing import program_of
 
@@ -101,13 +101,10 @@ class GuardModel(eqx.Module):
         return step(plant, state, mean - half, params, next_input=mean + half)
 
 
-def rules_of(
-    known: AbstractPlant, model: GuardModel, gentleness: float = _GENTLE[-1]
-) -> GuardRules:
+def rules_of(model: GuardModel, gentleness: float = 1.0) -> GuardRules:
     """The rules for a model, with thresholds that nothing exceeds.
 
     Args:
-        known: plant without what its equations leave out; the brake is made for it.
         gentleness: weight of the inputs in the brake.
 
     Raises:
@@ -125,7 +122,7 @@ def rules_of(
     spread = np.concatenate([np.maximum(start, 1e-9 * scale), np.ones(count)])
     walk = np.concatenate([_WALK * scale, np.full(count, _WALK)])
     watched, _, critical = watched_levels(d)
-    feedback, rest = _brake(known, gentleness), np.asarray(safe_input(d), float)
+    (feedback, past_feedback), rest = _brake(model, gentleness), np.asarray(safe_input(d), float)
     limits = plant.input_limits
     return GuardRules(
         mean=np.concatenate([np.asarray(plant.initial_state), np.zeros(count)]),
@@ -133,6 +130,7 @@ def rules_of(
         walk=walk,
         noise=_noise(plant),
         feedback=feedback,
+        past_feedback=past_feedback,
         rest=rest,
         lower=np.asarray(limits[0]),
         upper=np.asarray(limits[1]),
@@ -152,23 +150,81 @@ def _noise(plant: AbstractPlant) -> np.ndarray:
     return np.maximum(np.hypot(np.asarray(sensor.noise_sd), rounding), 1e-5 * scale)
 
 
-def _brake(plant: AbstractPlant, gentleness: float) -> np.ndarray:
-    """Linear-quadratic feedback that keeps the outputs with a critical level small."""
-    A, B, C = linear_model(plant)
-    d = plant.definition
+def _brake(model: GuardModel, gentleness: float) -> tuple[np.ndarray, np.ndarray]:
+    """Linear-quadratic feedback that keeps the outputs with a critical level small.
+
+    It is made for the largest delays and lags of the box: a plant that acts sooner is easier to
+    brake. What was written and has not acted yet belongs to the state.
+
+    Returns:
+        Feedback of the plant's state [input, state] and of the last inputs [input, past input].
+    """
+    A, B, C = _linear(model)
+    plant, d = model.uncertainty.plant, model.uncertainty.plant.definition
     watched, _, critical = watched_levels(d)
     states, inputs = (
         np.array([s.scale for s in d.states]),
         np.array([i.amplitude for i in d.inputs]),
     )
-    levels = C[np.array(watched, int)] / critical[:, None]
-    Q = np.diag(states**-2.0) + _WATCHED * levels.T @ levels
+    num_states, num_inputs, num_past = len(states), len(inputs), model.depth - 1
+    # The state, then the last inputs, the newest at the end; a small part of each state leaks
+    # away, so that an effect that nothing controls, such as a drift, does not matter.
+    whole = np.block([
+        [A * (1 - 1e-6), B[:, : num_past * num_inputs]],
+        [np.zeros((num_past * num_inputs, num_states)),
+         np.eye(num_past * num_inputs, k=num_inputs)],
+    ])  # fmt: skip
+    entry = np.zeros((len(whole), num_inputs))
+    entry[:num_states] = B[:, num_past * num_inputs :]
+    if num_past:
+        entry[-num_inputs:] = np.eye(num_inputs)
+    levels = np.zeros((len(watched), len(whole)))
+    levels[:, :num_states] = C[np.array(watched, int)] / critical[:, None]
+    weights = np.concatenate([states**-2.0, np.tile(1e-6 * inputs**-2.0, num_past)])
+    Q = np.diag(weights) + _WATCHED * levels.T @ levels
     R = gentleness * np.diag(inputs**-2.0)
     try:
-        P = scipy.linalg.solve_discrete_are(A, B, Q, R)
+        P = scipy.linalg.solve_discrete_are(whole, entry, Q, R)
     except (np.linalg.LinAlgError, ValueError) as error:
-        raise ValueError(f"no linear feedback brings plant {d.name!r} to rest ({error})") from None
-    return np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+        raise ValueError(
+            f"no linear feedback brings plant {plant.definition.name!r} to rest ({error})"
+        ) from None
+    feedback = np.linalg.solve(R + entry.T @ P @ entry, entry.T @ P @ whole)
+    return feedback[:, :num_states], feedback[:, num_states:]
+
+
+def _linear(model: GuardModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Matrices of one sample of the slowest plant, by secants; B has all inputs of the past."""
+    plant, d = model.uncertainty.plant, model.uncertainty.plant.definition
+    functions = model.functions()
+    names = [model.uncertainty.names[i] for i in model.estimated]
+    slowest = np.array([float(name.startswith(("delay_", "lag_"))) for name in names])
+    middle = np.concatenate([np.asarray(plant.initial_state), slowest])
+    states = np.array([s.scale for s in d.states])
+    inputs = np.tile([i.amplitude for i in d.inputs], model.depth)
+    rest = np.tile(np.asarray(safe_input(d), float), model.depth)
+
+    def secant(response: Callable[[np.ndarray], Array], sizes: np.ndarray) -> np.ndarray:
+        moves = np.diag(sizes)
+        return np.stack(
+            [np.asarray(response(m) - response(-m)) / (2 * max(m)) for m in moves], axis=1
+        )
+
+    def at(state: np.ndarray, past: np.ndarray) -> Array:
+        point = middle + np.concatenate([state, np.zeros(len(slowest))])
+        return functions.advance(
+            jnp.asarray(point)[None], jnp.asarray(past).reshape(1, model.depth, -1)
+        )[0]
+
+    A = secant(lambda move: at(move, rest), states)
+    B = secant(lambda move: at(np.zeros(len(states)), rest + move), inputs)
+    C = secant(
+        lambda move: functions.output(
+            jnp.asarray(middle + np.concatenate([move, np.zeros(len(slowest))]))[None]
+        )[0],
+        states,
+    )
+    return A, B, C
 
 
 def guard_for(
@@ -221,10 +277,10 @@ def guard_for(
             rows.append(np.asarray(function(play, *chunk)))
         return np.concatenate(rows)
 
-    chosen = rules_of(plant, model)
+    chosen = rules_of(model)
     best = np.inf
     for gentleness in _GENTLE:  # what declared plants do after a trip at any time decides
-        rules = rules_of(plant, model, gentleness)
+        rules = rules_of(model, gentleness)
         largest = played(_stopped, rules, stops).max()
         if largest < best:
             chosen, best = rules, largest
