@@ -36,11 +36,15 @@ NUM_RECENT = 10
 NUM_REPLAYED = 5
 """Samples from which the guard infers what was wrong."""
 
+NUM_CAUSES = 1 + 2 * (NUM_REPLAYED - 2)
+"""As declared, and an actuator that turned its sign or died at one of the first samples."""
+
+_NUM_ONSETS = NUM_REPLAYED - 2  # samples at which a fault of the actuator may have begun
 _SQUARE = 3.0  # of the distance of the filter's points, in standard deviations: that of a normal
 _WIDE = 0.05  # after a trip, how far a state may move in one sample unexplained, in its scales
 _QUIET = 0.25  # fraction of the critical levels below which the plant counts as at rest
 _NUM_QUIET, _LONGEST = 5, 60  # samples of rest that end the brake; samples after which it ends
-_CLEARLY = 0.1  # a fault of the actuator must explain the last samples this much better
+_CLEARLY = 0.02  # a fault of the actuator must explain the last samples this much better
 
 
 @dataclass(frozen=True, eq=False)  # hashable: a static argument of compiled functions
@@ -113,7 +117,7 @@ class Guard:
     @property
     def model(self) -> Model:
         """The declared plants."""
-        few = 1 + 2 * NUM_REPLAYED
+        few = NUM_CAUSES
 
         def advance(points: np.ndarray, past: np.ndarray) -> np.ndarray:
             return (self.replay if len(points) == few else self.advance)(points, past)
@@ -368,14 +372,16 @@ def _replayed(
     """State now, and the actuator's sign, that explain the last samples best.
 
     The last samples are played again from the estimate before them: as declared, and with an
-    actuator that turned its sign or died at any of these samples.
+    actuator that turned its sign or died three or more samples ago: in less, a plant that is
+    only late looks the same.
     """
     n, depth = rules.num_states, rules.depth
-    signs = np.array([1.0] + [-1.0] * NUM_REPLAYED + [0.0] * NUM_REPLAYED)
-    onsets = np.array([NUM_REPLAYED, *range(NUM_REPLAYED), *range(NUM_REPLAYED)])
-    # A fault since the first of these samples was there before, so that older inputs had it too.
-    since = np.where(onsets == 0, -depth, onsets)
-    factor = np.where(np.arange(-depth, NUM_REPLAYED) >= since[:, None], signs[:, None], 1.0)
+    since = range(_NUM_ONSETS)
+    signs = np.array([1.0] + [-1.0] * _NUM_ONSETS + [0.0] * _NUM_ONSETS)
+    onsets = np.array([NUM_REPLAYED, *since, *since])
+    # A fault since the first of these samples was there before: older inputs had it too.
+    begins = np.where(onsets == 0, -depth, onsets)
+    factor = np.where(np.arange(-depth, NUM_REPLAYED) >= begins[:, None], signs[:, None], 1.0)
     inputs = xp.asarray(factor)[:, :, None] * belief.inputs[None]
     quantities = xp.clip(belief.means[0, n:], -1.0, 1.0)
     points = xp.tile(xp.concatenate([belief.means[0, :n], quantities]), (len(signs), 1))

@@ -34,7 +34,7 @@ _SAFE = 0.99  # largest output over its level that a brake may leave
 _LATENCY = 0.2  # of a rig, at most, in samples
 _MARGIN, _MARGIN_OUTSIDE = 1.3, 0.15  # of the thresholds above the largest score
 _CHUNK = 100  # experiments of one call
-_VISIBLE = 0.003  # of an output's scale
+_VISIBLE = 0.005  # of an output's scale
 _WALK = 1e-3  # unexplained change in one sample, of a state in its scales and of a quantity
 
 
@@ -355,7 +355,7 @@ class GuardFilter(AbstractFilter):
         rules, model = self.rules, self.model.functions()
         n, shape = len(rules.mean), (rules.depth, len(rules.rest))
         programs = []
-        for count in (2 * n + 1, 1 + 2 * guard.NUM_REPLAYED):
+        for count in (2 * n + 1, guard.NUM_CAUSES):
             points, past = np.zeros((count, n)), np.zeros((count, *shape))
             programs += [program_of(model.advance, points, past), program_of(model.output, points)]
         return Guard(rules, *programs)
