@@ -112,7 +112,7 @@ def test_the_brake_brings_the_slowest_plant_to_rest(name):
     functions, n = model.functions(), rules.num_states
     names = [model.uncertainty.names[i] for i in model.estimated]
     slowest = np.array([float(name.startswith(("delay_", "lag_"))) for name in names])
-    away = 0.02 * rules.state_scale * (np.arange(n) < len(plant_named(name).definition.states))
+    away = 0.2 * rules.state_scale * (np.arange(n) < len(plant_named(name).definition.states))
     belief = guard.start(jnp, rules)
     belief = belief._replace(num_braked=jnp.asarray(1))
 

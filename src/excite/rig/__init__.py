@@ -4,8 +4,9 @@
 rig is), `player` (what proposes inputs), `loop` (the real-time loop) and `recorder` (the
 record on disk) and `watchdog` (a process that outlives this one), all with NumPy alone;
 rigs in `simulated`, `quanser` and `fmu`, by name in `catalogue`; `excitation` plays any
-excitation, `filter` is a predictive safety filter, `live_estimate` estimates while the
-experiment runs. Modules that need JAX or an extra are imported by name.
+excitation, `filter` is a predictive safety filter, `guard` notices a plant that is not as
+declared, `live_estimate` estimates while the experiment runs. Modules that need JAX or an
+extra are imported by name.
 """
 
 from .contract import AbstractRig as AbstractRig
