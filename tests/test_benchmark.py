@@ -438,6 +438,6 @@ def test_a_table_says_what_its_plants_differ_in():
     box = {"d_S": "10%", "initial_pitch": [-0.1, 0.1]}
     study = tiny(uncertainty=box, clairvoyant={"plants": 2, "starts": 1})
     notes = " ".join(footnotes(benchmark.facts(study)))
-    assert "d_S 10%, initial_pitch -0.1 to 0.1" in notes
+    assert "in addition d_S ± 10 %, initial_pitch -0.1 to 0.1" in notes
     assert "clairvoyant signals are for plants of the spread alone" in notes
-    assert "differ in more" not in " ".join(footnotes(benchmark.facts(tiny())))
+    assert "in addition" not in " ".join(footnotes(benchmark.facts(tiny())))

@@ -355,7 +355,9 @@ def test_a_case_behind_the_filter_stays_below_the_level():
 
 def test_what_was_searched_is_said(worst):
     found, _ = worst
-    filtered = dataclasses.replace(found, filter=True, policy=ex.read_policy("aero2"))
+    filtered = dataclasses.replace(
+        found, filter=True, policy=ex.read_policy("aero2"), num_steps=500
+    )
     assert "aero2's simulated rig behind the safety filter" in repr(filtered)
     claim = filtered.certified().claim
     assert "experiments on the simulated rig behind the safety filter" in claim
