@@ -227,8 +227,8 @@ def run_episode(
 
     def advance(carry: tuple, now: tuple) -> tuple[tuple, tuple]:
         (state, past, memory), (noise, k) = carry, now
-        output = plant.true_output(state, params)
-        measured = sensed(plant, plant.output(state, params), noise)
+        output, shown = plant.true_and_shown(state, params)
+        measured = sensed(plant, shown, noise)
         memory, input = excitation(memory, measured)
         input = jnp.clip(input, lower, upper)
         state, past = moved(state, past, input, k)
@@ -238,7 +238,7 @@ def run_episode(
     start = plant.initial_state, past, excitation.init(plant, num_steps, jax.random.split(key)[0])
     steps = noise[:-1], jnp.arange(num_steps)
     (state, *_), (inputs, measured, outputs) = jax.lax.scan(advance, start, steps)
-    last, shown = plant.true_output(state, params), plant.output(state, params)
+    last, shown = plant.true_and_shown(state, params)
     return Trajectory(
         time=jnp.arange(num_steps + 1) * plant.dt,
         inputs=inputs,

@@ -165,8 +165,7 @@ class Env(eqx.Module):
         is_finite = jnp.all(jnp.isfinite(after)) & self._is_visible(after, state.params)
         is_finite = is_finite & state.is_finite
         after = jnp.where(is_finite, after, state.plant_state)
-        output = plant.true_output(after, state.params)
-        shown = plant.output(after, state.params)
+        output, shown = plant.true_and_shown(after, state.params)
         measured = measure(plant, shown, jax.random.fold_in(state.key, k))
         sample = StepData(state.params, state.plant_state, input, measured)
         memory, gain = self.objective.update(plant, state.memory, sample, state.k)

@@ -170,6 +170,14 @@ class AbstractPlant(_Module):
         """
         return self.output(state, params)
 
+    def true_and_shown(
+        self, state: Float[Array, " state"], params: Params
+    ) -> tuple[Float[Array, " output"], Float[Array, " output"]]:
+        """`true_output` and `output`: computed once where they are the same."""
+        shown = self.output(state, params)
+        is_same = type(self).true_output is AbstractPlant.true_output
+        return (shown if is_same else self.true_output(state, params)), shown
+
     def delay(self, params: Params) -> Float[Array, " input"] | None:
         """Time after which each input acts [s]; None: all inputs act at once.
 

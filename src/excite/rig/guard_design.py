@@ -247,7 +247,8 @@ def guard_for(
     Args:
         plant: for which the excitation was made.
         excitation: plays.
-        spread, ranges: declared uncertainty, see `Uncertainty.of`.
+        spread: of the declared uncertainty, see `Uncertainty.of`.
+        ranges: of the declared uncertainty.
         num_steps: of an experiment.
         num_runs: experiments.
         seed: of these.
