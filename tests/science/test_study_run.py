@@ -147,7 +147,8 @@ def test_rows_are_methods_then_agents_with_what_a_benchmark_row_has(run):
     ]
     methods, agents = content["rows"][:2], content["rows"][2:]
     for row in agents:
-        assert row.keys() == methods[0].keys()
+        assert row.keys() - {"by_seed"} == methods[0].keys()
+        assert len(row["by_seed"]["violations"]) == 2
         assert row["seeds"] == 2
         assert row["evaluations"] == 10
         assert row["train_seconds"] > 0
