@@ -25,9 +25,9 @@ ORDER = (
     "files",
     "figure",
     "record",
+    "policy",
     "report",
     "plant",
-    "policy",
     "safety",
     "excitation",
     "simulation",
@@ -43,7 +43,7 @@ ORDER = (
     "__main__",
 )
 PLACE = {room: i for i, room in enumerate(ORDER)}
-PURE = ORDER[PLACE["plant"] : PLACE["training"] + 1]
+PURE = ("policy", *ORDER[PLACE["plant"] : PLACE["training"] + 1])
 
 DOORS = {
     "gymnasium": ["environment/gymnasium"],

@@ -793,6 +793,11 @@ BAD: dict[str, tuple[str, tuple[str, ...]]] = {
     "unknown plant to judge": ("information emsp", ("'emsp'", "'emps'?")),
     "no such plant file": ("simulate nowhere.py:Tank", ("nowhere.py", "no such file")),
     "plant that fails": ("simulate own.py:Broken", ("Broken", "a_name_that_is_nowhere")),
+    "plant for the page that is nowhere": ("serve --plant no.json", ("no.json", "No such file")),
+    "plant that the page has": ("serve --plant aero2", ("'aero2'", "already")),
+    "plant without a name for the page": (
+        "serve --plant aero2+delay_voltage", ("--plant", "letters", "'aero2+delay_voltage'"),
+    ),
     "no such plant class": ("simulate own.py:Tanc", ("own.py", "'Tanc'")),
     "unknown excitation": (
         "simulate aero2 --excitation chrip --out r.csv", ("'chrip'", "'chirp'?", "multisine"),

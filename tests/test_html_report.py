@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from excite.cli import main
+from excite.policy import read_policy
 from excite.report.estimates import parameter_cells, residual_cells, residual_in_words
 from excite.report.html import report_html
 from excite.report.numbers import number
@@ -210,6 +211,11 @@ def test_an_experiment_makes_one_small_page_that_needs_nothing_else(name, made):
     assert page.tags["svg"] >= 1
     assert page.tags["img"] == 0
     assert str(made.parent) not in page.text  # where it lies is nobody's business
+
+
+def test_what_a_search_found_for_an_agent_is_on_its_page():
+    policy = read_policy(RESULTS / "robust/seeds/gradient_D/0/policy.safetensors")
+    assert f"gradient D, seed 0: {policy.claim}" in page_of(RESULTS / "robust", drawn=True).words
 
 
 def test_the_page_is_light_dark_and_printable(made):

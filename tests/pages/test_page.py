@@ -9,11 +9,17 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from commands import PATIENCE
 from served import MAX_GAP, TRIES, served
 
+import excite as ex
 from excite.files import write_json
+from excite.plant import Aero2
+from excite.plant.catalogue import plant_in_file
+from excite.plant.contract import with_nominal
+from excite.policy import read_policy
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 if CHROMIUM is None and os.environ.get("EXCITE_BROWSER_TESTS") != "1":
@@ -53,7 +59,9 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     (run / "table.md").write_text(cells + "| <img src=x onerror=alert(1)> | 1 | 2 |\n")
     curve = "steps,return,violation_rate,relative_error_J_p\n0,-1,0,1\n10,2,0,0.01\n"
     (run / "seeds" / "agent" / "0" / "curve.csv").write_text(curve)
-    with served(folder, "--workers", "1") as where:
+    own = tmp_path_factory.mktemp("plants") / "worst.json"
+    write_json(own, plant_in_file(with_nominal(Aero2(), {"J_p": 0.017})))
+    with served(folder, "--workers", "1", "--plant", str(own)) as where:
         yield where
 
 
@@ -143,6 +151,26 @@ def test_a_run_from_choosing_to_the_report(address: str, page: Page, tmp_path: P
         if min(paints) < 1000:
             break
     assert min(paints) < 1000, paints
+
+
+def test_a_plant_of_ones_own_is_played_with_a_policy_of_which_is_told_what_was_searched(
+    address: str, page: Page, tmp_path: Path
+):
+    ready(page, address)
+    expect(page.locator("#claim")).to_be_empty()
+    page.locator("#plant").select_option("worst")
+    page.get_by_label("Excitation or policy").select_option("aero2")
+    expect(page.locator("#claim")).to_have_text(f"Safety: {read_policy('aero2').claim}.")
+    for label in ("First", "Second"):
+        page.get_by_label(label, exact=True).select_option("aero2")  # nothing to compare with
+    page.get_by_role("button", name="Run", exact=True).click()
+    expect(status(page)).to_have_text("Done.", timeout=WAIT)
+    with page.expect_download() as waiting:
+        page.locator("#outcome a[href$='record.csv']").click()
+    waiting.value.save_as(tmp_path / "record.csv")
+    expected = ex.simulate(with_nominal(Aero2(), {"J_p": 0.017}), "aero2", seed=0)
+    played = ex.read_record(tmp_path / "record.csv", Aero2().description)
+    np.testing.assert_allclose(played.outputs, expected.outputs, rtol=1e-9)
 
 
 def test_a_run_is_stopped(address: str, page: Page):

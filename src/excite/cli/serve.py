@@ -44,10 +44,24 @@ from .options import OUT_FILE, WholeNumber, cache_folder, json_option, show_json
     type=WholeNumber(1, 64),
     help="Worker processes; default one per core, at most four.",
 )
+@click.option(
+    "--plant",
+    "plants",
+    multiple=True,
+    metavar="FILE",
+    help="A plant of your own (path/to/file.py:ClassName), or the worst plant of 'excite falsify' "
+    "(.json); repeat for several.",
+)
 @json_option
 def serve(
-    host: str, port: int, runs: Path, token: str | None, workers: int | None, as_json: bool
-) -> None:  # fmt: skip
+    host: str,
+    port: int,
+    runs: Path,
+    token: str | None,
+    workers: int | None,
+    plants: tuple[str, ...],
+    as_json: bool,
+) -> None:
     """Serve the bench page until interrupted: run an excitation and watch what it identifies.
 
     Other computers cannot reach it unless --host is set.
@@ -58,10 +72,11 @@ def serve(
     except ImportError:
         raise ValueError("the bench page needs the extra: pip install 'excite[web]'") from None
 
+    named = _by_name(plants)
     source = click.get_current_context().get_parameter_source("runs")
     if source is ParameterSource.DEFAULT and not runs.exists():
         runs.mkdir()  # no run yet
-    settings = PageSettings.of(runs, host, token, workers, cache_folder())
+    settings = PageSettings.of(runs, host, token, workers, cache_folder(), named)
     with listening_at(host, port) as listening:
         address = address_of(settings, listening)
         told = {"address": address, "token": settings.token, "runs": str(runs)}
@@ -70,6 +85,33 @@ def serve(
         click.get_current_context().exit(code)
     if not as_json:
         click.echo("stopped")
+
+
+def _by_name(plants: tuple[str, ...]) -> dict[str, str]:
+    """The plants by the name that the page shows: that of the class or of the file.
+
+    Raises:
+        ValueError: for a plant that cannot be made, or a name that cannot be used.
+    """
+    if not plants:
+        return {}
+    from ..plant.catalogue import PLANT_ENDING, PLANTS, plant_named
+    from ..web.requests import WORD
+
+    found: dict[str, str] = {}
+    for given in plants:
+        plant_named(given)
+        is_json = given.endswith(PLANT_ENDING)
+        file, colon, class_name = (given, "", "") if is_json else given.rpartition(":")
+        name = class_name or Path(file).stem
+        if name in PLANTS or name in found:
+            raise ValueError(f"--plant {given}: the page has a plant {name!r} already")
+        if not WORD.fullmatch(name):
+            raise ValueError(
+                f"--plant {given}: the page needs a name of letters, digits, _ and -: got {name!r}"
+            )
+        found[name] = f"{Path(file).absolute()}{colon}{class_name}"
+    return found
 
 
 def _tell(told: dict[str, str | None], as_json: bool) -> None:

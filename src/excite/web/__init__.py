@@ -72,7 +72,8 @@ def application(
     async def catalogue(request: Request) -> JSONResponse:
         del request
         if not known:
-            async with contextlib.aclosing(workers.events("catalogue", {}, True)) as events:
+            arguments = {"plants": settings.plants}
+            async with contextlib.aclosing(workers.events("catalogue", arguments, True)) as events:
                 known.extend([event async for event in events if event["kind"] == "catalogue"])
         if not known:
             raise RefusedError(503, "the workers do not start; the terminal shows the reason")
@@ -82,10 +83,10 @@ def application(
         Route("/", lambda request: FileResponse(_STATIC / "index.html")),
         Route("/api/session", _session, methods=["POST"]),
         Route("/api/catalogue", catalogue),
-        *stream_routes(workers, _body),
+        *stream_routes(workers, settings.plants, _body),
         *place_routes(workers, partial(run_of, settings.runs)),
         *run_routes(settings.runs),
-        *training_routes(settings.runs, _body, trainings),
+        *training_routes(settings.runs, settings.plants, _body, trainings),
         Mount("/static", StaticFiles(directory=_STATIC)),
     ]
     guard = Middleware(Guard, settings=settings, sessions=Sessions(scratch))

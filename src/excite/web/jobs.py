@@ -1,8 +1,9 @@
 """Jobs of the bench page, run in workers: experiments, identification of files, reports.
 
 Every function is a generator of JSON-ready events, so that the page can show the first while
-the next is computed, and can stop in between. Plants, excitations and policies are taken by
-their shipped names only: a name from a browser must never become a path.
+the next is computed, and can stop in between. Excitations and policies are taken by their
+shipped names only: a name from a browser must never become a path. Plants are shipped ones, and
+files that were named where the server was started.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ from ..information import (
     running_information,
 )
 from ..plant import AbstractPlant
-from ..plant.catalogue import PLANTS
+from ..plant.catalogue import PLANTS, plant_named
 from ..policy import Policy, mismatch, read_policy, shipped_policies
 from ..record import column_lengths
 from ..report.html import report_html
@@ -65,19 +66,27 @@ _MAX_COLUMNS, _MAX_NAME = 500, 200  # of an uploaded file, and characters of a c
 # ------------------------------------------------------------------------- what there is
 
 
-def catalogue() -> Iterator[Event]:
-    """Plants, excitations, policies and estimators that can be chosen."""
+def catalogue(plants: Mapping[str, str]) -> Iterator[Event]:
+    """Plants, excitations, policies and estimators that can be chosen.
+
+    Args:
+        plants: files of plants, by the name shown; they are the last.
+    """
     policies = {name: read_policy(path) for name, path in shipped_policies().items()}
     names = [*EXCITATIONS, *(LOOP + name for name in EXCITATIONS)]
-    plants = {}
-    for name, plant_class in PLANTS.items():
-        description = plant_class().description
-        fitting = {n: p.layout.num_steps for n, p in policies.items() if _fits(p, description)}
-        plants[name] = {**_shown(description), "policies": fitting}
+    shown = {}
+    for name, file in {**{name: name for name in PLANTS}, **plants}.items():
+        description = _plant(file).description
+        fitting = {
+            n: {"num_steps": p.layout.num_steps, "claim": p.claim}
+            for n, p in policies.items()
+            if _fits(p, description)
+        }
+        shown[name] = {**_shown(description), "policies": fitting}
     yield {
         "kind": "catalogue",
         "version": __version__,
-        "plants": plants,
+        "plants": shown,
         "excitations": names,
         "estimators": list(ESTIMATORS),
     }
@@ -139,10 +148,13 @@ def _experiment(asked: ExperimentRequest, name: str) -> Experiment:
 
 
 def _plant(name: str) -> AbstractPlant:
-    """A shipped plant; never a file."""
-    if name not in PLANTS:
+    """A shipped plant, or one in a file that the server was started with.
+
+    A name from a browser has no dot, so that it is never that of a file (`requests.word`).
+    """
+    if "." not in name and name not in PLANTS:
         raise unknown("plant", name, PLANTS)
-    return PLANTS[name]()
+    return plant_named(name)
 
 
 def episode(asked: ExperimentRequest) -> Iterator[Event]:
@@ -170,8 +182,8 @@ def followed(asked: ExperimentRequest, folder: str) -> Iterator[Event]:
     own = _experiment(asked, asked["excitation"])
     run = own.run()
     information = running_information(own.plant, own.params, run.inputs)
-    yield from _estimates(own, run, information)
-    row, result = _outcome(own, run, information[-1])
+    yield from _estimates(_plant(asked["plant"]), own, run, information)
+    row, result = _outcome(asked, own, run, information[-1])
     if result is not None:
         result.save(folder, command=_experiment_again(asked))
     identification = None if result is None else result.to_dict()
@@ -184,12 +196,14 @@ def followed(asked: ExperimentRequest, folder: str) -> Iterator[Event]:
             yield {"kind": "left_out", "excitation": name, "sentence": str(error)}
             continue
         its = running_information(other.plant, other.params, its_run.inputs)[-1]
-        yield {"kind": "other", "row": _outcome(other, its_run, its)[0]}
+        yield {"kind": "other", "row": _outcome(asked, other, its_run, its)[0]}
 
 
-def _estimates(own: Experiment, run: Trajectory, information: Array) -> Iterator[Event]:
+def _estimates(
+    plant: AbstractPlant, own: Experiment, run: Trajectory, information: Array
+) -> Iterator[Event]:
     """Estimates from growing numbers of samples, the last one from all."""
-    plant, size = _plant(own.plant.definition.name), relative_size(own.plant, own.params)
+    size = relative_size(own.plant, own.params)
     data = stack_experiments(plant, [run.inputs], [run.measured], True)
     free = jnp.ones(len(own.params), bool)
     counts = np.linspace(min(_FIRST, own.num_steps + 1), own.num_steps + 1, NUM_ESTIMATES)
@@ -246,10 +260,10 @@ def _first(data: Experiments, count: int) -> Experiments:
 
 
 def _outcome(
-    own: Experiment, run: Trajectory, information: Array
+    asked: ExperimentRequest, own: Experiment, run: Trajectory, information: Array
 ) -> tuple[Row, Identification | None]:
     """A row of the comparison, and the identification; None where it failed."""
-    plant, d = _plant(own.plant.definition.name), own.plant.description
+    plant, d = _plant(asked["plant"]), own.plant.description
     record = dataclasses.replace(own.record(run), source=_RECORD)
     result, sentence = None, ""
     try:

@@ -21,7 +21,8 @@ Body = Callable[[Request], Awaitable[dict[str, object]]]
 """Reads it."""
 
 _FOLDERS = re.compile(r"(?<![\w.:/])/(?:[^\s/:'\"]+/)+")
-_WORD = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
+WORD = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
+"""A name from a browser: without dots, slashes and colons, so that it is never a path."""
 
 
 def without_folders(sentence: str) -> str:
@@ -43,9 +44,15 @@ class RefusedError(Exception):
 def word(asked: Asked, key: str) -> str:
     """A name without dots, slashes and colons, so that it is never a path."""
     value = asked.get(key)
-    if not (isinstance(value, str) and _WORD.fullmatch(value)):
-        raise RefusedError(400, f"{key}: a shipped name is needed")
+    if not (isinstance(value, str) and WORD.fullmatch(value)):
+        raise RefusedError(400, f"{key}: a name from the page is needed")
     return value
+
+
+def plant_of(asked: Asked, plants: Mapping[str, str]) -> str:
+    """The name of a shipped plant, or the file of one that the server was started with."""
+    name = word(asked, "plant")
+    return plants.get(name, name)
 
 
 def number(asked: Asked, key: str, lower: float, upper: float) -> float:

@@ -9,7 +9,7 @@ import secrets
 import shutil
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -36,6 +36,7 @@ class PageSettings:
         token: that a browser must send; None for no token.
         num_workers: number of worker processes.
         cache: where they keep compiled programs.
+        plants: that are on the page beside the shipped ones, by the name shown there: files.
     """
 
     runs: Path
@@ -43,10 +44,17 @@ class PageSettings:
     token: str | None = None
     num_workers: int = 2
     cache: Path | None = None
+    plants: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def of(
-        cls, runs: Path, host: str, token: str | None, workers: int | None, cache: Path
+        cls,
+        runs: Path,
+        host: str,
+        token: str | None,
+        workers: int | None,
+        cache: Path,
+        plants: Mapping[str, str],
     ) -> PageSettings:
         """Checked settings; by default a token for other computers, one worker per core, at most 4.
 
@@ -59,7 +67,7 @@ class PageSettings:
             raise ValueError(f"{runs}: no such folder; --runs names the run folder to show")
         if token is None and not is_loopback(host):
             token = secrets.token_urlsafe(16)
-        return cls(runs.absolute(), host, token, workers or min(4, num_cores()), cache)
+        return cls(runs.absolute(), host, token, workers or min(4, num_cores()), cache, plants)
 
 
 def is_loopback(host: str) -> bool:

@@ -25,7 +25,18 @@ from .events import (
     Samples,
     StreamEvent,
 )
-from .requests import MAX_STEPS, Asked, Body, RefusedError, number, numbers, texts, whole, word
+from .requests import (
+    MAX_STEPS,
+    Asked,
+    Body,
+    RefusedError,
+    number,
+    numbers,
+    plant_of,
+    texts,
+    whole,
+    word,
+)
 from .sessions import Session
 from .workers import Workers
 
@@ -36,23 +47,24 @@ _PULSE = 1.0  # seconds without an event, then a pulse is sent
 Events = AsyncGenerator[StreamEvent]
 
 
-def routes(workers: Workers, body: Body) -> list[Route]:
+def routes(workers: Workers, plants: Mapping[str, str], body: Body) -> list[Route]:
     """Routes that start and stop an experiment or an identification.
 
     Args:
+        plants: files of plants, by the name that a browser sends.
         body: reads a request's JSON.
     """
 
     async def experiment(request: Request) -> StreamingResponse:
         session, asked = request.state.session, await body(request)
-        seconds, asked = number(asked, "seconds", 0, 60), _experiment(asked)
+        seconds, asked = number(asked, "seconds", 0, 60), _experiment(asked, plants)
         return _streamed(session, lambda stop: _played(workers, session, asked, seconds, stop))
 
     async def identification(request: Request) -> StreamingResponse:
         session, asked = request.state.session, await body(request)
         upload = str(asked.get("upload"))
         with session.using(upload):  # or there is none
-            asked = _identification(asked)
+            asked = _identification(asked, plants)
         return _streamed(session, lambda stop: _identified(workers, session, asked, upload, stop))
 
     async def stop(request: Request) -> JSONResponse:
@@ -70,13 +82,13 @@ def routes(workers: Workers, body: Body) -> list[Route]:
     ]
 
 
-def _experiment(asked: Asked) -> ExperimentRequest:
+def _experiment(asked: Asked, plants: Mapping[str, str]) -> ExperimentRequest:
     """An experiment for `excite.web.jobs`: only checked names and numbers."""
     others = asked.get("others")
     if not isinstance(others, list) or len(others) > 2:
         raise RefusedError(400, "others: at most two excitations can be compared")
     return {
-        "plant": word(asked, "plant"),
+        "plant": plant_of(asked, plants),
         "excitation": word(asked, "excitation"),
         "amplitude": None if asked.get("amplitude") is None else number(asked, "amplitude", 0, 1e9),
         "noise": numbers(asked, "noise"),
@@ -87,10 +99,10 @@ def _experiment(asked: Asked) -> ExperimentRequest:
     }
 
 
-def _identification(asked: Asked) -> IdentificationRequest:
+def _identification(asked: Asked, plants: Mapping[str, str]) -> IdentificationRequest:
     """An identification, likewise."""
     return {
-        "plant": word(asked, "plant"),
+        "plant": plant_of(asked, plants),
         "estimator": word(asked, "estimator"),
         "initial_state": word(asked, "initial_state"),
         "columns": texts(asked, "columns"),

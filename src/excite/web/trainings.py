@@ -12,7 +12,7 @@ import os
 import secrets
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal, TypedDict
 
@@ -22,7 +22,7 @@ from starlette.routing import Route
 
 from ..study.objectives import OBJECTIVES, is_information
 from ..study.progress import read_progress
-from .requests import Asked, Body, RefusedError, number, whole, without_folders, word
+from .requests import Asked, Body, RefusedError, number, plant_of, whole, without_folders, word
 
 MAX_TRAININGS = 2
 _PATIENCE = 10.0  # seconds for a training to end when it is interrupted
@@ -142,10 +142,13 @@ class Training:
         }
 
 
-def routes(folder: Path, body: Body, every: list[Training]) -> list[Route]:
+def routes(
+    folder: Path, plants: Mapping[str, str], body: Body, every: list[Training]
+) -> list[Route]:
     """Routes that start, show and stop trainings.
 
     Args:
+        plants: files of plants, by the name that a browser sends.
         every: all running trainings of this server; updated here.
     """
 
@@ -154,7 +157,7 @@ def routes(folder: Path, body: Body, every: list[Training]) -> list[Route]:
         if sum(t.is_running for t in every) >= MAX_TRAININGS:
             raise RefusedError(429, f"{MAX_TRAININGS} trainings already running; stop one")
         every[:] = [training for training in every if training.is_running]
-        words, place = _words(asked), _free(folder, word(asked, "name"), every)
+        words, place = _words(asked, plants), _free(folder, word(asked, "name"), every)
         training = Training(secrets.token_urlsafe(12), place, words)
         every.append(training)
         request.state.session.trainings[training.name] = training
@@ -182,14 +185,14 @@ def routes(folder: Path, body: Body, every: list[Training]) -> list[Route]:
     ]
 
 
-def _words(asked: Asked) -> list[str]:
+def _words(asked: Asked, plants: Mapping[str, str]) -> list[str]:
     """The command, made of checked names and numbers only."""
     objective, updates = word(asked, "objective"), whole(asked, "updates", 1, 100_000)
     if objective not in OBJECTIVES:
         raise RefusedError(400, f"objective: one of {', '.join(OBJECTIVES)} is needed")
     spread = number(asked, "spread", 0, 0.9)
     return [
-        "train", word(asked, "plant"), "--objective", objective,
+        "train", plant_of(asked, plants), "--objective", objective,
         "--steps", str(whole(asked, "steps", 10, 5000)), "--spread", f"{spread:g}",
         "--set", f"num_updates={updates}",
     ]  # fmt: skip

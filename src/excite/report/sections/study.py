@@ -9,6 +9,7 @@ import numpy as np
 
 from ...description import PlantDescription, names_of
 from ...files import folder_word, read_columns, read_json
+from ...policy import POLICY_ENDING, read_policy
 from ...record import Record
 from ..figures import benchmark_figure
 from ..frontier import frontier_figure, lengths_figure
@@ -65,6 +66,7 @@ class StudyRun(Run):
             table(*t.cells(), name=t.study.heading),
             f'<div class="notes">\n{notes}</div>\n',
             _comparisons(t, name),
+            _claims(self),
             _learning(self, name),
             _episodes(self, name),
             _differences(t),
@@ -118,6 +120,16 @@ def _comparisons(found: StudyTable, name: str) -> str:
             ),
         ]
     return "".join(parts)
+
+
+def _claims(run: StudyRun) -> str:
+    """What a search for violations found for the best seed of each agent."""
+    seeds, claims = run.marker.folder / "seeds", []
+    for agent, seed in run.table.best_seeds.items():
+        path = seeds / folder_word(agent) / f"{seed}/policy{POLICY_ENDING}"
+        if path.is_file():
+            claims.append(f"{agent}, seed {seed}: {read_policy(path).claim}")
+    return heading("Searched for violations") + bullets(claims) if claims else ""
 
 
 def _learning(run: StudyRun, name: str) -> str:

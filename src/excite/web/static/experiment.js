@@ -59,7 +59,8 @@ function chooseExcitation() {
   const half = (input.upper - input.lower) / 2;
   Object.assign(at("amplitude"), { disabled: !isSignal, max: half, value: input.amplitude });
   section.querySelector("label[for=amplitude] .unit").textContent = isSignal ? `${input.unit}, at most ${half}` : "set by the excitation";
-  const longest = plant.policies[name];
+  const policy = plant.policies[name], longest = policy?.num_steps;
+  at("claim").textContent = policy ? `Safety: ${policy.claim}.` : "";
   at("steps").max = longest ?? 5000;
   if (longest && +at("steps").value > longest) at("steps").value = longest;
   tellLength();
@@ -80,7 +81,7 @@ function drawParams() {
 function asked() {
   const pace = at("pace").value;
   return {
-    plant: plant.name,
+    plant: at("plant").value,
     excitation: at("excitation").value,
     amplitude: at("amplitude").disabled ? null : +at("amplitude").value,
     noise: changed("noise"),

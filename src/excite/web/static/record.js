@@ -70,7 +70,7 @@ function identify() {
   for (const name of needed()) if (at(`scale-${name}`).value !== "") scales[name] = +at(`scale-${name}`).value;
   const wanted = {
     upload: file.upload,
-    plant: plant().name,
+    plant: at("record-plant").value,
     columns: Object.fromEntries(needed().map((name) => [name, at(`column-${name}`).value])),
     scales,
     estimator: at("estimator").value,
