@@ -23,7 +23,6 @@ ORDER = (
     "__init__",
     "description",
     "files",
-    "figure",
     "record",
     "policy",
     "report",
@@ -31,7 +30,6 @@ ORDER = (
     "safety",
     "excitation",
     "simulation",
-    "identifiability",
     "information",
     "estimation",
     "environment",
@@ -70,7 +68,7 @@ DOORS = {
     "arviz_stats": ["estimation/posterior"],
     "fmpy": ["rig/fmu"],
     "quanser": ["rig/quanser"],
-    "matplotlib": ["figure", "report"],
+    "matplotlib": ["record/figure", "report"],
     "fastapi": ["web"],
     "starlette": ["web"],
     "uvicorn": ["web"],
@@ -81,7 +79,6 @@ DOORS = {
 WITHOUT_JAX = (
     "description",
     "files",
-    "figure",
     "policy",
     "record",
     "safety",
@@ -263,7 +260,7 @@ def test_imports_stand_at_the_top_but_for_the_command_line(module):
         functions = [n for n in ast.walk(tree_of(module)) if isinstance(n, ast.FunctionDef)]
         found = [n for f in functions for n in ast.walk(f) if isinstance(n, imports)]
         # Figures load Matplotlib, which only those who draw one wait for.
-        figures = ("from ..report.figure", "from ..figure", "from .figure")
+        figures = ("from ..report.figure", "from ..record.figure", "from .figure")
         hidden = [n for n in found if not ast.unparse(n).startswith(figures)]
         assert not [node.lineno for node in hidden if node not in _shown(module)]
 
@@ -295,7 +292,7 @@ def test_jax_is_not_loaded_through_third_parties_either():
 
 
 def test_the_rig_of_a_laboratory_computer_uses_only_what_needs_no_jax():
-    allowed = {"__init__", "description", "files", "figure", "record", "policy", "safety", "rig"}
+    allowed = {"__init__", "description", "files", "record", "policy", "safety", "rig"}
     for module in MODULES:
         if belongs(
             module, ("rig/contract", "rig/player", "rig/recorder", "rig/loop", "rig/quanser")

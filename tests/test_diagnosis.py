@@ -14,7 +14,7 @@ from excite.estimation.diagnosis import (
     robust_covariance,
     widened,
 )
-from excite.identifiability import UNSEEN_SD, identifiability, worst_seen
+from excite.information.identifiability import UNSEEN_SD, identifiability, worst_seen
 
 # Fit
 

@@ -16,7 +16,8 @@ from kinetics import Conversion, Product
 import excite as ex
 from excite.description import Input, Output, Parameter, PlantDescription, State
 from excite.files import json_ready
-from excite.identifiability import (
+from excite.information import experiment_information
+from excite.information.identifiability import (
     IDENTIFIABLE,
     PRACTICALLY_NOT,
     STRUCTURALLY_NOT,
@@ -24,7 +25,6 @@ from excite.identifiability import (
     Structure,
     structure,
 )
-from excite.information import experiment_information
 from excite.plant import AbstractPlant
 from excite.plant.extension import extended
 from excite.simulation import response

@@ -14,7 +14,9 @@ import pytest
 from catalogue import TwoMasses
 
 from excite.description import HALF_95, PlantDescription
-from excite.figure import (
+from excite.plant import EMPS, Aero2, CartPole
+from excite.record import Record
+from excite.record.figure import (
     PLOT_ENDINGS,
     episode_figure,
     episodes_figure,
@@ -22,8 +24,6 @@ from excite.figure import (
     require_plot_path,
     save,
 )
-from excite.plant import EMPS, Aero2, CartPole
-from excite.record import Record
 from excite.report.figures import (
     autocorrelation_figure,
     benchmark_figure,

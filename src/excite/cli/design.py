@@ -82,7 +82,7 @@ def design(
     plant: str, out: Path, plot: Path | None, noise: Any, as_json: bool, **options: Any
 ) -> None:
     """Design an open-loop input for PLANT, within its limits and safe for uncertain parameters."""
-    from ..figure import save
+    from ..record.figure import save
     from ..training.design import design as designed
 
     options["uncertainty"] = merged(options["uncertainty"])

@@ -135,7 +135,7 @@ def falsify(
         if not as_json:
             click.echo(f"policy with this certificate: {certify}")
     if plot is not None:
-        from ..figure import save
+        from ..record.figure import save
 
         save(found.plot(), plot)
     click.get_current_context().exit(0 if found.is_safe else 1)

@@ -246,7 +246,7 @@ def identify(
         is_drawn = posterior is not None and result.is_usable
         samples = result.posterior(options["samples"], progress=progress) if is_drawn else None
     if plot is not None or plot_diagnosis is not None:
-        from ..figure import save
+        from ..record.figure import save
 
         if plot is not None:
             save(result.plot(), plot)

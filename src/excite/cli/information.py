@@ -45,7 +45,7 @@ def information(
         result = verb(**given, initial_state=initial_state or "auto")
     show_warnings(result.warnings)
     if plot is not None:
-        from ..figure import save
+        from ..record.figure import save
 
         save(result.plot(), plot)
     if as_json:

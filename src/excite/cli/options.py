@@ -188,7 +188,7 @@ def computing(command: Callable[P, Result]) -> Callable[P, Result]:
             ) from None
         for plot in (kwargs.get("plot"), kwargs.get("plot_diagnosis")):
             if isinstance(plot, Path):
-                from ..figure import require_plot_path
+                from ..record.figure import require_plot_path
 
                 require_plot_path(plot)
         return command(*args, **kwargs)

@@ -94,8 +94,8 @@ def _plot(plant: Any, path: Path) -> None:
     import jax
 
     from ..excitation.catalogue import EXCITATIONS
-    from ..figure import episodes_figure, save
     from ..record import Record
+    from ..record.figure import episodes_figure, save
     from ..simulation import run_episode
 
     responses = {}

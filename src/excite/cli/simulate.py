@@ -133,7 +133,7 @@ def simulate(
         "warnings": experiment.warnings,
     }
     if plot is not None:
-        from ..figure import episode_figure, save
+        from ..record.figure import episode_figure, save
 
         save(episode_figure(description, record), plot)
     if out is not None:

@@ -95,7 +95,7 @@ def run_study_here(
             del told["on_done"]
         found = run_study(chosen, out, on_wait=waiting, **told, **options)
     if plot is not None:
-        from ..figure import save
+        from ..record.figure import save
 
         save(found.plot(), plot)
     show_comparison(found, out, as_json)

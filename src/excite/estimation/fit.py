@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from ..description import RARE, names_of
-from ..identifiability import STRUCTURALLY_NOT, worst_seen
+from ..information.identifiability import STRUCTURALLY_NOT, worst_seen
 from ..plant import AbstractPlant, Params, floats
 from .contract import (
     AbstractEstimator,

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from ..description import Parameter, listed
-from ..identifiability import STRUCTURALLY_NOT, Structure, structure
+from ..information.identifiability import STRUCTURALLY_NOT, Structure, structure
 from ..plant import AbstractPlant, Params
 from .contract import AbstractEstimator, AnyArray, Estimate, Experiments, bound_reached
 from .diagnosis import inverse_information

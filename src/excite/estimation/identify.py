@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from ..description import RARE, Named, PlantDescription, names_of, unknown, wrong_type
 from ..files import json_ready
-from ..identifiability import identifiability
+from ..information.identifiability import identifiability
 from ..plant import AbstractPlant, Params, params_from
 from ..plant.catalogue import PLANTS, PlantLike, plant_from
 from ..plant.extension import plain_kind

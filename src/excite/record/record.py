@@ -151,7 +151,7 @@ class Record:
 
     def plot(self) -> Figure:
         """Inputs and outputs over time, with the safety levels; ValueError without a plant."""
-        from ..figure import episode_figure
+        from .figure import episode_figure
 
         return episode_figure(self.description, self)
 

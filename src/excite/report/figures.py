@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ..description import HALF_95, PlantDescription, display_unit
-from ..figure import (
+from ..record import Record
+from ..record.figure import (
     BLUE,
     GREEN,
     GREY,
@@ -24,7 +25,6 @@ from ..figure import (
     new_figure,
     thin,
 )
-from ..record import Record
 from .numbers import digits_for, number
 from .rows import EstimatedParameter, EstimateSummary, Row
 

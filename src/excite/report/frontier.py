@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import matplotlib.figure
 
-from ..figure import add_legend, add_title, colour_of, new_figure
+from ..record.figure import add_legend, add_title, colour_of, new_figure
 from .rows import Row
 
 _MARKERS = "osD^vP*X<>hpd"  # as many as share no factor with the colours

@@ -10,8 +10,8 @@ import matplotlib
 
 from .. import __version__
 from ..description import path_from, wrong_type
-from ..figure import MAX_POINTS, at_most
 from ..files import require_new_file, write_bytes
+from ..record.figure import MAX_POINTS, at_most
 from .sections.elements import Marker, Run, Section, paragraph, text
 from .sections.experiment import Experiment, comparison, read_experiment
 from .sections.record import read_recorded

@@ -10,7 +10,8 @@ import matplotlib.figure
 import numpy as np
 
 from ..description import PlantDescription
-from ..figure import (
+from ..record import Record
+from ..record.figure import (
     BLUE,
     RED,
     add_legend,
@@ -20,7 +21,6 @@ from ..figure import (
     new_figure,
     thin,
 )
-from ..record import Record
 
 Curve = Mapping[str, np.ndarray]
 """Columns of one learning curve by name; `steps` is one of them."""

@@ -11,7 +11,7 @@ import matplotlib.axis
 import matplotlib.figure
 import matplotlib.ticker
 
-from ..figure import BLUE, COLOURS, GREEN, GREY, ORANGE, RED
+from ..record.figure import BLUE, COLOURS, GREEN, GREY, ORANGE, RED
 
 PAGE_STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",  # keep text searchable and the file small

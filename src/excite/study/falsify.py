@@ -173,7 +173,7 @@ class Falsification:
 
         That with searched noise where it is worse.
         """
-        from ..figure import episode_figure
+        from ..record.figure import episode_figure
 
         with_noise = self.noise_nearness > self.nearness
         return episode_figure(self.plant, self.noise_record if with_noise else self.record)

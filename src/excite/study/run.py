@@ -22,7 +22,6 @@ from typing import Any, Literal
 import jax
 
 from .. import __version__
-from ..figure import image
 from ..files import (
     csv_text,
     json_ready,
@@ -34,6 +33,7 @@ from ..files import (
 )
 from ..plant import AbstractPlant
 from ..policy import POLICY_ENDING, read_policy
+from ..record.figure import image
 from ..record.read import SIGNAL_ENDINGS
 from ..report.frontier import frontier_figure, lengths_figure
 from ..report.rows import CountsBySeed, Rows

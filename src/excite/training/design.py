@@ -105,7 +105,7 @@ class Design:
 
     def plot(self) -> matplotlib.figure.Figure:
         """The inputs and the nominal plant's response over time, with limits and levels."""
-        from ..figure import episode_figure
+        from ..record.figure import episode_figure
 
         return episode_figure(self.plant, self.record)
 

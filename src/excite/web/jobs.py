@@ -37,7 +37,6 @@ from ..estimation.diagnosis import half_95
 from ..estimation.identify import InitialState, identify
 from ..estimation.result import Identification
 from ..excitation.catalogue import EXCITATIONS, LOOP
-from ..figure import kept_samples
 from ..files import write_bytes
 from ..information import (
     cramer_rao_bound,
@@ -50,6 +49,7 @@ from ..plant import AbstractPlant
 from ..plant.catalogue import PLANTS, plant_named
 from ..policy import Policy, mismatch, read_policy, shipped_policies
 from ..record import column_lengths
+from ..record.figure import kept_samples
 from ..report.html import report_html
 from ..safety import critical_levels, is_violation, max_abs_output
 from ..simulation import Experiment, Trajectory

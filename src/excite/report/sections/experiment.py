@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...description import RARE, PlantDescription, display_unit, names_of
-from ...figure import episode_figure
 from ...files import read_columns
 from ...record import Record
+from ...record.figure import episode_figure
 from ..estimates import largest_correlation, parameter_cells, parameter_header, residual_cells
 from ..figures import (
     autocorrelation_figure,

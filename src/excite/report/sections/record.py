@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ...description import PlantDescription
-from ...figure import episode_figure
 from ...files import read_json
 from ...record import RECORD_KIND, Record
+from ...record.figure import episode_figure
 from .elements import (
     Run,
     Section,

@@ -17,8 +17,8 @@ import matplotlib.axes
 import matplotlib.figure
 import numpy as np
 
-from .description import Input, Output, PlantDescription, display_unit
-from .files import require_folder, write_bytes
+from ..description import Input, Output, PlantDescription, display_unit
+from ..files import require_folder, write_bytes
 
 Axes = np.ndarray
 """A grid of Matplotlib's axes: rows, columns."""

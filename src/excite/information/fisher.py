@@ -19,15 +19,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from .description import Named, PlantDescription, names_of
-from .excitation.catalogue import ExcitationLike
+from ..description import Named, PlantDescription, names_of
+from ..excitation.catalogue import ExcitationLike
+from ..plant import AbstractPlant, Params, require_double_precision
+from ..plant.catalogue import PlantLike
+from ..record import Record
+from ..record.table import data_frame
+from ..report.results import information_html, information_text, wrapped
+from ..simulation import Experiment, response, run_episode
 from .identifiability import Structure, practically, structure
-from .plant import AbstractPlant, Params, require_double_precision
-from .plant.catalogue import PlantLike
-from .record import Record
-from .record.table import data_frame
-from .report.results import information_html, information_text, wrapped
-from .simulation import Experiment, response, run_episode
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -232,7 +232,7 @@ class InformationResult:
 
     def plot(self) -> Figure:
         """The input, and the smallest possible standard deviation of each parameter in percent."""
-        from .report.figures import information_figure
+        from ..report.figures import information_figure
 
         time = np.arange(len(self.inputs) + 1) * self.plant.dt
         drawn = Record.of_episode(time, self.inputs, np.empty((len(time), 0)))

@@ -20,9 +20,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .description import Parameter, listed, names_of
-from .plant import AbstractPlant, Params, require_double_precision
-from .simulation import response
+from ..description import Parameter, listed, names_of
+from ..plant import AbstractPlant, Params, require_double_precision
+from ..simulation import response
 
 UNSEEN_SD = 0.5
 """A direction of relative changes with a larger standard deviation is not identifiable: its
