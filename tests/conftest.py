@@ -34,6 +34,11 @@ from jaxtyping import install_import_hook  # noqa: E402
 jax.config.update("jax_numpy_rank_promotion", "raise")
 install_import_hook("excite", "strict.checked")
 assert "excite.plant" not in sys.modules
+# Tracing makes so many objects that looking through them for cycles, again and again, takes a
+# fifth of all time.
+gc.set_threshold(100_000, 20, 20)
+# A program that a shell starts in the background ignores Ctrl-C, and so would all that it starts.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 class Memory:

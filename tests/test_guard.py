@@ -1,5 +1,6 @@
 """The guard of a rig: its filter, its brake, its programs for NumPy, and experiments behind it."""
 
+import functools
 import json
 
 import jax
@@ -29,6 +30,7 @@ SHIPPED = ["aero2", "aero2_detailed", "aero2_lag", "cart_pole", "dc_motor", "emp
 STEPS, READINGS = 60, 5
 
 
+@functools.cache
 def model_of(name: str) -> tuple[GuardModel, guard.GuardRules]:
     plant = plant_named(name)
     first, dt = plant.definition.inputs[0].name, float(plant.dt)
