@@ -2,7 +2,8 @@
 
 The import hook stands here because it must be installed before anything imports `excite`.
 Compiled programs are kept on disk, in one folder for all processes of a test run and for
-the runs that follow: what one test compiles, no other compiles again.
+the runs that follow: what one test compiles, no other compiles again. Thousands of small ones
+are compiled as fast as they are written, and are not kept.
 """
 
 import ctypes
@@ -25,7 +26,7 @@ CACHE = os.environ.setdefault(
 )
 # In the environment, so that every process that a test starts does the same.
 os.environ["JAX_COMPILATION_CACHE_DIR"] = CACHE
-os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"
 os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "0"
 
 import jax  # noqa: E402
