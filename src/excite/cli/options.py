@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import gc
 import json
 import math
 import os
@@ -198,6 +199,8 @@ def computing(command: Callable[P, Result]) -> Callable[P, Result]:
 
 def prepare_jax() -> None:
     """Double precision, and a cache of compiled programs."""
+    # Tracing makes many objects; searching all of them for cycles is a sixth of a first command.
+    gc.set_threshold(100_000, 20, 20)
     # The user cannot act on the compiler's messages about its cache.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     import jax
