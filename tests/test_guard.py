@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from catalogue import LONG
 from commands import excite
 
 import excite as ex
@@ -26,7 +27,9 @@ from excite.rig.simulated import drawn_hardware, run_batch
 from excite.rig.tracing import program_of
 from excite.safety import Supervision, Trip
 
-SHIPPED = ["aero2", "aero2_detailed", "aero2_lag", "cart_pole", "dc_motor", "emps"]
+SHIPPED = [
+    "aero2", "cart_pole", *map(LONG, ["aero2_detailed", "aero2_lag", "dc_motor", "emps"])
+]  # fmt: skip
 STEPS, READINGS = 60, 5
 
 

@@ -234,6 +234,7 @@ def product() -> Record:
     return Record(TIME, np.zeros((len(TIME), 0)), noisy, source="product.csv")
 
 
+@pytest.mark.science
 def test_a_curved_posterior_is_that_of_a_grid():
     record = product()
     known = {"plant": Product, "initial_state": "known"}
