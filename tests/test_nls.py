@@ -20,7 +20,6 @@ from excite.simulation import response, run_episode
 
 NUM_STEPS = 200
 KEY = jax.random.key(23)
-names = pytest.mark.parametrize("name", PLANTS)
 
 
 def all_free(plant):
