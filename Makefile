@@ -8,7 +8,7 @@ PYTEST := $(BIN)/python -m pytest -n 2 --dist worksteal
 # The flags are of the jaxlib in constraints.txt; the other suites compile as users do.
 QUICK := XLA_FLAGS="--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
 
-.PHONY: help demo test test-pages test-science test-all check-results coverage lint types docs results \
+.PHONY: help demo test units test-pages test-science test-all check-results coverage lint types docs results \
     agents policies certificates evaluations clean
 
 help: ## this list
@@ -17,7 +17,11 @@ help: ## this list
 demo: .venv/core ## the baseline rows of the paper's Table 1, with three estimators, in runs/baselines
 	$(BIN)/excite study run baselines --out runs/baselines --overwrite
 
-test: lint types ## style, types, unit and command-line tests
+# The type checker has one thread: the tests begin on the other core.
+test: lint ## style, types, unit and command-line tests
+	$(MAKE) --jobs=2 types units
+
+units: .venv/dev ## unit and command-line tests
 	$(QUICK) $(PYTEST)
 
 test-pages: .venv/dev ## commands of the documentation, and the bench page in a browser

@@ -12,6 +12,8 @@ from excite.cli import main
 
 PATIENCE = 1800
 """Seconds after which a program hangs, and is not only slow on a busy computer."""
+REPEATS = 20
+"""How often an experiment in real time is tried; a busy computer loses deadlines."""
 
 
 def excite(*words: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:

@@ -2,7 +2,8 @@
 
 The import hook stands here because it must be installed before anything imports `excite`.
 Compiled programs are kept on disk, in one folder for all processes of a test run and for
-the runs that follow: what one test compiles, no other compiles again.
+the runs that follow: what one test compiles, no other compiles again. Thousands of small ones
+are compiled as fast as they are written, and are not kept.
 """
 
 import ctypes
@@ -25,7 +26,7 @@ CACHE = os.environ.setdefault(
 )
 # In the environment, so that every process that a test starts does the same.
 os.environ["JAX_COMPILATION_CACHE_DIR"] = CACHE
-os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"
 os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "0"
 
 import jax  # noqa: E402
@@ -34,6 +35,11 @@ from jaxtyping import install_import_hook  # noqa: E402
 jax.config.update("jax_numpy_rank_promotion", "raise")
 install_import_hook("excite", "strict.checked")
 assert "excite.plant" not in sys.modules
+# Tracing makes so many objects that looking through them for cycles, again and again, takes a
+# fifth of all time.
+gc.set_threshold(100_000, 20, 20)
+# A program that a shell starts in the background ignores Ctrl-C, and so would all that it starts.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 class Memory:

@@ -219,6 +219,7 @@ class Limited(Amplifier):
     )
 
 
+@pytest.mark.science
 def test_a_robust_signal_is_made_safe_in_a_declared_uncertainty():
     plant, few = Limited(), dataclasses.replace(ROBUST, num_updates=200, num_plants=4)
     box = Uncertainty.of(plant, 0.3, {"gain_u": (0.5, 2.0)})

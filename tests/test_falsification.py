@@ -503,6 +503,7 @@ def test_the_policies_of_files_are_listed(tmp_path):
 BRIEF = {"num_updates": 1, "num_plants": 2, "hidden": [4]}
 
 
+@pytest.mark.science
 def test_a_policy_that_is_kept_although_a_search_broke_it_is_warned_of(tmp_path):
     told = list[str]()
     with pytest.warns(UserWarning, match="of the critical level, and 0.975 is allowed"):

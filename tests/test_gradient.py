@@ -416,6 +416,7 @@ def test_the_penalty_of_adversaries_lowers_the_nearness_in_the_declared_uncertai
     assert nearest(now.player) < 0.9 * before
 
 
+@pytest.mark.science
 def test_an_interrupted_training_against_an_uncertainty_ends_with_the_same_policy():
     env, kept = uncertain_env(20), []
     settings = dataclasses.replace(AGAINST, allowed_nearness=0.5)

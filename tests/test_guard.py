@@ -1,11 +1,13 @@
 """The guard of a rig: its filter, its brake, its programs for NumPy, and experiments behind it."""
 
+import functools
 import json
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from catalogue import LONG
 from commands import excite
 
 import excite as ex
@@ -25,10 +27,13 @@ from excite.rig.simulated import drawn_hardware, run_batch
 from excite.rig.tracing import program_of
 from excite.safety import Supervision, Trip
 
-SHIPPED = ["aero2", "aero2_detailed", "aero2_lag", "cart_pole", "dc_motor", "emps"]
+SHIPPED = [
+    "aero2", "cart_pole", *map(LONG, ["aero2_detailed", "aero2_lag", "dc_motor", "emps"])
+]  # fmt: skip
 STEPS, READINGS = 60, 5
 
 
+@functools.cache
 def model_of(name: str) -> tuple[GuardModel, guard.GuardRules]:
     plant = plant_named(name)
     first, dt = plant.definition.inputs[0].name, float(plant.dt)

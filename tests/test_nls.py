@@ -20,7 +20,6 @@ from excite.simulation import response, run_episode
 
 NUM_STEPS = 200
 KEY = jax.random.key(23)
-names = pytest.mark.parametrize("name", PLANTS)
 
 
 def all_free(plant):
@@ -46,7 +45,7 @@ def assert_recovered(plant, estimate, rtol: float = 1e-6) -> None:
 # ------------------------------------------------------------------ without noise
 
 
-@names
+@pytest.mark.parametrize("name", FEW_AND_ALL)
 def test_noise_free_data_give_the_parameters(name):
     plant = PLANTS[name]
     inputs = Multisine().sequence(plant, NUM_STEPS, KEY)

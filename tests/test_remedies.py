@@ -146,6 +146,7 @@ def test_outliers_are_counted_and_normal_noise_has_none():
     assert found.remedy.startswith("20 samples are more than 4 standard deviations off")
 
 
+@pytest.mark.science
 def test_the_likeliest_cause_is_fitted_to_all_of_a_long_record():
     plant = "aero2+delay_voltage"
     params = {"delay_voltage": 0.07}

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import PATIENCE
+from commands import PATIENCE, REPEATS
 
 import excite
 from excite.cli import main
@@ -495,7 +495,7 @@ JAX_IS_MISSING = "JAX is not installed: the live estimate and the filter are off
 def test_a_laboratory_computer_runs_without_jax(call, tmp_path, words):
     words = ("--rig", "quanser", *words, "--out", "r.csv", "--steps", 20, "--json", "--overwrite")
     done = bare(tmp_path, *words)
-    for _ in range(4):  # a computer that runs tests may lose a deadline
+    for _ in range(REPEATS):
         if '"trip": "deadlines"' not in done.stdout:
             break
         done = bare(tmp_path, *words)

@@ -214,12 +214,12 @@ def test_ctrl_c_ends_the_workers_at_once(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         work(functions.hang, tasks, engine.local_engine(2), on_tick=interrupt)
     pids = [int(m.read_text()) for m in markers]
-    assert wait_for(lambda: not any(map(is_alive, pids)), 1.0)
+    assert wait_for(lambda: not any(map(is_alive, pids)))
 
 
 def test_an_error_of_on_done_ends_the_workers_and_is_told(tmp_path):
     def on_done(name: str, result: Any) -> None:
-        assert wait_for(lambda: marker.exists() and marker.read_text())
+        assert wait_for(lambda: marker.exists() and marker.read_text(), PATIENCE)
         raise OSError("disk full")
 
     marker = tmp_path / "pid"
@@ -227,7 +227,7 @@ def test_an_error_of_on_done_ends_the_workers_and_is_told(tmp_path):
     tasks["sum"] = {"function": "add", "a": 1, "b": 1}
     with pytest.raises(OSError, match="disk full"):
         engine.run(functions.any_of_them, tasks, engine.local_engine(2), on_done=on_done)
-    assert wait_for(lambda: not is_alive(int(marker.read_text())), 1.0)
+    assert wait_for(lambda: not is_alive(int(marker.read_text())))
 
 
 def test_a_killed_driver_leaves_no_worker(tmp_path):
@@ -239,13 +239,13 @@ def test_a_killed_driver_leaves_no_worker(tmp_path):
     )
     driver = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL)
     try:
-        assert wait_for(lambda: all(m.exists() and m.read_text() for m in markers), 20)
+        assert wait_for(lambda: all(m.exists() and m.read_text() for m in markers), PATIENCE)
         pids = [int(m.read_text()) for m in markers]
         assert all(map(is_alive, pids))
     finally:
         driver.kill()
         driver.wait()
-    assert wait_for(lambda: not any(map(is_alive, pids)), 2.0)
+    assert wait_for(lambda: not any(map(is_alive, pids)))
 
 
 # -------------------------------------------------------------------- a Dask cluster

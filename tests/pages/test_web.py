@@ -376,8 +376,8 @@ def stopped_while_it_compiles(address: str, client: httpx.Client) -> None:
     assert kinds[-1] == "stopped"
     assert "samples" not in kinds, "it was stopped after the compilation only"
     # It stopped by itself within the time that it has, or its process was replaced.
-    assert wait_for(lambda: not any(map(is_at_work, before)), 60), "its worker goes on"
-    assert wait_for(lambda: len(processes_of(address)) == 2, 60)
+    assert wait_for(lambda: not any(map(is_at_work, before)), PATIENCE), "its worker goes on"
+    assert wait_for(lambda: len(processes_of(address)) == 2, PATIENCE)
     again = client.post("/api/uploads?name=a.csv", content="time,x\n0,1\n1,2\n")
     assert again.status_code == 200
 
@@ -393,7 +393,7 @@ def test_a_browser_that_leaves_takes_its_work_along(address: str, told: Told):
                 return answer.status_code == 200 and json.loads(line)["kind"] == "job"
 
         for _ in range(MAX_JOBS + 1):  # more than it may have under way
-            assert wait_for(is_begun, 60)
+            assert wait_for(is_begun, PATIENCE)
 
 
 def trainings_in(folder: Path) -> set[int]:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+from commands import PATIENCE
 
 ROOT = Path(__file__).parent.parent.parent
 
@@ -31,7 +32,7 @@ class Installed(NamedTuple):
         env = {name: value for name, value in os.environ.items() if name not in hidden}
         return subprocess.run(
             [str(self.python), *words], cwd=folder, env=env,
-            capture_output=True, text=True, check=False, timeout=600,
+            capture_output=True, text=True, check=False, timeout=PATIENCE,
         )  # fmt: skip
 
     def excite(self, folder: Path, words: str) -> str:

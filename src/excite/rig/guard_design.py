@@ -199,32 +199,24 @@ def _linear(model: GuardModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     functions = model.functions()
     names = [model.uncertainty.names[i] for i in model.estimated]
     slowest = np.array([float(name.startswith(("delay_", "lag_"))) for name in names])
-    middle = np.concatenate([np.asarray(plant.initial_state), slowest])
     states = np.array([s.scale for s in d.states])
     inputs = np.tile([i.amplitude for i in d.inputs], model.depth)
-    rest = np.tile(np.asarray(safe_input(d), float), model.depth)
-
-    def secant(response: Callable[[np.ndarray], Array], sizes: np.ndarray) -> np.ndarray:
-        moves = np.diag(sizes)
-        return np.stack(
-            [np.asarray(response(m) - response(-m)) / (2 * max(m)) for m in moves], axis=1
-        )
-
-    def at(state: np.ndarray, past: np.ndarray) -> Array:
-        point = middle + np.concatenate([state, np.zeros(len(slowest))])
-        return functions.advance(
-            jnp.asarray(point)[None], jnp.asarray(past).reshape(1, model.depth, -1)
-        )[0]
-
-    A = secant(lambda move: at(move, rest), states)
-    B = secant(lambda move: at(np.zeros(len(states)), rest + move), inputs)
-    C = secant(
-        lambda move: functions.output(
-            jnp.asarray(middle + np.concatenate([move, np.zeros(len(slowest))]))[None]
-        )[0],
-        states,
+    sizes = np.concatenate([states, inputs])
+    # Rows: each state and each input of the past, moved up, then down.
+    moves = np.concatenate([np.diag(sizes), -np.diag(sizes)])
+    moved, past = moves[:, : len(states)], moves[:, len(states) :]
+    points = np.concatenate(
+        [np.asarray(plant.initial_state) + moved, np.tile(slowest, (len(moves), 1))], axis=1
     )
-    return A, B, C
+    past = np.tile(np.asarray(safe_input(d), float), model.depth) + past
+
+    def secants(responses: Array) -> np.ndarray:
+        up, down = np.split(np.asarray(responses), 2)
+        return ((up - down) / (2 * sizes[:, None])).T
+
+    advanced = jax.jit(functions.advance)(points, past.reshape(len(moves), model.depth, -1))
+    whole, C = secants(advanced), secants(jax.jit(functions.output)(points))
+    return whole[:, : len(states)], whole[:, len(states) :], C[:, : len(states)]
 
 
 def guard_for(
