@@ -74,6 +74,13 @@ def committed(study: str) -> dict[tuple[str, str], Any]:
     return {(row["method"], row["estimator"]): row for row in rows}
 
 
+def test_no_policy_but_that_for_the_ideal_plant_violated_on_random_plants():
+    text = (RESULTS / "policies" / "random_plants.txt").read_text()
+    found = re.findall(r"^([\w-]+), [^:]*: (\d+) violations in 100,000 ", text, re.M)
+    assert {name for name, _ in found} == {*shipped_policies()} - {*NOT_SEARCHED}
+    assert [pair for pair in found if pair[1] != "0"] == [("aero2-ideal", "96")]
+
+
 def test_half_the_samples_of_the_tuned_chirp_are_enough():
     half, frontier = committed("half"), committed("frontier")
     assert json.loads((RESULTS / "half" / "study.json").read_text())["num_steps"] == 250
