@@ -44,8 +44,11 @@ _SQUARE = 3.0  # of the distance of the filter's points, in standard deviations:
 _WIDE = 0.05  # after a trip, how far a state may move in one sample unexplained, in its scales
 _QUIET = 0.25  # fraction of critical levels and input limits below which it is at rest
 _NUM_QUIET, _LONGEST = 5, 60  # samples of rest that end the brake; samples after which it ends
-_CLEARLY = 0.02  # a fault of the actuator must explain the last samples this much better,
-_BY_FAR = 10.0  # or as well as a declared plant would, and by this much better in squares
+_LOST = 2.0  # times the critical levels: what is beyond is not braked any more
+# A fault of the actuator must explain the last samples as well as a declared plant would, and
+# better by so much in squares; or so much better, where what is unexplained is so large. A late
+# plant was else taken for one that turned its sign.
+_BY_FAR, _CLEARLY, _LARGE = 100.0, 0.02, 100.0
 
 
 @dataclass(frozen=True, eq=False)  # hashable: a static argument of compiled functions
@@ -279,6 +282,7 @@ def observed(
     reach = _QUIET * (xp.asarray(rules.upper) - xp.asarray(rules.lower)) / 2
     is_quiet = (size < _QUIET).all() & (abs(belief.inputs[-1] - rules.rest) < reach).all()
     num_quiet = xp.where(is_quiet, belief.num_quiet + 1, 0)
+    num_quiet = xp.where((size > _LOST).any(), _NUM_QUIET, num_quiet)  # it pushes, as it seems
     return belief._replace(
         mean=mean,
         root=root,
@@ -398,9 +402,10 @@ def _replayed(
         error = error + xp.sum(xp.where(xp.isfinite(seen[i])[None], off, 0.0) ** 2, axis=1)
     error = xp.where(xp.isfinite(error), error, xp.inf)
     best, as_now = xp.argmin(error), xp.argmin(xp.where(signs == belief.sign, error, xp.inf))
-    better = error[as_now] - error[best]
-    is_explained = (error[best] < rules.thresholds[0]) & (error[as_now] > rules.thresholds[0])
-    is_clear = (error[best] < _CLEARLY * error[as_now]) | (is_explained & (better > _BY_FAR))
+    limit, better = rules.thresholds[0], error[as_now] - error[best]
+    is_explained = (error[best] < limit) & (error[as_now] > limit) & (better > _BY_FAR)
+    is_large = error[as_now] > _LARGE * limit
+    is_clear = is_explained | (is_large & (error[best] < _CLEARLY * error[as_now]))
     best = xp.where(is_clear, best, as_now)
     return points[best, :n], xp.asarray(signs)[best]
 

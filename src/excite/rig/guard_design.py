@@ -344,9 +344,9 @@ class GuardFilter(AbstractFilter):
         input = guard.decided(jnp, self.rules, belief, proposed)
         return belief, input, belief.num_braked > 0
 
-    def applied(self, belief: Belief, input: Float[Array, " input"]) -> Belief:
+    def applied(self, memory: Belief, input: Float[Array, " input"]) -> Belief:
         """The belief at the next sample."""
-        return guard.moved(jnp, self.rules, self.model.functions(), belief, input)
+        return guard.moved(jnp, self.rules, self.model.functions(), memory, input)
 
     def is_over(self, memory: Belief) -> Bool[Array, ""]:
         """Whether the brake has done its work."""
