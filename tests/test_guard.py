@@ -1,5 +1,6 @@
 """The guard of a rig: its filter, its brake, its programs for NumPy, and experiments behind it."""
 
+import dataclasses
 import functools
 import json
 
@@ -52,7 +53,7 @@ def test_a_program_computes_what_the_plant_computes(name):
     functions = model.functions()
     for function, arrays in ((functions.advance, (points, past)), (functions.output, (points,))):
         program = program_of(function, *arrays)
-        again = Program.from_dict(json.loads(json.dumps(program.to_dict())))
+        again = Program.from_text(json.loads(json.dumps(program.to_text())))
         expected = np.asarray(jax.jit(function)(*arrays))
         np.testing.assert_allclose(again(*arrays), expected, rtol=1e-9, atol=1e-12)
 
@@ -83,6 +84,9 @@ def test_a_program_from_a_file_can_only_do_arithmetic():
         Program.from_dict(foreign)
     with pytest.raises(ValueError, match="damaged"):
         Program.from_dict({"num_inputs": 1})
+    for text in ("what", "eJw="):
+        with pytest.raises(ValueError, match="damaged"):
+            Program.from_text(text)
     with pytest.raises(ValueError, match="unknown type 'object'"):
         Program.from_dict(json.loads(json.dumps(whole).replace('"float64"', '"object"')))
 
@@ -175,6 +179,59 @@ def test_after_a_flip_the_brake_turns_its_sign_too(guarding):
     assert (np.asarray(runs.memory.tripped_at) >= 30).all()
     assert (np.asarray(runs.memory.sign) < 1).all()
     assert np.abs(np.asarray(runs.measured)[:, -1]).max() < 0.2
+
+
+def test_the_estimate_starts_again_where_the_sign_turns(guarding):
+    """A state that the wrong sign explained would mislead the brake for many samples."""
+    guard_ = guarding.guard()
+    rules, model = guard_.rules, guard_.model
+    n, point = rules.num_states, rules.mean.copy()
+    belief, past = guard.start(np, rules), np.zeros((rules.depth, 1))
+    sign, errors = 1.0, []
+    for k in range(30):
+        measured = model.output(point[None])[0]
+        belief = guard.observed(np, rules, model, belief, measured)
+        if belief.sign < 0:
+            errors.append(np.abs(belief.mean[:n] - point[:n]) / rules.state_scale)
+        sign = -1.0 if k >= 15 else 1.0
+        input = guard.decided(np, rules, belief, np.array([12.0 * (-1) ** (k // 4)]))
+        belief = guard.moved(np, rules, model, belief, input)
+        past = np.concatenate([past[1:], sign * input[None]])
+        point[:n] = model.advance(point[None], past[None])[0]
+    assert 15 < belief.tripped_at <= 18
+    assert len(errors) >= 10
+    assert np.max(errors) < 0.05
+
+
+def test_what_seems_dead_is_braked_all_the_same(guarding):
+    rules = guarding.rules
+    belief = guard.start(np, rules)
+    belief = belief._replace(mean=belief.mean + 0.3, num_braked=np.asarray(1))
+    acting = guard.decided(np, rules, belief, np.zeros(1))
+    dead = guard.decided(np, rules, belief._replace(sign=np.asarray(0.0)), np.zeros(1))
+    np.testing.assert_array_equal(acting, dead)
+    assert abs(acting[0]) > 1
+
+
+def test_the_guard_knows_what_the_supervisor_let_through(guarding):
+    """Without it, inputs that a slew limit or a trip changed would look like another plant."""
+    keys = jax.random.split(jax.random.key(3), 2)
+    hardware = drawn_hardware(PLANT, READINGS, 0.3, keys)
+    rules = guarding.supervision(Supervision.of(PLANT.description, slew=20.0))
+    runs = run_batch(hardware, CHIRP, rules, STEPS, READINGS, guarding)
+    count = np.asarray(runs.memory.inputs).shape[1]
+    np.testing.assert_array_equal(runs.memory.inputs, np.asarray(runs.inputs)[:, -count:])
+    np.testing.assert_array_equal(runs.memory.num_braked, 0)
+
+
+def test_at_its_level_a_plant_is_braked_not_let_go(guarding):
+    rules, model = guarding.rules, guarding.model.functions()
+    free = dataclasses.replace(rules, thresholds=np.full(3, np.inf))
+    belief = guard.start(jnp, free)
+    for share in (0.80, 0.88, 0.96, 1.01):
+        assert int(belief.num_braked) == 0
+        belief = guard.observed(jnp, free, model, belief, jnp.array([share * rules.critical[0]]))
+    assert int(belief.num_braked) == 1
 
 
 def test_a_sensor_that_stands_still_is_not_believed(guarding):

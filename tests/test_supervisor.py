@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from catalogue import PLANTS, TwoMasses
 
-from excite.plant import Aero2Detailed
+from excite.plant import Aero2Detailed, DCMotor
 from excite.safety import Supervision, Trip, Watch, allowed, check_reading, check_sample, tripped
 
 AERO = Aero2Detailed.definition
@@ -82,6 +82,26 @@ def test_a_change_beyond_what_the_plant_can_do_is_a_jump(sign, elapsed):
     assert most < CRITICAL
     assert seen(sign * 0.99 * most, elapsed=elapsed) == Trip.NONE
     assert seen(sign * 1.01 * most, elapsed=elapsed) == Trip.JUMP
+
+
+def test_a_fast_plant_that_is_read_once_in_a_sampling_time_does_not_jump():
+    rules = Supervision.of(DCMotor.definition)
+    watch = Watch.start(np, rules, np.array([0.0, -4.0]))
+    assert check_reading(np, rules, watch, np.array([19.0, 4.0]), rules.dt).trip == Trip.NONE
+    watch = Watch.start(np, rules, np.array([0.0, -4.0]))
+    assert check_reading(np, rules, watch, np.array([0.0, 6.1]), rules.dt).trip == Trip.JUMP
+
+
+def test_a_plant_that_turns_within_a_sample_is_not_predicted():
+    assert trip_of(np.array([0.33, -0.84, -0.93]) * CRITICAL) == Trip.NONE
+    assert trip_of(np.array([-0.1, 0.8, 0.91]) * CRITICAL) == Trip.NONE
+
+
+def test_beside_a_guard_only_what_is_no_number_trips():
+    rules = dataclasses.replace(RULES, is_guarded=True)
+    assert trip_of([0.0, 0.5, 0.6, 1.2 * CRITICAL, -0.5], rules=rules) == Trip.NONE
+    assert trip_of([0.1] * 30, inputs=LARGE, rules=rules) == Trip.NONE
+    assert trip_of([0.1, math.nan], rules=rules) == Trip.NOT_FINITE
 
 
 def test_a_jump_over_the_level_is_told_as_a_jump():

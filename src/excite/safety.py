@@ -138,9 +138,13 @@ class Supervision:
         critical: critical levels.
         resolution: smallest change of a reading that is not the sensor's noise or step.
         fastest: largest plausible change of an output in one second.
+        widest: largest plausible change from one sampling instant to the next, for a rig that is
+            read once in a sampling time.
         driven: an input further than this from the safe one must move the plant.
         num_still: samples for which a reading may be constant after the plant moved.
         num_dead: samples for which a reading may be constant while the plant is driven.
+        is_guarded: whether levels, jumps and constant readings are left to a guard, which brakes
+            where a supervisor can only switch to the safe input (`rig.guard`).
     """
 
     dt: float
@@ -151,9 +155,11 @@ class Supervision:
     critical: np.ndarray
     resolution: np.ndarray
     fastest: np.ndarray
+    widest: np.ndarray
     driven: np.ndarray
     num_still: int = 4
     num_dead: int = 20
+    is_guarded: bool = False
 
     @classmethod
     def of(cls, description: PlantDescription, slew: float = math.inf) -> Supervision:
@@ -180,6 +186,7 @@ class Supervision:
             critical=critical,
             resolution=np.array([max(o.resolution, o.noise_sd) for o in d.outputs]),
             fastest=10 * size,
+            widest=2 * size,
             driven=np.array([i.amplitude / 4 for i in d.inputs]),
         )
 
@@ -241,20 +248,34 @@ def check_reading(
     is_finite = xp.isfinite(measured)
     change = abs(xp.where(is_finite, measured, 0.0) - watch.reading)
     watch = tripped(xp, watch, ~is_finite.all(), Trip.NOT_FINITE)
+    # Read once in a sampling time, a fast plant can go from one level to the other unseen.
     allowed_change = rules.fastest * elapsed + 8 * rules.resolution
-    watch = tripped(xp, watch, (is_finite & (change > allowed_change)).any(), Trip.JUMP)
-    watch = tripped(xp, watch, (abs(measured) >= rules.critical).any(), Trip.LEVEL)
+    is_whole = elapsed > rules.dt / 2
+    allowed_change = xp.where(is_whole, xp.maximum(allowed_change, rules.widest), allowed_change)
+    if not rules.is_guarded:
+        watch = tripped(xp, watch, (is_finite & (change > allowed_change)).any(), Trip.JUMP)
+        watch = tripped(xp, watch, (abs(measured) >= rules.critical).any(), Trip.LEVEL)
     return watch._replace(reading=xp.where(is_finite, measured, watch.reading))
+
+
+def about_to_reach(samples: AnyArray, critical: AnyArray) -> AnyArray:
+    """Whether each output is near its level, and reaches it one sample later.
+
+    A parabola through the last three samples, newest last, takes into account that a swing slows
+    down before it turns. It says nothing of a plant that turns within a sample.
+    """
+    predicted = 3 * samples[2] - 3 * samples[1] + samples[0]
+    is_smooth = abs(samples[2] - 2 * samples[1] + samples[0]) < 0.25 * critical
+    return is_smooth & (abs(predicted) >= critical) & (abs(samples[2]) >= 0.9 * critical)
 
 
 def check_sample(xp: ModuleType, rules: Supervision, watch: Watch) -> Watch:
     """The watch at a sampling instant: prediction one step ahead, and constant readings."""
     newest, last = watch.reading, watch.samples[2]
     samples = xp.concatenate([watch.samples[1:], newest[None]])
-    # A parabola through three samples takes into account that a swing slows down before it turns.
-    predicted = 3 * samples[2] - 3 * samples[1] + samples[0]
-    is_over = (abs(predicted) >= rules.critical) & (abs(newest) >= 0.9 * rules.critical)
-    watch = tripped(xp, watch, is_over.any() & (watch.num_samples >= 2), Trip.PREDICTED_LEVEL)
+    if not rules.is_guarded:
+        is_over = about_to_reach(samples, rules.critical).any() & (watch.num_samples >= 2)
+        watch = tripped(xp, watch, is_over, Trip.PREDICTED_LEVEL)
     is_still = (newest == last) & (watch.num_samples > 0)
     is_driven = (abs(watch.input - rules.safe_input) > rules.driven).any()
     watch = watch._replace(
@@ -267,6 +288,8 @@ def check_sample(xp: ModuleType, rules: Supervision, watch: Watch) -> Watch:
     # A swing slows down before it turns: a sudden stop is a fault of the sensor.
     is_stuck = (watch.num_still >= rules.num_still) & (watch.last_move > 4 * rules.resolution)
     is_dead = watch.num_driven >= rules.num_dead
+    if rules.is_guarded:
+        return watch
     return tripped(xp, watch, (is_stuck | is_dead).any(), Trip.STALE)
 
 

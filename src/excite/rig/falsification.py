@@ -87,7 +87,7 @@ class OnRig(AbstractExperiments):
             excitation=excitation,
             safety_filter=safety_filter,
             numbers=usual_numbers(float(plant.dt), numbers),
-            rules=Supervision.of(plant.description),
+            rules=safety_filter.supervision(Supervision.of(plant.description)),
             num_steps=num_steps,
             num_readings=num_readings,
             num_written=num_written(delay, len(box.names), float(plant.dt)),

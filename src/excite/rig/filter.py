@@ -27,7 +27,7 @@ import scipy.linalg
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..plant import AbstractPlant, Params
-from ..safety import critical_levels, safe_input
+from ..safety import Supervision, critical_levels, safe_input
 from ..simulation import step
 from .player import AbstractPlayer
 
@@ -61,6 +61,15 @@ class AbstractFilter(eqx.Module):
         self, memory: PyTree, measured: Float[Array, " output"], proposed: Float[Array, " input"]
     ) -> tuple[PyTree, Float[Array, " input"], Bool[Array, ""]]:
         """Memory before the next sample, the input to apply, and whether it was changed."""
+
+    def applied(self, memory: PyTree, input: Float[Array, " input"]) -> PyTree:
+        """Memory at the next sample; the input is the one that the supervisor let through."""
+        del input
+        return memory
+
+    def supervision(self, rules: Supervision) -> Supervision:
+        """A supervisor's rules beside this filter."""
+        return rules
 
     def is_over(self, memory: PyTree) -> Bool[Array, ""]:
         """Whether the experiment ends."""

@@ -36,15 +36,19 @@ NUM_RECENT = 10
 NUM_REPLAYED = 5
 """Samples from which the guard infers what was wrong."""
 
-NUM_CAUSES = 1 + 2 * (NUM_REPLAYED - 2)
+NUM_CAUSES = 1 + 2 * (NUM_REPLAYED - 1)
 """As declared, and an actuator that turned its sign or died at one of the first samples."""
 
-_NUM_ONSETS = NUM_REPLAYED - 2  # samples at which a fault of the actuator may have begun
+_NUM_ONSETS = NUM_REPLAYED - 1  # samples at which a fault of the actuator may have begun
 _SQUARE = 3.0  # of the distance of the filter's points, in standard deviations: that of a normal
 _WIDE = 0.05  # after a trip, how far a state may move in one sample unexplained, in its scales
-_QUIET = 0.25  # fraction of the critical levels below which the plant counts as at rest
+_QUIET = 0.25  # fraction of critical levels and input limits below which it is at rest
 _NUM_QUIET, _LONGEST = 5, 60  # samples of rest that end the brake; samples after which it ends
-_CLEARLY = 0.02  # a fault of the actuator must explain the last samples this much better
+_LOST = 2.0  # times the critical levels: what is beyond is not braked any more
+# A fault of the actuator must explain the last samples as well as a declared plant would, and
+# better by so much in squares; or so much better, where what is unexplained is so large. A late
+# plant was else taken for one that turned its sign.
+_BY_FAR, _CLEARLY, _LARGE = 100.0, 0.02, 100.0
 
 
 @dataclass(frozen=True, eq=False)  # hashable: a static argument of compiled functions
@@ -65,7 +69,6 @@ class GuardRules:
         watched: indices of the outputs with a critical level.
         critical: their levels.
         state_scale: usual size of each state.
-        visible: size of an output's change that is taken for one of the actuator.
         depth: samples for which an input can act.
         thresholds: of the largest squared innovation in standard deviations, of the mean of the
             last ten, and of the distance of an estimate from the declared box.
@@ -83,7 +86,6 @@ class GuardRules:
     watched: np.ndarray
     critical: np.ndarray
     state_scale: np.ndarray
-    visible: np.ndarray
     depth: int
     thresholds: np.ndarray
 
@@ -94,8 +96,8 @@ class GuardRules:
 
 
 def beside(rules: Supervision) -> Supervision:
-    """A supervisor's rules beside a guard: a frozen sensor is left to the guard and its brake."""
-    return replace(rules, num_still=_LONGEST, num_dead=max(rules.num_dead, _LONGEST))
+    """A supervisor's rules beside a guard: what the guard notices, too, is left to its brake."""
+    return replace(rules, is_guarded=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,28 +107,23 @@ class Guard:
     Attributes:
         rules: what it knows.
         advance, output: the model's functions, for as many points as the filter has.
-        replay, replay_output: the same for the points of a replay.
     """
 
     rules: GuardRules
     advance: Program
     output: Program
-    replay: Program
-    replay_output: Program
 
     @property
     def model(self) -> Model:
-        """The declared plants."""
-        few = NUM_CAUSES
+        """The declared plants; a program has a fixed number of points, and some may be spare."""
+        count = num_points(self.rules)
 
         def advance(points: np.ndarray, past: np.ndarray) -> np.ndarray:
-            return (self.replay if len(points) == few else self.advance)(points, past)
+            rows = np.resize(points, (count, *points.shape[1:]))
+            return self.advance(rows, np.resize(past, (count, *past.shape[1:])))[: len(points)]
 
         def output(points: np.ndarray) -> np.ndarray:
-            if len(points) == few:
-                return self.replay_output(points)
-            rows = 2 * len(self.rules.mean) + 1
-            return self.output(np.resize(points, (rows, points.shape[1])))[: len(points)]
+            return self.output(np.resize(points, (count, points.shape[1])))[: len(points)]
 
         return Model(advance, output)
 
@@ -136,7 +133,7 @@ class Guard:
             name: value.tolist() if isinstance(value, np.ndarray) else value
             for name, value in vars(self.rules).items()
         }
-        programs = {name: getattr(self, name).to_dict() for name in _PROGRAMS}
+        programs = {name: getattr(self, name).to_text() for name in _PROGRAMS}
         return {"rules": rules, **programs}
 
     @classmethod
@@ -150,13 +147,18 @@ class Guard:
             rules = dict(data["rules"])
             depth, watched = int(rules.pop("depth")), np.array(rules.pop("watched"), int)
             arrays = {name: np.array(value, float) for name, value in rules.items()}
-            programs = (Program.from_dict(data[name]) for name in _PROGRAMS)
+            programs = (Program.from_text(data[name]) for name in _PROGRAMS)
             return cls(GuardRules(depth=depth, watched=watched, **arrays), *programs)
         except (KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"the guard is damaged ({error!r})") from None
 
 
-_PROGRAMS = "advance", "output", "replay", "replay_output"
+_PROGRAMS = "advance", "output"
+
+
+def num_points(rules: GuardRules) -> int:
+    """Points of a guard's programs: those of its filter, or of a replay."""
+    return max(2 * len(rules.mean) + 1, NUM_CAUSES)
 
 
 class Model(NamedTuple):
@@ -256,16 +258,17 @@ def observed(
     sd = xp.sqrt(xp.sum(root**2, axis=1))[rules.num_states :]
     outside = xp.max(abs(mean[rules.num_states :]) - 1 - 3 * sd, initial=-1.0)
     score = xp.stack([square, xp.mean(recent), outside])
-    is_explained = (score < xp.asarray(rules.thresholds)).all() & ~xp.asarray(is_asked)
+    is_over = (abs(measured[rules.watched]) >= xp.asarray(rules.critical)).any()
+    is_explained = (score < xp.asarray(rules.thresholds)).all() & ~is_over & ~xp.asarray(is_asked)
     trips = ~is_braking & ~is_explained
     was_frozen = (measured == belief.measured[-1]).any()
     is_blind = belief.is_blind | ((is_braking | trips) & was_frozen)
-    starts_again = trips | (is_blind & ~belief.is_blind)
     if xp is np and not (trips or is_braking):  # on a rig, what is not needed takes time
         state, sign = mean[: rules.num_states], belief.sign
     else:
         state, sign = _replayed(xp, rules, model, belief, measured)
     sign = xp.where(is_braking | trips, xp.where(is_blind, 1.0, sign), belief.sign)
+    starts_again = trips | (is_blind & ~belief.is_blind) | (sign != belief.sign)
     quantities = xp.clip(belief.mean[rules.num_states :], -1.0, 1.0)
     braking_mean = xp.concatenate([state, quantities])
     braking_root = xp.diag(
@@ -274,8 +277,12 @@ def observed(
     mean = xp.where(starts_again, braking_mean, xp.where(is_blind, belief.mean, mean))
     root = xp.where(starts_again, braking_root, xp.where(is_blind, belief.root, root))
     shown = xp.where(is_blind, model.output(mean[None])[0], measured)  # what is believed
+    # A motor at full speed may have no current: it is at rest where the brake asks for nothing.
     size = abs(shown[rules.watched]) / xp.asarray(rules.critical)
-    num_quiet = xp.where((size < _QUIET).all(), belief.num_quiet + 1, 0)
+    reach = _QUIET * (xp.asarray(rules.upper) - xp.asarray(rules.lower)) / 2
+    is_quiet = (size < _QUIET).all() & (abs(belief.inputs[-1] - rules.rest) < reach).all()
+    num_quiet = xp.where(is_quiet, belief.num_quiet + 1, 0)
+    num_quiet = xp.where((size > _LOST).any(), _NUM_QUIET, num_quiet)  # it pushes, as it seems
     return belief._replace(
         mean=mean,
         root=root,
@@ -298,7 +305,8 @@ def decided(xp: ModuleType, rules: GuardRules, belief: Belief, proposed: AnyArra
     count = rules.depth - 1
     past = belief.sign * belief.inputs[len(belief.inputs) - count :] - rest[None]
     brake = xp.asarray(rules.feedback) @ away + xp.asarray(rules.past_feedback) @ xp.ravel(past)
-    brake = belief.sign * (rest - brake)
+    # One that seems dead may only be late: it is driven all the same.
+    brake = xp.where(belief.sign < 0, -1.0, 1.0) * (rest - brake)
     brake = xp.clip(xp.where(xp.isfinite(brake), brake, rules.rest), rules.lower, rules.upper)
     return xp.where(belief.num_braked > 0, brake, proposed)
 
@@ -372,7 +380,7 @@ def _replayed(
     """State now, and the actuator's sign, that explain the last samples best.
 
     The last samples are played again from the estimate before them: as declared, and with an
-    actuator that turned its sign or died three or more samples ago: in less, a plant that is
+    actuator that turned its sign or died two or more samples ago: in less, a plant that is
     only late looks the same.
     """
     n, depth = rules.num_states, rules.depth
@@ -390,11 +398,14 @@ def _replayed(
     for i in range(NUM_REPLAYED):
         states = model.advance(points, inputs[:, i + 1 : i + 1 + depth])
         points = xp.concatenate([states, points[:, n:]], axis=1)
-        off = (model.output(points) - seen[i][None]) / xp.asarray(rules.visible)[None]
+        off = (model.output(points) - seen[i][None]) / xp.asarray(rules.noise)[None]
         error = error + xp.sum(xp.where(xp.isfinite(seen[i])[None], off, 0.0) ** 2, axis=1)
     error = xp.where(xp.isfinite(error), error, xp.inf)
     best, as_now = xp.argmin(error), xp.argmin(xp.where(signs == belief.sign, error, xp.inf))
-    is_clear = (error[best] < _CLEARLY * error[as_now]) & (error[as_now] > NUM_REPLAYED)
+    limit, better = rules.thresholds[0], error[as_now] - error[best]
+    is_explained = (error[best] < limit) & (error[as_now] > limit) & (better > _BY_FAR)
+    is_large = error[as_now] > _LARGE * limit
+    is_clear = is_explained | (is_large & (error[best] < _CLEARLY * error[as_now]))
     best = xp.where(is_clear, best, as_now)
     return points[best, :n], xp.asarray(signs)[best]
 

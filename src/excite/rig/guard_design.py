@@ -34,7 +34,6 @@ _SAFE = 0.99  # largest output over its level that a brake may leave
 _LATENCY = 0.2  # of a rig, at most, in samples
 _MARGIN, _MARGIN_OUTSIDE = 1.3, 0.15  # of the thresholds above the largest score
 _CHUNK = 100  # experiments of one call
-_VISIBLE = 0.005  # of an output's scale
 _WALK = 1e-3  # unexplained change in one sample, of a state in its scales and of a quantity
 
 
@@ -59,6 +58,21 @@ class GuardModel(eqx.Module):
         ]
         longest = max(delays, default=0.0) / float(uncertainty.plant.dt)
         return cls(uncertainty, 2 + math.ceil(longest))
+
+    @classmethod
+    def for_rig(
+        cls, plant: AbstractPlant, spread: float, ranges: Mapping[str, Range]
+    ) -> GuardModel:
+        """The model for a declared uncertainty, and for a rig.
+
+        A rig acts a part of a sampling time late: the guard must not take that for a fault.
+        """
+        short, declared = _LATENCY * float(plant.dt), Uncertainty.of(plant, spread, ranges).ranges()
+        late = {
+            name: (0.0, max(short, declared.get(name, (0.0, 0.0))[1]))
+            for name in (f"delay_{i.name}" for i in plant.definition.inputs)
+        }
+        return cls.of(Uncertainty.of(plant, spread, {**ranges, **late}))
 
     @property
     def estimated(self) -> tuple[int, ...]:
@@ -137,7 +151,6 @@ def rules_of(model: GuardModel, gentleness: float = 1.0) -> GuardRules:
         watched=np.array(watched, int),
         critical=np.asarray(critical, float),
         state_scale=scale,
-        visible=np.maximum(_noise(plant), _VISIBLE * np.array([o.scale for o in d.outputs])),
         depth=model.depth,
         thresholds=np.full(3, np.inf),
     )
@@ -250,13 +263,7 @@ def guard_for(
         ValueError: for a plant that linear feedback cannot bring to rest.
     """
     box = Uncertainty.of(plant, spread, ranges)
-    # A rig acts a part of a sampling time late: the guard must not take that for a fault.
-    short, declared = _LATENCY * float(plant.dt), box.ranges()
-    late = {
-        name: (0.0, max(short, declared.get(name, (0.0, 0.0))[1]))
-        for name in (f"delay_{i.name}" for i in plant.definition.inputs)
-    }
-    model = GuardModel.of(Uncertainty.of(plant, spread, {**ranges, **late}))
+    model = GuardModel.for_rig(plant, spread, ranges)
     keys = jax.random.split(jax.random.key(seed), num_runs)
     cases = Cases(jax.vmap(box.draw)(keys), jnp.arange(num_runs) + seed * num_runs)
     stops = jax.random.randint(jax.random.key(seed), (num_runs,), 1, num_steps)
@@ -322,14 +329,16 @@ class GuardFilter(AbstractFilter):
     def __call__(
         self, belief: Belief, measured: Float[Array, " output"], proposed: Float[Array, " input"]
     ) -> tuple[Belief, Float[Array, " input"], Bool[Array, ""]]:
-        """The belief at the next sample, the input to apply, and whether it is the brake's."""
+        """The belief after a measurement, the input to apply, and whether it is the brake's."""
         model = self.model.functions()
         is_asked = False if self.trips_at is None else belief.k >= self.trips_at
         belief = guard.observed(jnp, self.rules, model, belief, measured, is_asked)
         input = guard.decided(jnp, self.rules, belief, proposed)
-        input = jnp.clip(input, self.rules.lower, self.rules.upper)
-        after = guard.moved(jnp, self.rules, model, belief, input)
-        return after, input, belief.num_braked > 0
+        return belief, input, belief.num_braked > 0
+
+    def applied(self, memory: Belief, input: Float[Array, " input"]) -> Belief:
+        """The belief at the next sample."""
+        return guard.moved(jnp, self.rules, self.model.functions(), memory, input)
 
     def is_over(self, memory: Belief) -> Bool[Array, ""]:
         """Whether the brake has done its work."""
@@ -345,10 +354,8 @@ class GuardFilter(AbstractFilter):
         Raises:
             ValueError: for a plant with equations that a program cannot have.
         """
-        rules, model = self.rules, self.model.functions()
-        n, shape = len(rules.mean), (rules.depth, len(rules.rest))
-        programs = []
-        for count in (2 * n + 1, guard.NUM_CAUSES):
-            points, past = np.zeros((count, n)), np.zeros((count, *shape))
-            programs += [program_of(model.advance, points, past), program_of(model.output, points)]
-        return Guard(rules, *programs)
+        rules, model, count = self.rules, self.model.functions(), guard.num_points(self.rules)
+        points = np.zeros((count, len(rules.mean)))
+        past = np.zeros((count, rules.depth, len(rules.rest)))
+        advance = program_of(model.advance, points, past)
+        return Guard(rules, advance, program_of(model.output, points))

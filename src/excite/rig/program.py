@@ -7,6 +7,9 @@ computer. A program from a file can only do arithmetic on arrays.
 
 from __future__ import annotations
 
+import base64
+import json
+import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Self
@@ -14,6 +17,8 @@ from typing import Any, Self
 import numpy as np
 
 Numpy = Callable[..., Any]
+
+_LONGEST = 10_000_000  # bytes of a program: a file of a few bytes cannot fill the memory
 
 _BY_ELEMENT: Mapping[str, Numpy] = {
     "add": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.divide, "neg": np.negative,
@@ -58,15 +63,16 @@ OPERATIONS: Mapping[str, Numpy] = {
     "select_n": lambda which, first, second: np.where(which, second, first),
     "convert_element_type": lambda x, new_dtype: np.asarray(x).astype(new_dtype),
     "broadcast_in_dim": _broadcast,
-    "reshape": lambda x, new_sizes: np.reshape(x, new_sizes),
-    "squeeze": lambda x, dimensions: np.squeeze(x, tuple(dimensions)),
-    "transpose": lambda x, permutation: np.transpose(x, permutation),
+    "reshape": lambda x, new_sizes: x.reshape(new_sizes),
+    "squeeze": lambda x, dimensions: x.squeeze(tuple(dimensions)),
+    "transpose": lambda x, permutation: x.transpose(permutation),
     "concatenate": lambda *parts, dimension: np.concatenate(parts, dimension),
     "stack": lambda *parts, axis: np.stack(parts, axis),
     "slice": lambda x, start_indices, limit_indices, strides: x[
         tuple(map(slice, start_indices, limit_indices, strides or [1] * len(start_indices)))
     ],
     "row": lambda x, i: x[i],
+    "index": lambda x, at: x[tuple(i if isinstance(i, int) else slice(*i) for i in at)],
     "reduce_sum": lambda x, axes: np.sum(x, tuple(axes)),
     "reduce_max": lambda x, axes: np.max(x, tuple(axes)),
     "reduce_min": lambda x, axes: np.min(x, tuple(axes)),
@@ -115,6 +121,26 @@ class Program:
         for o in self.operations:
             values[o.gives] = OPERATIONS[o.name](*(values[i] for i in o.takes), **o.settings)
         return values[self.result]
+
+    def to_text(self) -> str:
+        """The program in few letters: its JSON, compressed."""
+        whole = json.dumps(self.to_dict(), separators=(",", ":")).encode()
+        return base64.b64encode(zlib.compress(whole, 9)).decode()
+
+    @classmethod
+    def from_text(cls, text: str) -> Self:
+        """The program that `to_text` wrote.
+
+        Raises:
+            ValueError: for another text.
+        """
+        try:
+            reader = zlib.decompressobj()
+            whole = reader.decompress(base64.b64decode(text, validate=True), _LONGEST)
+            data = json.loads(whole)
+        except (ValueError, TypeError, zlib.error) as error:
+            raise ValueError(f"a plant's program is damaged ({error!r})") from None
+        return cls.from_dict(data)
 
     def to_dict(self) -> dict[str, Any]:
         """The program as JSON-ready data."""

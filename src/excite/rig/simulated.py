@@ -454,7 +454,7 @@ def one_run(
         memory, proposed, is_changed = safety_filter(memory, measured, proposed)
         watch = tripped(jnp, watch, safety_filter.is_over(memory), Trip.UNEXPLAINED)
         watch, input = allowed(jnp, rules, watch, proposed)
-        player = excitation.applied(player, input)
+        player, memory = excitation.applied(player, input), safety_filter.applied(memory, input)
         (state, watch), acted_on = hold(state, watch, input, noise)
         return (state, watch, player, memory, count + is_changed), (input, acted_on)
 

@@ -48,6 +48,7 @@ class _Writer:
     constants: dict[int, np.ndarray] = field(default_factory=dict)
     operations: list[Operation] = field(default_factory=list)
     done: dict[str, int] = field(default_factory=dict)
+    cuts: dict[int, Operation] = field(default_factory=dict)
     count: int = 0
 
     def __post_init__(self) -> None:
@@ -92,6 +93,13 @@ class _Writer:
         if name == "scan":
             return self._scan(takes, params)
         settings = {word: _plain(params[word]) for word in _TAKES.get(name, ())}
+        cut = self.cuts.get(takes[0]) if name == "squeeze" else None
+        if cut is not None:  # one row or column, in one operation
+            ends = cut.settings["start_indices"], cut.settings["limit_indices"]
+            at: list[Any] = [[begin, end] for begin, end in zip(*ends, strict=True)]
+            for axis in settings["dimensions"]:
+                at[axis] = at[axis][0]
+            return [self._operation("index", list(cut.takes), {"at": at})]
         return [self._operation(name, takes, settings)]
 
     def _operation(self, name: str, takes: list[int], settings: dict[str, Any]) -> int:
@@ -104,7 +112,10 @@ class _Writer:
             number = self.constant(np.asarray(value))
         else:
             number = self.new()
-            self.operations.append(Operation(name, tuple(takes), number, settings))
+            operation = Operation(name, tuple(takes), number, settings)
+            self.operations.append(operation)
+            if name == "slice" and set(settings["strides"] or [1]) == {1}:
+                self.cuts[number] = operation
         self.done[task] = number
         return number
 
