@@ -10,8 +10,8 @@ The width begins at the states' scales and shrinks with the gaps. Segments are s
 almost a linear problem, and it succeeds from parameters that are several times too large or
 too small. A step of Levenberg-Marquardt eliminates the start states one after the other by
 orthogonal factorisations, as a square-root information filter does (G. J. Bierman,
-Factorization Methods for Discrete Sequential Estimation, 1977). In the very first steps every
-segment finds its start state from its own first samples, which is nearly linear, too.
+Factorization Methods for Discrete Sequential Estimation, 1977). Before, every segment finds
+its start state from its own first samples, which is nearly linear, too.
 
 Second phase: the gaps are closed. A step of Gauss-Newton closes them to first order,
 
@@ -42,11 +42,10 @@ from .contract import Experiments
 
 Tree = TypeVar("Tree")
 
-_FIRST = 2
+_PLACEMENTS = 2
 """Steps in which every segment finds its start state from its first samples."""
-_FIRST_WIDTH = 3.0  # how far that may be from the experiment's initial state, in state scales
-_MATCHES = 40
-"""Most steps of the first phase."""
+_MATCHES = 38
+"""Most steps of the first phase after these."""
 _SHRINKAGE, _LEAST_WIDTH = 0.01, 1e-8  # of the gaps' width: in one step at most, and its end
 _SMALL = 1e-2  # root mean square of the gaps, over state scales, that ends the first phase
 _LEAST_PART = 0.01  # of a step; a search that needs smaller ones has stalled
@@ -362,21 +361,51 @@ class MultipleShooting:
         (_, triangles), (moves, misfit) = jax.lax.scan(simulate_block, begin, self._blocks(point))
         return Sweep(over_segments(moves), triangles, over_segments(misfit))
 
-    def linearised(
-        self, point: Point, sd: Array, width: Array, damping: Array, is_first: Array
-    ) -> Linear:
-        """Simulates all segments; gaps count over `width` state scales.
+    def placed(self, start: Point, sd: Array) -> tuple[Point, Float[Array, ""]]:
+        """Start states that fit the first samples of each segment, and the misfits on the way.
 
-        At first every segment is fitted to its first samples alone, from which its start state
-        follows almost linearly.
+        A step of Gauss-Newton also counts the change of a state, over its scale. The misfits
+        are the sum of squares before the last step.
         """
+        n, z = self.num_states, start.z
+        params = self.plant.Params(*self.params_at(z))
+        few = -(-2 * n // len(self.output_scales)) + 1
+        here, _, segments = self._blocks(start)
+        parts = segments.steps, segments.measured, segments.valid
+        parts = jax.tree.map(lambda a: a[:, :, :, :few], parts)
+
+        def misfits(x: Array, parts: tuple[Steps, Array, Array]) -> Array:
+            steps, measured, valid = parts
+
+            def advance(x: Array, now: Steps) -> tuple[Array, Array]:
+                return self.advance(x, now, params), self.plant.output(x, params)
+
+            outputs = jax.lax.scan(advance, x * self.scales, steps)[1]
+            return (jnp.where(valid, outputs - measured, 0.0) / sd[None]).ravel()
+
+        def move(x: Array, parts: tuple[Steps, Array, Array]) -> tuple[Array, Array]:
+            def twice(x: Array) -> tuple[Array, Array]:
+                return (r := misfits(x, parts)), r
+
+            J, r = jax.jacfwd(twice, has_aux=True)(x)
+            rows = jnp.concatenate([jnp.concatenate([J, r[:, None]], axis=1), jnp.eye(n, n + 1)])
+            R = jnp.linalg.qr(rows, mode="r")
+            return x - jax.scipy.linalg.solve_triangular(R[:n, :n], R[:n, n]), jnp.sum(r**2)
+
+        def improved(_: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:
+            moved, squares = jax.vmap(jax.vmap(jax.vmap(move)))(now[0], parts)
+            if not self.first_is_free:
+                moved = moved.at[0, :, 0].set(now[0][0, :, 0])
+            return moved, jnp.sum(squares)
+
+        moved, squares = jax.lax.fori_loop(0, _PLACEMENTS, improved, (here, jnp.asarray(0.0)))
+        return Point(z, over_segments(moved)), squares
+
+    def linearised(self, point: Point, sd: Array, width: Array, damping: Array) -> Linear:
+        """Simulates all segments; gaps count over `width` state scales."""
         n, p = self.num_states, len(point.z)
-        (num_experiments, _), num_outputs = self.segments.shape, len(self.output_scales)
-        length = self.segments.valid.shape[3]
-        few = -(-2 * n // num_outputs) + 1
-        used = jnp.arange(length) < jnp.where(is_first, few, length)
-        weight = used[:, None] / sd[None]
-        prior = jnp.where(is_first, 1 / _FIRST_WIDTH, jnp.sqrt(damping + 1e-12))
+        num_experiments = self.segments.shape[0]
+        prior = jnp.sqrt(damping + 1e-12)
 
         def eliminate(carry: Array, parts: tuple) -> tuple[Array, Array]:
             J, r, A, c = parts  # of one segment; J and A by its start state, then z
@@ -393,13 +422,13 @@ class MultipleShooting:
         def simulate_block(carry: tuple, parts: tuple) -> tuple[tuple, Array]:
             triangle, misfits, gaps, index = carry
             shots = self.shoot(point.z, *parts)
-            misfits += jnp.sum((shots.misfit / sd[None, None, None]) ** 2)
+            weighted = shots.misfit / sd[None, None, None]
+            misfits += jnp.sum(weighted**2)
             gaps += jnp.sum(shots.gap**2)
             joined = num_experiments, shots.gap.shape[1], -1
-            J = (shots.misfit_slope * weight[None, None, ..., None]).reshape(*joined, n + p)
-            r = (shots.misfit * weight[None, None]).reshape(*joined, 1)
-            A = jnp.where(is_first, 0.0, shots.end_slope) / width
-            c = jnp.where(is_first, 0.0, shots.gap)[..., None] / width
+            J = (shots.misfit_slope / sd[None, None, None, :, None]).reshape(*joined, n + p)
+            r = weighted.reshape(*joined, 1)
+            A, c = shots.end_slope / width, shots.gap[..., None] / width
             if not self.first_is_free:
                 knows = (index == 0) & (jnp.arange(J.shape[1]) == 0)[None, :, None, None]
                 J = J.at[..., :n].multiply(~knows)
@@ -418,7 +447,7 @@ class MultipleShooting:
         common = jnp.linalg.qr(jnp.concatenate([left, known]), mode="r")
         return Linear(over_segments(rows), common, misfits, gaps)
 
-    def step_of(self, found: Linear, damping: Array, is_first: Array) -> tuple[Array, Point]:
+    def step_of(self, found: Linear, damping: Array) -> tuple[Array, Point]:
         """The sum of squares that a Levenberg-Marquardt step would leave, and the step.
 
         The damping is raised until no search coordinate changes too much.
@@ -443,35 +472,35 @@ class MultipleShooting:
             longer,
             (damping, damped(damping)),
         )
-        dz = jnp.where(is_first, 0.0, dz)
         change = jnp.append(dz, 1.0)
 
+        def solved(row: Array) -> Array:
+            return -jax.scipy.linalg.solve_triangular(row[:, :n], row[:, n:])
+
         def substitute(after: Array, row: Array) -> tuple[Array, Array]:
-            right = row[:, n : 2 * n] @ after + row[:, 2 * n :] @ change
-            own = -jax.scipy.linalg.solve_triangular(row[:, :n], right)
+            own = row[:, :n] @ after + row[:, n:] @ change
             return own, own
 
         backwards = jax.vmap(
             lambda rows: jax.lax.scan(substitute, jnp.zeros(n), rows, reverse=True)[1]
         )
         left = jnp.sum((found.common @ change) ** 2)
-        return left, Point(dz, backwards(found.rows))
+        return left, Point(dz, backwards(jax.vmap(jax.vmap(solved))(found.rows)))
 
     def matched(self, start: Point, sd: Array) -> Point:
         """Where the segments fit and the gaps are closed, or as far as that succeeds."""
         num_gaps = jnp.maximum(jnp.sum(self.segments.is_followed) * self.num_states, 1)
+        start, misfits = self.placed(start, sd)
 
         def match(s: _Match) -> _Match:
-            is_first = s.steps < _FIRST
-            before = jnp.where(is_first, 0.0, s.damping * s.misfits)
-            found = self.linearised(s.here, sd, s.next_width, before, is_first)
+            found = self.linearised(s.here, sd, s.next_width, s.damping * s.misfits)
             gained = s.misfits - found.misfits + (s.gaps - found.gaps) / s.width**2
-            accepted = (s.steps <= _FIRST) | (gained >= _ACCEPTED * s.part * s.hoped)
+            accepted = (s.steps == 0) | (gained >= _ACCEPTED * s.part * s.hoped)
             is_good = (s.part == 1) & (gained >= _GOOD * s.hoped)
             factor = jnp.where(is_good, 0.01, jnp.where(s.part < 1, 10.0, 1.0))
-            damping = jnp.where(is_first, s.damping, jnp.clip(s.damping * factor, 1e-18, 1e3))
+            damping = jnp.clip(s.damping * factor, 1e-18, 1e3)
             cost = found.misfits + found.gaps / s.next_width**2
-            left, change = self.step_of(found, damping * cost, is_first)
+            left, change = self.step_of(found, damping * cost)
             mean_square = found.gaps / num_gaps
             moved = _Match(
                 best=s.here,
@@ -481,11 +510,11 @@ class MultipleShooting:
                 gaps=found.gaps,
                 hoped=cost - left,
                 width=s.next_width,
-                next_width=_next_width(s.next_width, mean_square, is_first),
+                next_width=_next_width(s.next_width, mean_square),
                 damping=damping,
                 part=jnp.asarray(1.0),
                 steps=s.steps + 1,
-                is_closed=~is_first & (mean_square < _SMALL**2),
+                is_closed=mean_square < _SMALL**2,
             )
             part = 0.25 * s.part
             nearer = jax.tree.map(lambda at, by: at + part * by, s.best, s.change)
@@ -493,14 +522,14 @@ class MultipleShooting:
             return where_tree(accepted, moved, stayed)
 
         def goes_on(s: _Match) -> Array:
-            is_sound = (s.part > _LEAST_PART) & ((s.steps <= _FIRST) | jnp.isfinite(s.misfits))
+            is_sound = (s.part > _LEAST_PART) & ((s.steps == 0) | jnp.isfinite(s.misfits))
             return ~s.is_closed & is_sound & (s.steps < _MATCHES)
 
         begin = _Match(
             best=start,
             change=jax.tree.map(jnp.zeros_like, start),
             here=start,
-            misfits=jnp.asarray(jnp.inf),
+            misfits=misfits,
             gaps=jnp.asarray(jnp.inf),
             hoped=jnp.asarray(0.0),
             width=jnp.asarray(1.0),
@@ -683,10 +712,10 @@ def student_root(u: Array) -> tuple[Array, Array]:
     return u * root, (FREEDOM + 1) / ((FREEDOM + u**2) * root)
 
 
-def _next_width(width: Array, mean_square: Array, is_first: Array) -> Array:
+def _next_width(width: Array, mean_square: Array) -> Array:
     """Width of the gaps in the next step: it shrinks with the gaps, at last quadratically."""
     least = jnp.maximum(_SHRINKAGE * width, _LEAST_WIDTH)
-    return jnp.where(is_first, 1.0, jnp.clip(mean_square, least, width / 3))
+    return jnp.clip(mean_square, least, width / 3)
 
 
 def where_tree(condition: Array, new: Tree, old: Tree) -> Tree:
