@@ -91,7 +91,7 @@ def test_the_file_holds_the_weights_the_contract_and_nothing_else(tmp_path: Path
     assert about["policy_hash"] == POLICY.hash
     contract = json.loads(about["contract"])
     assert contract == tensors_from_bytes(POLICY.to_bytes(), FORMAT, "")[1]
-    assert {"plant", "plant_hash", "layout", "provenance", "certificate"} == set(contract)
+    assert {"plant", "plant_hash", "layout", "provenance", "certificate", "guard"} == set(contract)
 
 
 def test_another_program_runs_it_without_excite(tmp_path: Path):
