@@ -237,7 +237,7 @@ ENDINGS = {
     "SIGTERM": ({}, kill(signal.SIGTERM), "interrupted by SIGTERM", None, 5),
     "a reading is no number": ({"script": {LEVEL_AT: math.nan}}, None, "finite", "not_finite", 6),
     "a reading is infinite": ({"script": {LEVEL_AT: -math.inf}}, None, "finite", "not_finite", 6),
-    "a reading jumps": ({"script": {LEVEL_AT: 1.5}}, None, "measurement jumped", "jump", 6),
+    "a reading jumps": ({"script": {LEVEL_AT: 0.6}}, None, "measurement jumped", "jump", 6),
     "a reading sticks": ({"script": STUCK}, None, "did not change", "stale", 8),
     "the level": ({"script": RISING}, None, "reached", "level", 6),
     "the rig fails to read": ({"script": SHAKEN}, None, "the cable is out", None, 6),

@@ -76,7 +76,7 @@ def test_one_output_that_is_no_number_is_enough():
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
-@pytest.mark.parametrize("elapsed", [0.002, 0.02])
+@pytest.mark.parametrize("elapsed", [0.002, 0.02, 0.1 + 0.2 - 0.25])
 def test_a_change_beyond_what_the_plant_can_do_is_a_jump(sign, elapsed):
     most = 10 * CRITICAL * elapsed + 8 * STEP
     assert most < CRITICAL

@@ -250,7 +250,7 @@ def check_reading(
     watch = tripped(xp, watch, ~is_finite.all(), Trip.NOT_FINITE)
     # Read once in a sampling time, a fast plant can go from one level to the other unseen.
     allowed_change = rules.fastest * elapsed + 8 * rules.resolution
-    is_whole = elapsed > rules.dt / 2
+    is_whole = elapsed > 0.75 * rules.dt
     allowed_change = xp.where(is_whole, xp.maximum(allowed_change, rules.widest), allowed_change)
     if not rules.is_guarded:
         watch = tripped(xp, watch, (is_finite & (change > allowed_change)).any(), Trip.JUMP)

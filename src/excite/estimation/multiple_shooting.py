@@ -280,6 +280,16 @@ class MultipleShooting:
             ends = jax.tree.map(lambda u, slope: u + (own - delay) * slope, ends, now.change)
         return step(self.plant, x, ends[0], params, now.dt, ends[1])
 
+    def simulated(
+        self, start: Array, steps: Steps, params: Params, delay: Array | None = None
+    ) -> tuple[Array, Array]:
+        """The end state of a segment, and its outputs; the start state is over its scales."""
+
+        def advance(x: Array, now: Steps) -> tuple[Array, Array]:
+            return self.advance(x, now, params, delay), self.plant.output(x, params)
+
+        return jax.lax.scan(advance, start * self.scales, steps)
+
     def shoot(self, z: Array, starts: Array, next_starts: Array, block: Segments) -> Shots:
         """Simulates the segments of one block."""
         n = self.num_states
@@ -287,11 +297,7 @@ class MultipleShooting:
 
         def outputs_and_end(point: Array, steps: Steps) -> tuple[tuple, tuple]:
             params = self.plant.Params(*self.params_at(point[n:]))
-
-            def advance(x: Array, now: Steps) -> tuple[Array, Array]:
-                return self.advance(x, now, params, delay), self.plant.output(x, params)
-
-            end, outputs = jax.lax.scan(advance, point[:n] * self.scales, steps)
+            end, outputs = self.simulated(point[:n], steps, params, delay)
             return (found := (outputs, end / self.scales)), found
 
         def differentiated(start: Array, steps: Steps) -> tuple:
@@ -376,11 +382,7 @@ class MultipleShooting:
 
         def misfits(x: Array, parts: tuple[Steps, Array, Array]) -> Array:
             steps, measured, valid = parts
-
-            def advance(x: Array, now: Steps) -> tuple[Array, Array]:
-                return self.advance(x, now, params), self.plant.output(x, params)
-
-            outputs = jax.lax.scan(advance, x * self.scales, steps)[1]
+            _, outputs = self.simulated(x, steps, params)
             return (jnp.where(valid, outputs - measured, 0.0) / sd[None]).ravel()
 
         def move(x: Array, parts: tuple[Steps, Array, Array]) -> tuple[Array, Array]:

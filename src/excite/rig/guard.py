@@ -46,8 +46,8 @@ _QUIET = 0.25  # fraction of critical levels and input limits below which it is 
 _NUM_QUIET, _LONGEST = 5, 60  # samples of rest that end the brake; samples after which it ends
 _LOST = 2.0  # times the critical levels: what is beyond is not braked any more
 # A fault of the actuator must explain the last samples as well as a declared plant would, and
-# better by so much in squares; or so much better, where what is unexplained is so large. A late
-# plant was else taken for one that turned its sign.
+# better by so much in squares; or so much better, where what is unexplained is so large. Without
+# this, a late plant was taken for one that turned its sign.
 _BY_FAR, _CLEARLY, _LARGE = 100.0, 0.02, 100.0
 
 
@@ -282,7 +282,7 @@ def observed(
     reach = _QUIET * (xp.asarray(rules.upper) - xp.asarray(rules.lower)) / 2
     is_quiet = (size < _QUIET).all() & (abs(belief.inputs[-1] - rules.rest) < reach).all()
     num_quiet = xp.where(is_quiet, belief.num_quiet + 1, 0)
-    num_quiet = xp.where((size > _LOST).any(), _NUM_QUIET, num_quiet)  # it pushes, as it seems
+    num_quiet = xp.where((size > _LOST).any(), _NUM_QUIET, num_quiet)  # the brake seems to push
     return belief._replace(
         mean=mean,
         root=root,

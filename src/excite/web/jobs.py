@@ -179,11 +179,11 @@ def followed(asked: ExperimentRequest, folder: str) -> Iterator[Event]:
     The run folder of the identification is written to `folder`. It is the same as that of
     `excite simulate` followed by `excite identify`.
     """
-    own = _experiment(asked, asked["excitation"])
+    own, plant = _experiment(asked, asked["excitation"]), _plant(asked["plant"])
     run = own.run()
     information = running_information(own.plant, own.params, run.inputs)
-    yield from _estimates(_plant(asked["plant"]), own, run, information)
-    row, result = _outcome(asked, own, run, information[-1])
+    yield from _estimates(plant, own, run, information)
+    row, result = _outcome(plant, own, run, information[-1])
     if result is not None:
         result.save(folder, command=_experiment_again(asked))
     identification = None if result is None else result.to_dict()
@@ -196,7 +196,7 @@ def followed(asked: ExperimentRequest, folder: str) -> Iterator[Event]:
             yield {"kind": "left_out", "excitation": name, "sentence": str(error)}
             continue
         its = running_information(other.plant, other.params, its_run.inputs)[-1]
-        yield {"kind": "other", "row": _outcome(asked, other, its_run, its)[0]}
+        yield {"kind": "other", "row": _outcome(plant, other, its_run, its)[0]}
 
 
 def _estimates(
@@ -260,10 +260,10 @@ def _first(data: Experiments, count: int) -> Experiments:
 
 
 def _outcome(
-    asked: ExperimentRequest, own: Experiment, run: Trajectory, information: Array
+    plant: AbstractPlant, own: Experiment, run: Trajectory, information: Array
 ) -> tuple[Row, Identification | None]:
     """A row of the comparison, and the identification; None where it failed."""
-    plant, d = _plant(asked["plant"]), own.plant.description
+    d = own.plant.description
     record = dataclasses.replace(own.record(run), source=_RECORD)
     result, sentence = None, ""
     try:
