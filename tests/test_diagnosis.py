@@ -11,6 +11,7 @@ from excite.estimation.diagnosis import (
     fit_percent,
     ljung_box,
     mean_or_trend,
+    misfit_factor,
     robust_covariance,
     widened,
 )
@@ -143,6 +144,23 @@ def test_correlation_of_a_held_parameter_is_no_number():
     assert np.isnan(result[:, 1]).all()
 
 
+# An error of the structure
+
+
+def test_the_misfit_of_noise_is_one_and_that_of_a_wrong_structure_larger():
+    rng = np.random.default_rng(7)
+    signals, noise = rng.normal(size=(2000, 2)), rng.normal(size=2000)
+    coloured = np.convolve(noise, [1.0, 0.8, 0.6, 0.3])[:2000]
+    for own in (noise, coloured):
+        factor = misfit_factor([[own]], [[signals]], 2)
+        assert 1 <= factor < 1.6
+    follows = noise + 0.2 * np.roll(signals[:, 0], 1)
+    # Of four directions one has 0.04 * 2000 more than the variance of the noise.
+    expected = np.sqrt(1 + 0.04 * 2000 / 4 / 1.04)
+    assert misfit_factor([[follows]], [[signals]], 2) == pytest.approx(expected, rel=0.3)
+    assert misfit_factor([[]], [[]], 2) == 1
+
+
 # What the data cannot see
 
 
@@ -176,19 +194,29 @@ def test_one_unseen_parameter_is_named(index):
     assert found == (index, f"{NAMES[index]} is not identifiable from the data")
 
 
-def test_an_unseen_combination_is_named_with_its_exponents():
+def test_an_unseen_combination_of_a_planned_experiment_is_named_with_its_exponents():
     # The data see a b and c: a may grow as b falls.
     information = information_of([[1, 1, 0], [0, 0, 1], [1, -1, 0]], [0.01, 0.01, 1e6])
-    found = worst_seen(NAMES, information, ALL)
+    seen = worst_seen(NAMES, information, ALL)
+    found = worst_seen(NAMES, information, ALL, is_planned=True)
+    assert seen is not None
     assert found is not None
+    assert seen[1] == "a and b are not identifiable separately"
     index, why = found
     assert NAMES[index] in ("a", "b")
-    assert "a and b are not identifiable separately" in why
     exponents = dict(
         part.split("^") for part in why.split(": ")[1].removesuffix(" is undetermined").split()
     )
     assert sorted(exponents) == ["a", "b"]
     assert float(exponents["a"]) == pytest.approx(-float(exponents["b"]))
+
+
+def test_of_parts_alike_the_one_is_held_that_leaves_the_others_most_certain():
+    # a, b and c are known but for a common factor, and a hardly acts besides.
+    ratios = np.array([[1 / 3, -1 / 3, 0], [0, 100, -100]])
+    found = worst_seen(NAMES, ratios.T @ ratios, ALL)
+    assert found is not None
+    assert found[0] in (1, 2)
 
 
 def test_of_a_combination_the_largest_part_is_held():

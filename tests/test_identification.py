@@ -248,6 +248,59 @@ def test_a_sentence_names_the_held_parameter_and_where_it_was_held(decay):
     assert decay.verdict[2].startswith("J_p, D_p identifiable; least certain ")
 
 
+class Slow(AbstractPlant):
+    """A first-order lag, of which the search begins at ten times the sampling time."""
+
+    definition = PlantDescription(
+        name="slow",
+        states=(State("x", "m", scale=1.0),),
+        inputs=(Input("u", "m", -2.0, 2.0, amplitude=1.0),),
+        outputs=(Output("x", "m", scale=1.0, noise_sd=0.05),),
+        parameters=(Parameter("gain", "1", 1.0), Parameter("tau", "s", 1.0)),
+        dt=0.1,
+        substeps=16,
+    )
+
+    def derivative(self, state, input, params):
+        return (params.gain * input - state) / params.tau
+
+    def output(self, state, params):
+        return state
+
+
+def test_an_unseen_parameter_is_not_held_where_it_ruins_the_fit():
+    record = record_of(Slow(), PRBS(clock=1), params=Slow().Params(0.8, 0.018), sidecar=False)
+    result = identify([record], Slow())
+    assert result.held == ("tau",)
+    assert result.params["tau"] < 0.04
+    assert result.params["gain"] == pytest.approx(0.8, abs=0.02)
+    assert result.fitted[0].fit_percent["x"] > 90
+
+
+def test_a_coarse_integration_is_told():
+    class Coarse(DCMotor):
+        definition = dataclasses.replace(DCMotor.definition, substeps=1)
+
+    fine = DCMotor().integrated_in(20)
+    record = record_of(fine, sidecar=False)
+    sentences = identify([record], Coarse()).verdict
+    assert any(
+        "the integration is too coarse for these data: with substeps=2" in s for s in sentences
+    )
+    assert not any("too coarse" in s for s in identify([record], DCMotor()).verdict)
+
+
+def test_an_interval_ends_at_a_parameters_bound_and_zero_is_told():
+    record = dataclasses.replace(free_decay(), outputs=free_decay().outputs[:12])
+    record = dataclasses.replace(record, time=record.time[:12], inputs=record.inputs[:12])
+    result = identify([record], PLANT, hold={"K_pu": 0.0125})
+    low = {name: ends[0] for name, ends in result.intervals.items() if name not in result.held}
+    assert min(low.values()) >= 0
+    lost = [name for name, value in low.items() if value == 0]
+    assert lost
+    assert any(s.startswith("the 95 % interval") and "zero" in s for s in result.verdict)
+
+
 def test_a_held_parameter_is_null_in_json_but_for_its_value(decay):
     entry = json_ready(decay.to_dict())["params"]["K_pu"]
     assert entry["estimate"] == pytest.approx(0.03)

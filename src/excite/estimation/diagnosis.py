@@ -85,7 +85,6 @@ def input_dependence(
     residuals: Sequence[Float[np.ndarray, " _sample"]],
     inputs: Sequence[Float[np.ndarray, "_sample input"]],
     num_lags: int = 20,
-    order: int = 10,
 ) -> float:
     """p-value of the hypothesis that the residuals of some records do not follow past inputs.
 
@@ -94,8 +93,42 @@ def input_dependence(
     Residual and inputs are first filtered by an autoregression fitted to the residual, so
     that coloured noise alone does not fail the test. NaN for residuals of zeros.
     """
+    statistic, degrees = _following(residuals, inputs, num_lags)
+    return chi2_tail(degrees, statistic) if degrees else math.nan
+
+
+def misfit_factor(
+    residuals: Sequence[Sequence[Float[np.ndarray, " _sample"]]],
+    signals: Sequence[Sequence[Float[np.ndarray, "_sample signal"]]],
+    num_lags: int,
+) -> float:
+    """How much wider than noise an error of the structure makes intervals; at least 1.
+
+    The residual of each output, in some records, is filtered as in `input_dependence`, and
+    projected on the past of signals that follow from the inputs, such as simulated outputs. Noise
+    has its own variance in each of these directions. An error of the structure has more; what
+    the estimates took of it cannot be seen, and is taken to be as large as in the mean of them.
+
+    Args:
+        num_lags: past samples; as many as the plant has states determine its next output.
+    """
+    found = [_following(*own, num_lags) for own in zip(residuals, signals, strict=True)]
+    degrees = sum(count for _, count in found)
+    return math.sqrt(max(sum(own for own, _ in found) / degrees, 1.0)) if degrees else 1.0
+
+
+def _following(
+    residuals: Sequence[Float[np.ndarray, " _sample"]],
+    signals: Sequence[Float[np.ndarray, "_sample signal"]],
+    num_lags: int,
+    order: int = 10,
+) -> tuple[float, int]:
+    """Sum of squares of filtered residuals along past signals, over their variance.
+
+    With its number of directions: of noise it is a chi-squared variable of these degrees.
+    """
     statistic, degrees = 0.0, 0
-    for residual, record in zip(residuals, inputs, strict=True):
+    for residual, record in zip(residuals, signals, strict=True):
         centred, past = residual - residual.mean(), min(order, residual.size // 20)
         lags = min(num_lags, residual.size // 10)
         own = _lagged(centred[:, None], past)
@@ -112,7 +145,7 @@ def input_dependence(
         if power > 0:
             statistic += float(np.sum((seen.T @ white) ** 2)) / power
             degrees += seen.shape[1]
-    return chi2_tail(degrees, statistic) if degrees else math.nan
+    return statistic, degrees
 
 
 def _lagged(

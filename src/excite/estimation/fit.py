@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import jax
@@ -36,6 +36,8 @@ NOTHING_SEEN = (
 )
 _STARTS, _SIZE_OF_MANY_STARTS = 8, 50_000  # measured values up to which so many are tried
 _TELLING = 50  # measured values from which the residual tells whether the search missed something
+_MORE_THAN_CHANCE = 10.0  # of a chi-squared variable of one degree of freedom
+_FAR_OFF = 100.0  # times a positive parameter's start, or scales from it: the search ran away
 _FREE = 100.0  # scales of a parameter of free sign that are small for its standard error
 
 
@@ -58,7 +60,7 @@ class NothingLeftError(ValueError):
 
 @dataclass(frozen=True)
 class Fit:
-    """An estimate, its free and known parameters, and a sentence for each held one.
+    """An estimate, its free and known parameters, and why each held one was held, by name.
 
     `others` are the ends of searches that began elsewhere.
     """
@@ -66,7 +68,7 @@ class Fit:
     estimate: Estimate
     free: np.ndarray
     known: np.ndarray
-    reasons: tuple[str, ...]
+    reasons: Mapping[str, str]
     others: Sequence[Estimate] = ()
 
     def has_ended_in(self, status: Status) -> bool:
@@ -115,7 +117,7 @@ def _fit_seen(
     """Fits; holds a parameter that ends at a bound or is not identifiable, and fits again."""
     names = names_of(plant.definition.parameters)
     known = known_parameters(plant, estimator)
-    free, reasons = ~known, ()
+    free, reasons = ~known, {}
     found = _estimate(plant, experiments, estimator, start, free, progress)
     first = Fit(found[0], free, known, reasons, found[1:])
     while True:
@@ -123,25 +125,28 @@ def _fit_seen(
         # ARX estimates all parameters or none.
         if not isinstance(estimator, AbstractSearch) or fit.has_ended_in(Status.NOT_FINITE):
             return fit
-        held = _to_hold(plant, fit, start)
+        held = _to_hold(plant, fit)
         if held is None:
             return fit
-        chosen, value, why = held
-        start, last = (
-            params._replace(**{names[chosen]: floats(value)}) for params in (start, found[0].params)
-        )
+        chosen, why, bound = held
+        name, ended = names[chosen], found[0]
+        value = float(start[chosen]) if bound is None else bound
+        start, last = (params._replace(**{name: floats(value)}) for params in (start, ended.params))
         free = free & (np.arange(len(names)) != chosen)
-        reasons = (*reasons, why)
         if not free.any():
-            if bound_reached(plant.definition, start) is not None:
-                raise NothingLeftError(
-                    f"no parameter is left to estimate: {'; '.join(reasons)}", first
-                )
+            if bound is not None:
+                every = "; ".join([*reasons.values(), why])
+                raise NothingLeftError(f"no parameter is left to estimate: {every}", first)
             tested = structure_of(plant, experiments, start, known)
             groups = tested.not_identifiable if tested else ()
             lost = [f"{STRUCTURALLY_NOT}: {group.sentence}" for group in groups]
             raise NothingLeftError("; ".join([*lost, NOTHING_SEEN]), first)
         found = _estimate(plant, experiments, estimator, start, free, progress, [last])
+        if bound is None and _fits_worse(found[0], ended) and _is_near(plant, chosen, value, ended):
+            start, value = ended.params, float(ended.params[chosen])
+            found = _estimate(plant, experiments, estimator, start, free, progress, [])
+        why = why if bound is not None else f"{why}; {name} was held at {value:g}"
+        reasons = {**reasons, name: why}
 
 
 def _estimate(
@@ -188,7 +193,7 @@ def _estimate(
     while int(found[0].status) == Status.ITERATIONS_EXHAUSTED and length < num_samples:
         length *= 4
         longer = search(dataclasses.replace(estimator, segment_length=length), start)
-        found = [longer] if int(longer.status) == Status.SUCCESSFUL else found
+        found = [longer, *found[1:]] if int(longer.status) == Status.SUCCESSFUL else found
     return found
 
 
@@ -221,24 +226,37 @@ def is_centred(experiments: Experiments, estimate: Estimate) -> bool:
     )
 
 
-def _to_hold(plant: AbstractPlant, fit: Fit, start: Params) -> tuple[int, float, str] | None:
-    """The parameter to hold next, its value, and the reason; None where there is none."""
+def _to_hold(plant: AbstractPlant, fit: Fit) -> tuple[int, str, float | None] | None:
+    """The parameter to hold next, the reason, and where it ended if that is its bound.
+
+    None where there is none to hold.
+    """
     names = names_of(plant.definition.parameters)
     reached = bound_reached(plant.definition, fit.estimate.params)
     if reached is not None and fit.free[reached[0]]:
-        name, value = names[reached[0]], float(fit.estimate.params[reached[0]])
-        return reached[0], value, f"{name} ended at its bound {reached[1]:g} and was held there"
+        index, bound = reached
+        why = f"{names[index]} ended at its bound {bound:g} and was held there"
+        return index, why, float(fit.estimate.params[index])
     # A positive parameter is searched by its logarithm, which ends nowhere if the data do not tell
     # it from zero; one of free sign is far from that as long as the equations can be solved.
     unit = np.array([1.0 if p.positive else _FREE for p in plant.definition.parameters])
     information = np.asarray(fit.estimate.information) * np.outer(unit, unit)
     unseen = worst_seen(names, information, fit.free)
-    if unseen is None:
-        return None
-    value = float(start[unseen[0]])
-    why = f"{unseen[1]}; {names[unseen[0]]} was held at {value:g}"
-    only = "; the others hold only for this value" if "separately" in why else ""
-    return unseen[0], value, why + only
+    return None if unseen is None else (*unseen, None)
+
+
+def _fits_worse(estimate: Estimate, other: Estimate) -> bool:
+    """Whether a fit with one free parameter less is worse than the other by more than chance."""
+    noise = float(other.cost) / max(np.count_nonzero(other.residual), 1)
+    return not float(estimate.cost) - float(other.cost) < _MORE_THAN_CHANCE * noise
+
+
+def _is_near(plant: AbstractPlant, index: int, start: float, estimate: Estimate) -> bool:
+    """Whether a search ended so near a parameter's start that its end is a sensible value."""
+    part, end = plant.definition.parameters[index], float(estimate.params[index])
+    if part.positive:
+        return 1 / _FAR_OFF < end / start < _FAR_OFF
+    return abs(end - start) < _FAR_OFF * part.scale
 
 
 def with_initial_state(

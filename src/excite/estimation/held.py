@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import jax
 import numpy as np
 from jaxtyping import Bool
@@ -40,17 +42,18 @@ def told_of_held(
     estimate: Estimate,
     free: Bool[np.ndarray, " param"],
     known: Bool[np.ndarray, " param"],
+    names: Sequence[str],
 ) -> tuple[str, ...]:
-    """A sentence on each parameter that is neither free, nor known, nor held at a bound.
+    """A sentence on each held parameter, in the order of `names`, that is not held at a bound.
 
-    Whether it is structurally not identifiable or practically not, and how the other estimates
-    move if its value is wrong: by the implicit function theorem, d theta = -(S' S)^-1 S' s for
-    sensitivities S of what was estimated and s of the held parameter.
+    Whether it is structurally not identifiable or practically not, with those before it known,
+    and how the other estimates move if its value is wrong: by the implicit function theorem,
+    d theta = -(S' S)^-1 S' s for sensitivities S of what was estimated and s of the parameter.
     """
     parameters, params = plant.definition.parameters, estimate.params
     held = [
         i
-        for i in np.flatnonzero(~free & ~known).tolist()
+        for i in map(params._fields.index, names)
         if bound_reached(plant.definition, _with(plant.nominal, i, params[i])) is None
     ]
     if not held:
@@ -63,12 +66,13 @@ def told_of_held(
     rows = np.einsum("etou,etoh->uh", S[..., estimated], S[..., held]) + P[estimated][:, held]
     inverse = inverse_information(S[..., estimated], P[np.ix_(estimated, estimated)])
     effects = -(inverse @ rows)[: free.sum()]
-    found = structure_of(plant, experiments, params, known)
     others = [p for p, is_free in zip(parameters, free, strict=True) if is_free]
-    return tuple(
-        f"{_why(parameters[i].name, found)}; {_cost(parameters[i], others, effects[:, column])}"
-        for column, i in enumerate(held)
-    )
+    told = []
+    for i, effect in zip(held, effects.T, strict=True):
+        why = _why(parameters[i].name, structure_of(plant, experiments, params, known))
+        known = known | (np.arange(len(known)) == i)
+        told.append(f"{why}; {_cost(parameters[i], others, effect)}")
+    return tuple(told)
 
 
 def _with(params: Params, index: int, value: AnyArray) -> Params:

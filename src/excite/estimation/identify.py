@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from ..description import RARE, Named, PlantDescription, names_of, unknown, wrong_type
+from ..description import RARE, Named, PlantDescription, listed, names_of, unknown, wrong_type
 from ..files import json_ready
 from ..information.identifiability import identifiability
 from ..plant import AbstractPlant, Params, params_from
@@ -39,6 +39,7 @@ from .diagnosis import (
     half_95,
     input_dependence,
     is_more_than_rounding,
+    misfit_factor,
     robust_covariance,
     whiteness_of,
     widened,
@@ -70,12 +71,14 @@ from .from_records import (
     starts_at,
 )
 from .held import told_of_held
+from .integration import too_coarse
 from .nls import NLS, Likelihood
+from .pem import PEM
 from .prior import unbounded, within_support
 from .prior_knowledge import PriorLike, with_prior
 from .profile import profile_intervals
 from .remedies import Question, Suspect, outliers, suspects, suspects_in
-from .result import Identification, Noise
+from .result import Fitted, Identification, Noise
 from .validation import fitted_all, state_from, validated, way_to_state
 
 InitialState = Literal["auto", "free", "known"]
@@ -232,20 +235,28 @@ def identify(
         for i, name in enumerate(names_of(plant.definition.outputs))
     }
     structure = {
-        name: _dependence(residual, records, i, plant.definition.outputs[i].scale)
+        name: input_dependence(*_seen(residual, records, i, plant.definition.outputs[i].scale))
         for i, name in enumerate(whiteness)
     }
+    wrong = [n for n, p in structure.items() if p < RARE / len(structure)] * fit.is_successful
+    factor = _misfit(plant, residual, records, fitted) if wrong else 1.0
     covariance, degrees, verdict = _confidence(
-        plant, experiments, estimator, fit, whiteness, uncertain_sd
+        plant, experiments, estimator, fit, whiteness, uncertain_sd, factor
     )
-    wrong = _wrong_structure(structure, estimator) if fit.is_successful else ()
+    told = factor if intervals == "linear" else 1.0
+    wrong = _wrong_structure(wrong, told, estimator)
     others = tuple(s for record in [*records, *validation] for s in _other_plant(record, plant))
     large = _above_declared(plant, fit) if fit.is_successful else ()
-    verdict = (*others, *wrong, *large, *_remedies(found), *where, *_agreement(fit), *verdict)
+    astray = _simulates_poorly(fitted) if isinstance(estimator, PEM) else ()
+    remedies = *_remedies(found), *where
+    verdict = (*others, *wrong, *large, *astray, *remedies, *_agreement(fit), *verdict)
     names = names_of(plant.definition.parameters)
     values = np.array([float(value) for value in fit.estimate.params])
     sd = np.where(fit.free, np.sqrt(np.maximum(np.diag(covariance), 0.0)), np.nan)
     half = np.where(fit.free, half_95(covariance, degrees), np.nan)
+    if isinstance(estimator, NLS) and fit.is_successful:
+        coarse = too_coarse(plant, experiments, estimator, fit.estimate, fit.free, sd)
+        verdict = (*coarse, *verdict)
     ends = within_support(plant, np.stack([values - half, values + half], axis=1))
     profiles = {}
     if intervals == "profile" and isinstance(estimator, NLS) and fit.is_successful:
@@ -445,50 +456,64 @@ def _confidence(
     fit: Fit,
     whiteness: Mapping[str, float],
     uncertain: np.ndarray,
+    factor: float,
 ) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Covariance of the estimates, its degrees of freedom, and the sentences of the verdict."""
+    """Covariance of the estimates, its degrees of freedom, and the sentences of the verdict.
+
+    An error of the structure widens the intervals by a factor.
+    """
     names = names_of(plant.definition.parameters)
     covariance, its = np.asarray(fit.estimate.covariance), fit.estimate.degrees
     degrees = np.full(len(names), np.inf) if its is None else np.asarray(its)
     if not fit.is_successful:
         sentence = Status(int(fit.estimate.status)).sentence
         needed = f"; {estimator.name} needs {estimator.needs}" if estimator.needs else ""
-        return covariance, degrees, (*fit.reasons, sentence + needed)
+        return covariance, degrees, (*fit.reasons.values(), sentence + needed)
     parameters = zip(plant.definition.parameters, fit.estimate.params, strict=True)
     size = np.array([float(value) if p.positive else p.scale for p, value in parameters])
     coloured, remarks = [name for name, p in whiteness.items() if p < RARE], []
     not_white = f"the residual of {' and '.join(coloured)} is not white: the intervals"
-    if not isinstance(estimator, NLS):
-        if coloured:
-            remarks.append(f"{not_white} assume white noise, and are too narrow")
-    elif coloured or uncertain.any():
+    S = residual = prior = np.zeros(0)
+    if isinstance(estimator, NLS) and (coloured or uncertain.any()):
         estimate, free = jax.device_put((fit.estimate, fit.free))
         S, residual = map(np.asarray, estimator.sensitivity(plant, experiments, estimate, free))
         prior = np.asarray(estimator.prior_information(plant, estimate, S.shape[-1], free))
-        if coloured:
-            robust, its = robust_covariance(S, residual, np.asarray(experiments.valid), prior)
-            robust = np.outer(size, size) * robust[: len(names), : len(names)]
-            is_wider = np.diag(robust) > np.diag(covariance)
-            degrees = np.where(is_wider, its[: len(names)], degrees)
-            covariance = widened(covariance, robust)
-            remarks.append(
-                f"{not_white} allow for coloured noise, not for an error in the plant's equations"
-            )
-        if uncertain.any():
-            to_constants = np.asarray(estimator.constant_sensitivity(plant, experiments, estimate))
-            effect = effect_of_constants(S, to_constants, prior)[: len(names)] * uncertain[None]
-            effect = effect * size[:, None]
-            covariance, degrees = with_independent(covariance, degrees, effect @ effect.T)
-            remarks.append(
-                f"the intervals include the standard deviation of {_sd_in_words(plant, uncertain)}"
-            )
-    seen = identifiability(names, covariance / np.outer(size, size), fit.free)
+    if coloured and isinstance(estimator, NLS):
+        robust, its = robust_covariance(S, residual, np.asarray(experiments.valid), prior)
+        robust = np.outer(size, size) * robust[: len(names), : len(names)]
+        is_wider = np.diag(robust) > np.diag(covariance)
+        degrees = np.where(is_wider, its[: len(names)], degrees)
+        covariance = widened(covariance, robust)
+        but = "" if factor > 1 else ", not for an error in the plant's equations"
+        remarks.append(f"{not_white} allow for coloured noise{but}")
+    elif coloured:
+        remarks.append(f"{not_white} assume white noise, and are too narrow")
+    covariance = factor**2 * covariance
+    if isinstance(estimator, NLS) and uncertain.any():
+        estimate = jax.device_put(fit.estimate)
+        to_constants = np.asarray(estimator.constant_sensitivity(plant, experiments, estimate))
+        effect = effect_of_constants(S, to_constants, prior)[: len(names)] * uncertain[None]
+        effect = effect * size[:, None]
+        covariance, degrees = with_independent(covariance, degrees, effect @ effect.T)
+        remarks.append(
+            f"the intervals include the standard deviation of {_sd_in_words(plant, uncertain)}"
+        )
+    half = half_95(covariance, degrees)
+    is_told = fit.free & (half < np.abs([float(value) for value in fit.estimate.params]))
+    seen = []
+    if is_told.any():
+        seen.append(identifiability(names, covariance / np.outer(size, size), is_told))
+    if lost := [n for n, is_lost in zip(names, fit.free & ~is_told, strict=True) if is_lost]:
+        includes = "intervals of {} include" if len(lost) > 1 else "interval of {} includes"
+        seen.append(f"the 95 % {includes.format(listed(lost))} zero")
     if isinstance(estimator, NLS) and estimator.prior is not None:
         values = dict(zip(names, map(float, fit.estimate.params), strict=True))
         sd = dict(zip(names, np.sqrt(np.diag(np.asarray(fit.estimate.covariance))), strict=True))
         remarks += estimator.prior.verdict(values, {n: sd[n] for n in names if sd[n] > 0})
-    held = told_of_held(plant, experiments, estimator, fit.estimate, fit.free, fit.known)
-    return covariance, degrees, (*fit.reasons, *held, seen, *remarks)
+    held = told_of_held(
+        plant, experiments, estimator, fit.estimate, fit.free, fit.known, tuple(fit.reasons)
+    )
+    return covariance, degrees, (*fit.reasons.values(), *held, *seen, *remarks)
 
 
 def _sd_in_words(plant: AbstractPlant, uncertain: np.ndarray) -> str:
@@ -507,33 +532,62 @@ def _noise(description: PlantDescription, estimate: Estimate) -> Noise | None:
     return Noise(dict(of_states), dict(of_outputs))
 
 
-def _dependence(
-    residual: Sequence[np.ndarray], records: Sequence[Record], output: int, scale: float
-) -> float:
-    """p-value of an output's residual not following the input; see `whiteness_of`."""
+def _seen(
+    residual: Sequence[np.ndarray],
+    records: Sequence[Record],
+    output: int,
+    scale: float,
+    simulated: Sequence[np.ndarray] | None = None,
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Residuals of an output that are more than rounding, and the inputs at the same times.
+
+    The simulated outputs, where they are given, stand beside the inputs.
+    """
+    signals = [record.inputs for record in records]
+    if simulated is not None:
+        signals = [np.hstack(both) for both in zip(signals, simulated, strict=True)]
     pairs = [
-        (r[seen, output], record.inputs[seen])
-        for r, record in zip(residual, records, strict=True)
+        (r[seen, output], rows[seen])
+        for r, rows in zip(residual, signals, strict=True)
         for seen in [np.isfinite(r[:, output])]
     ]
-    pairs = [(r, inputs) for r, inputs in pairs if is_more_than_rounding(r, scale)]
-    return input_dependence([r for r, _ in pairs], [inputs for _, inputs in pairs])
+    pairs = [(r, rows) for r, rows in pairs if is_more_than_rounding(r, scale)]
+    return [r for r, _ in pairs], [rows for _, rows in pairs]
+
+
+def _misfit(
+    plant: AbstractPlant,
+    residual: Sequence[np.ndarray],
+    records: Sequence[Record],
+    fitted: Sequence[Fitted],
+) -> float:
+    """How much wider than noise an error of the structure makes intervals."""
+    simulated = [record.simulated for record in fitted]
+    found = [
+        _seen(residual, records, i, part.scale, simulated)
+        for i, part in enumerate(plant.definition.outputs)
+    ]
+    residuals, signals = zip(*found, strict=True)
+    return misfit_factor(residuals, signals, len(plant.definition.states))
 
 
 def _wrong_structure(
-    structure: Mapping[str, float], estimator: AbstractEstimator
+    outputs: Sequence[str], factor: float, estimator: AbstractEstimator
 ) -> tuple[str, ...]:
-    """A sentence where a residual follows the input."""
-    wrong = [name for name, p in structure.items() if p < RARE / len(structure)]
-    if not wrong:
+    """A sentence where residuals follow the input."""
+    if not outputs:
         return ()
     or_biased = (
         "" if isinstance(estimator, AbstractSearch) else "; or the estimator is biased: try nls"
     )
+    allowed = "do not include this error"
+    if factor > 1:
+        times = f"{factor:.2g}" if factor < 10 else f"{factor:.0f}"
+        allowed = f"are {times} times as wide for this error, taken as alike in all directions"
     return (
-        f"the residual of {' and '.join(wrong)} follows the input: the structure of this plant is "
+        f"the residual of {listed(outputs)} follows the input: the structure of this plant is "
         "wrong for these data, or time, input or sensor differ from its description; the "
-        f"intervals do not include this error{or_biased}",
+        f"intervals {allowed}{or_biased}",
     )
 
 
@@ -546,6 +600,17 @@ def _above_declared(plant: AbstractPlant, fit: Fit) -> tuple[str, ...]:
         f"{sd:.3g} {part.unit}): the plant leaves something out, or the declaration is wrong"
         for part, own, sd in zip(plant.definition.outputs, size, declared, strict=True)
         if sd > 0 and own > _FAR_ABOVE * sd
+    )
+
+
+def _simulates_poorly(fitted: Sequence[Fitted]) -> tuple[str, ...]:
+    """A sentence where predictions are good only because samples correct them."""
+    poor = {name for record in fitted for name, fit in record.fit_percent.items() if fit < 0}
+    if not poor:
+        return ()
+    return (
+        f"the simulation of {listed(sorted(poor))} is worse than a constant: process noise "
+        "explains what the equations should; use these parameters to predict, not to simulate",
     )
 
 

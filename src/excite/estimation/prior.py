@@ -174,9 +174,8 @@ def unbounded(plant: AbstractPlant) -> AbstractPlant:
 def within_support(
     plant: AbstractPlant, ends: Float[np.ndarray, "param end"]
 ) -> Float[np.ndarray, "param end"]:
-    """Ends of intervals, not beyond a uniform prior."""
-    names, parts = uniform_names(plant), plant.definition.parameters
-    allowed = np.array([p.support if p.name in names else (-np.inf, np.inf) for p in parts])
+    """Ends of intervals, not beyond the bounds of a parameter or its uniform prior."""
+    allowed = np.array([p.support for p in plant.definition.parameters])
     return np.clip(ends, allowed[:, :1], allowed[:, 1:])
 
 

@@ -3,8 +3,8 @@
 Each suspect is one effect with one parameter. The plant with all of them is simulated with one
 at a time, at several values; those that could explain most of the residual are fitted. A suspect
 is named where it explains more than chance; the best by the Bayesian information criterion
-comes first. Of a long record some parts are searched, and the likeliest suspect is then fitted to
-all of it.
+comes first. Of a long record some parts are searched, and the likeliest suspects are then fitted
+to all of it.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from .contract import (
     simulate_experiments,
     to_search,
 )
-from .diagnosis import chi2_tail, innovations, log_likelihood
+from .diagnosis import chi2_tail, innovations, log_likelihood, whiteness_of
 from .excerpt import Excerpt, Span, excerpt_of
 from .nls import NLS
 
@@ -62,7 +62,9 @@ _LANES = 16  # simulated side by side; a constant, so that one program is compil
 _HUGE = 1e30
 _BOUND = 20.0  # the search coordinate of a parameter at its bound, which is infinite
 _FREEDOMS = 2.0, 3.0, 4.0, 6.0, 10.0, 20.0  # of Student's t for outliers
-_FAR = 4.0  # standard deviations of the bulk beyond which a sample is an outlier
+_FAR = 4.0  # standard deviations, told by the median, beyond which a sample is an outlier
+_SIMPLER = 1.05  # advantage of a cause without a parameter
+_MUCH = 0.1  # part of a coloured residual that a likely cause explains
 
 
 @dataclasses.dataclass(frozen=True)
@@ -169,29 +171,53 @@ class Question:
         )
 
     def suspect(
-        self, name: str, before: Residual, after: Residual, valid: Bool[np.ndarray, "..."]
+        self,
+        name: str,
+        before: Residual,
+        after: Residual,
+        valid: Bool[np.ndarray, "..."],
+        value: float | None = None,
+        std_error: float | None = None,
     ) -> Suspect:
-        """A suspect by the residuals without and with it."""
+        """A suspect by the residuals without and with it, and the value of its parameter."""
         whitened = max(_gained(before, after, valid, whiten=True), 0.0)
         word, _, channel = name.partition("_")
-        is_hold = word in HOLDS
+        remedy, unit = f"--hold-input {channel}={word}", ""
+        if value is not None:
+            unit = extended(self.plant, [name]).definition.parameter(name).unit
+            remedy = f"--plant {self.plant_word}+{name} --start {name}={value:.4g}"
         return Suspect(
             name=name,
-            value=None,
-            std_error=None,
-            unit="",
+            value=value,
+            std_error=std_error,
+            unit=unit,
             reduction=_reduction(before, after, valid),
             log_likelihood=_gained(before, after, valid, whiten=False),
             p_value=chi2_tail(1 + (word == "drift"), 2 * whitened),
-            remedy=f"--hold-input {channel}={word}"
-            if is_hold
-            else f"--plant {self.plant_word}+{name}",
+            remedy=remedy,
         )
 
-    def likely(self, found: Sequence[Suspect], num_values: int) -> tuple[Suspect, ...]:
-        """Those that explain more than chance, the likeliest first."""
+    def likely(
+        self, found: Sequence[Suspect], before: Residual, valid: Bool[np.ndarray, "..."]
+    ) -> tuple[Suspect, ...]:
+        """Those that explain more than chance, the likeliest first.
+
+        What a plant leaves out has heavy tails, too: of a coloured residual outliers are a cause
+        only where no effect explains much. The other hold is as good as a delay of half a sample,
+        and needs no parameter.
+        """
         likely = [s for s in found if s.log_likelihood > 0 and s.p_value * self.num_tests <= RARE]
-        return tuple(sorted(likely, key=lambda s: -s.evidence(num_values)))
+        parts, outputs = _parts(before, valid), self.plant.definition.outputs
+        is_coloured = any(
+            whiteness_of(r, o.scale) < RARE for r, o in zip(parts, outputs, strict=True)
+        )
+
+        def rank(s: Suspect) -> tuple[bool, float]:
+            simplicity = _SIMPLER if s.name.startswith(HOLDS) else 1.0
+            explains_little = is_coloured and not s.reduction > _MUCH
+            return explains_little, -simplicity * s.evidence(int(valid.sum()))
+
+        return tuple(sorted(likely, key=rank))
 
 
 Told = Callable[[str, float, float], None]
@@ -221,7 +247,7 @@ def suspects(question: Question, progress: Told = lambda *_: None) -> tuple[Susp
         after = np.asarray(min(ended, key=quality).residual)
         found.append(q.suspect(name, before, after, valid))
     found += _effects(q, search, before, progress)
-    return q.likely(found, int(valid.sum()))
+    return q.likely(found, before, valid)
 
 
 def suspects_in(
@@ -229,7 +255,7 @@ def suspects_in(
 ) -> tuple[Suspect, ...]:
     """The suspects of a long record, looked for in some parts of it.
 
-    The likeliest is fitted to the whole record: its figures are of that fit.
+    The likeliest are fitted to the whole record: their figures are of that fit.
 
     Args:
         question: what was fitted.
@@ -248,12 +274,13 @@ def suspects_in(
         after = other_search.refitted(other_search.begin)
         found.append(q.suspect(name, before, after, valid))
     found += _effects(q, search, before, progress)
-    likely = q.likely(found, int(valid.sum()))
-    for i, first in enumerate(likely[:_MOST_CONFIRMED]):
+    likely, confirmed = q.likely(found, before, valid), []
+    for first in likely[:_MOST_CONFIRMED]:
         progress(f"likely causes: {first.name} in the whole record", total - 1, total)
-        if confirmed := q.likely([_in_all(q, first)], int(q.experiments.valid.sum())):
-            return *confirmed, *likely[i + 1 :]
-    return ()
+        confirmed.append(_in_all(q, first))
+    whole = np.asarray(q.estimate.residual), np.asarray(q.experiments.valid)
+    best = q.likely(confirmed, *whole)
+    return (*best, *likely[_MOST_CONFIRMED:]) if best else ()
 
 
 def _in_all(q: Question, found: Suspect) -> Suspect:
@@ -273,16 +300,11 @@ def _in_all(q: Question, found: Suspect) -> Suspect:
         free = np.array([n not in q.plant.Params._fields for n in begin._fields])
         free[[begin._fields.index(n) for n in q.plant.Params._fields]] = q.free
     end = jax.device_get(q.estimator(plant, data, *jax.device_put((begin, free))))
-    suspect = q.suspect(found.name, before, np.asarray(end.residual), valid)
-    if found.value is None:
-        return suspect
-    at = plant.Params._fields.index(found.name)
-    return dataclasses.replace(
-        suspect,
-        value=float(end.params[at]),
-        std_error=math.sqrt(end.covariance[at, at]),
-        unit=found.unit,
-    )
+    value = std_error = None
+    if found.value is not None:
+        at = plant.Params._fields.index(found.name)
+        value, std_error = float(end.params[at]), math.sqrt(end.covariance[at, at])
+    return q.suspect(found.name, before, np.asarray(end.residual), valid, value, std_error)
 
 
 def _effects(q: Question, search: _Search, before: Residual, progress: Told) -> list[Suspect]:
@@ -293,9 +315,7 @@ def _effects(q: Question, search: _Search, before: Residual, progress: Told) -> 
     for i, trial in enumerate(search.promising(trials, where), first):
         progress(f"likely causes: {trial.name}", i, first + _MOST_FITTED)
         value, std_error, after = search.best(trial)
-        named = q.suspect(trial.name, before, after, search.valid)
-        unit = search.whole.definition.parameter(trial.name).unit
-        found.append(dataclasses.replace(named, value=value, std_error=std_error, unit=unit))
+        found.append(q.suspect(trial.name, before, after, search.valid, value, std_error))
     return found
 
 
@@ -569,7 +589,8 @@ def outliers(residual: Residual, valid: np.ndarray) -> Suspect | None:
     p = chi2_tail(residual.shape[2], 2 * gained)
     if p > RARE or not count:
         return None
-    remedy = f"{count} samples are more than {_FAR:g} standard deviations off: --likelihood student"
+    far = f"{count} of {int(valid.sum())} samples are more than {_FAR:g} robust standard deviations"
+    remedy = f"{far} off: --likelihood student"
     return Suspect("outliers", None, None, "", math.nan, gained, p, remedy)
 
 

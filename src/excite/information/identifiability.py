@@ -35,6 +35,7 @@ _HOLDS = 1, 2, 5, 10, 20  # samples for which the levels of each random input ar
 _NUM_DRAWS, NUM_STEPS = len(_HOLDS), 500
 _NO_EFFECT = 1e-12  # sensitivity relative to the outputs that is nothing but rounding
 _INVOLVED = 1e-6  # component of a direction that is not rounding
+_ALIKE = 0.9  # part of the largest component, or certainty, that counts as much
 
 IDENTIFIABLE, PRACTICALLY_NOT, STRUCTURALLY_NOT = (
     "identifiable",
@@ -422,18 +423,34 @@ def worst_seen(
         value, direction = 0.0, np.ones(index.size)
     if value * UNSEEN_SD**2 >= 1:
         return None
-    chosen = int(index[np.argmax(np.abs(direction))])
     involved = [names[i] for i, v in zip(index, direction, strict=True) if abs(v) > 0.3]
+    chosen = int(index[_told_best(block, direction)])
     if len(involved) == 1:
         kind = PRACTICALLY_NOT if is_planned else "not identifiable from the data"
         return chosen, f"{names[chosen]} is {kind}"
+    if not is_planned:
+        return chosen, f"{' and '.join(involved)} are not identifiable separately"
     combination = " ".join(
         f"{names[i]}^{v:+.2g}"
         for i, v in zip(index, direction / direction[np.argmax(np.abs(direction))], strict=True)
         if names[i] in involved
     )
-    kind = f"{PRACTICALLY_NOT}, separately" if is_planned else "not identifiable separately"
+    kind = f"{PRACTICALLY_NOT}, separately"
     return chosen, f"{' and '.join(involved)} are {kind}: {combination} is undetermined"
+
+
+def _told_best(
+    information: Float[np.ndarray, "param param"], direction: Float[np.ndarray, " param"]
+) -> int:
+    """Which parameter of an undetermined direction, once held, makes the others most certain."""
+    size = np.abs(direction)
+    alike = np.flatnonzero(size > _ALIKE * size.max())
+    if len(alike) == 1 or not np.all(np.isfinite(information)):
+        return int(np.argmax(size))
+    rest = [np.delete(np.delete(information, i, 0), i, 1) for i in alike]
+    least = [float(np.linalg.eigvalsh(block)[0]) if block.size else 0.0 for block in rest]
+    equal = [i for i, value in zip(alike, least, strict=True) if value > _ALIKE * max(least)]
+    return int(max(equal or alike, key=lambda i: size[i]))
 
 
 def identifiability(

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import abc
 import contextlib
+import copy
 import dataclasses
 import math
 from collections import namedtuple
@@ -241,8 +242,13 @@ class AbstractPlant(_Module):
         own = {"sensor": self.sensor, "initial_state": self.initial_state}
         plant = kind(**{**own, **self.constants._asdict(), **numbers})
         if "dt" not in numbers:
-            plant = eqx.tree_at(lambda p: p.dt, plant, self.dt)
-            object.__setattr__(plant, "substeps", self.substeps)
+            plant = eqx.tree_at(lambda p: p.dt, plant, self.dt).integrated_in(self.substeps)
+        return plant
+
+    def integrated_in(self, substeps: int) -> Self:
+        """The same plant with another number of Runge-Kutta steps in one `dt`."""
+        plant = copy.copy(self)
+        object.__setattr__(plant, "substeps", substeps)
         return plant
 
 
