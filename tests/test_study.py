@@ -706,10 +706,10 @@ def test_a_users_plant_is_found_beside_its_study(plant_file, tmp_path, monkeypat
 @pytest.mark.parametrize(
     ("class_name", "words"),
     [
-        ("Tanc", "has no plant class 'Tanc'"),
+        ("Tanc", "has no plant class 'Tanc'; it has Tank, Half, Nameless, Wide"),
         ("number", "has no plant class 'number'"),
         ("State", "has no plant class 'State'"),
-        ("", "has no plant class ''"),
+        ("", "is a file: name the plant in it as .*tank.py:Tank or .*tank.py:Half"),
         ("Half", "Half in .* is not a complete plant: .*derivative"),
         ("Wide", r"output of Wide in .* returns shape \(2,\); .*\(1,\) is needed"),
         ("Typo", "derivative of Typo in .*: unknown parameter 'aera'; did you mean 'area'?"),
@@ -732,6 +732,17 @@ def test_what_is_no_plant_class_is_said(class_name, words, plant_file):
     with pytest.raises(ValueError, match=words) as error:
         plant_named(f"{plant_file}:{class_name}")
     assert str(plant_file) in str(error.value)
+
+
+def test_a_file_without_a_class_names_its_classes(plant_file):
+    with pytest.raises(ValueError, match=f"{plant_file} is a file: .* as {plant_file}:Tank or "):
+        plant_named(str(plant_file))
+    plant_file.write_text("from excite.plant import Aero2\nclass Own(Aero2):\n    pass")
+    with pytest.raises(ValueError, match=f"name the plant in it as {plant_file}:Own$"):
+        plant_named(f"{plant_file}+delay")
+    plant_file.write_text("from excite.plant import Aero2")
+    with pytest.raises(ValueError, match="has no plant class ''; it has none"):
+        plant_named(str(plant_file))
 
 
 @pytest.mark.parametrize(

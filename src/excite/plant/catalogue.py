@@ -90,6 +90,8 @@ def plant_named(name: str) -> AbstractPlant:
     """
     if name.endswith(PLANT_ENDING):
         return _plant_of_file(Path(name))
+    if name.endswith(".py") and Path(name).is_file():
+        name += ":"  # the refusal names the classes of the file
     path, colon, class_name = name.rpartition(":")
     plain, *extensions = class_name.split("+")
     if extensions:
