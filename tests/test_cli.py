@@ -778,6 +778,7 @@ BAD: dict[str, tuple[str, tuple[str, ...]]] = {
     "pickle as MAT": (IDENTIFY.format("pickle.mat"), ("pickle.mat", "not a readable MAT")),
     "HDF5 MAT": (IDENTIFY.format("hdf5.mat"), ("hdf5.mat", "-v7")),
     "wrong ending": (IDENTIFY.format("study.toml"), ("study.toml", ".csv, .txt", "or .db3")),
+    "spreadsheet": (IDENTIFY.format("log.xlsx"), ("log.xlsx", "save the sheet as CSV or Parquet")),
     "no such file": (IDENTIFY.format("nowhere.csv"), ("nowhere.csv", "no such file")),
     "broken sidecar": (IDENTIFY.format("sidecar.csv"), ("sidecar.json", "JSON")),
     "sidecar by hand": (IDENTIFY.format("hand.csv"), ("hand.json", "plant")),
