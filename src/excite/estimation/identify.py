@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Literal, TypeAlias, get_args
+from typing import Any, Literal, TypeAlias, get_args
 
 import jax
 import numpy as np
@@ -60,6 +60,7 @@ from .from_records import (
     by_record,
     experiments_of,
     finite,
+    given_twice,
     linear_inputs,
     parts_of,
     require_complete,
@@ -105,6 +106,7 @@ def identify(
     hold_input: str | Mapping[str, str] = "constant",
     validate: RecordLike | Sequence[RecordLike] = (),
     validate_state: str | float = "auto",
+    validate_columns: Mapping[str, str] | None = None,
     columns: Mapping[str, str] | None = None,
     scales: Mapping[str, float] | None = None,
     units: Mapping[str, str] | None = None,
@@ -149,6 +151,8 @@ def identify(
             from this share of the record, which does not count in the fit; 1.0: from all of it,
             which counts. "auto": known where the sidecar says so, otherwise from the first
             measurements, otherwise from all of it, and the fit with a share of 10 % is told, too.
+        validate_columns: names in the files of held-out records where they differ from `columns`:
+            {"u": "uVal", "y": "yVal"}. One file may hold both kinds of records.
         progress: called with a text, how much is done, and the total.
         columns: names in the files where they are not the plant's: {"pitch": "qm"}.
         scales: factors from the files' units to the plant's: {"pitch": 0.01745}.
@@ -165,6 +169,9 @@ def identify(
     given = _listed(records, "records")
     if not given:
         raise ValueError("no record is given")
+    held_out = _listed(validate, "validate")
+    if validate_columns and not held_out:
+        raise ValueError("validate_columns need a held-out record (--validate)")
     plant = plant_from(_plant_of(given[0]) if plant is None else plant)
     estimator, begin = _chosen(estimator, plant, start, hold)
     estimator = _with_likelihood(estimator, likelihood)
@@ -184,19 +191,17 @@ def identify(
         raise ValueError(f"initial state {initial_state!r} is not one of: known, free, auto")
     progress("reading", 0.0, 1.0)
     read = partial(
-        read_record,
-        description=plant.description,
-        columns=columns,
+        _read,
+        plant.description,
         scales=scales,
         units=units,
         set_inputs=set_inputs,
         dt=dt,
         rows=rows,
     )
-    records, validation = (
-        [_require_kind(r, plant.description) if isinstance(r, Record) else read(r) for r in group]
-        for group in (given, _listed(validate, "validate"))
-    )
+    of_held_out = {**(columns or {}), **(validate_columns or {})}
+    records = [read(record, columns=columns) for record in given]
+    validation = [read(record, columns=of_held_out) for record in held_out]
     known = initial_state == "known" or (
         initial_state == "auto" and all(starts_at(record, plant) for record in records)
     )
@@ -239,7 +244,10 @@ def identify(
         plant, experiments, estimator, fit, whiteness, uncertain_sd
     )
     wrong = _wrong_structure(structure, estimator) if fit.is_successful else ()
-    others = tuple(s for record in [*records, *validation] for s in _other_plant(record, plant))
+    others = (
+        *(s for record in [*records, *validation] for s in _other_plant(record, plant)),
+        *given_twice(records, validation),
+    )
     large = _above_declared(plant, fit) if fit.is_successful else ()
     verdict = (*others, *wrong, *large, *_remedies(found), *where, *_agreement(fit), *verdict)
     names = names_of(plant.definition.parameters)
@@ -312,16 +320,18 @@ def _plant_of(record: RecordLike) -> str:
     return name
 
 
-def _require_kind(record: Record, description: PlantDescription) -> Record:
-    """The record; ValueError where it does not have the plant's inputs and outputs."""
-    found = record.inputs.shape[1], record.outputs.shape[1]
+def _read(description: PlantDescription, given: RecordLike, **options: Any) -> Record:
+    """A record or that of a file; ValueError where it does not have the plant's columns."""
+    if not isinstance(given, Record):
+        return read_record(given, description, **options)
+    found = given.inputs.shape[1], given.outputs.shape[1]
     if found != (len(description.inputs), len(description.outputs)):
         raise ValueError(
-            f"{record.source or 'the record'} has {found[0]} inputs and {found[1]} outputs; plant "
+            f"{given.source or 'the record'} has {found[0]} inputs and {found[1]} outputs; plant "
             f"{description.name!r} has {len(description.inputs)} and {len(description.outputs)}"
         )
-    require_columns(record, description)
-    return record
+    require_columns(given, description)
+    return given
 
 
 def _chosen(
