@@ -471,6 +471,14 @@ def test_a_result_can_be_pickled():
         again.posterior()
 
 
+def test_a_prediction_error_search_does_not_claim_a_share_that_it_does_not_know():
+    told = []
+    identify(noisy(), Ramp, "pem", progress=lambda *step: told.append(step))
+    text, done, total = told[-1]
+    assert (text, total) == ("prediction error", 1.0)
+    assert np.isnan(done)
+
+
 def test_stages_are_told_in_order():
     told = []
     identify(

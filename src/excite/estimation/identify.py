@@ -153,7 +153,7 @@ def identify(
             measurements, otherwise from all of it, and the fit with a share of 10 % is told, too.
         validate_columns: names in the files of held-out records where they differ from `columns`:
             {"u": "uVal", "y": "yVal"}. One file may hold both kinds of records.
-        progress: called with a text, how much is done, and the total.
+        progress: called with a text, how much is done (NaN where it is not known), and the total.
         columns: names in the files where they are not the plant's: {"pitch": "qm"}.
         scales: factors from the files' units to the plant's: {"pitch": 0.01745}.
         units: the files' units where they are not the plant's: {"time": "ms", "pitch": "deg"}.
