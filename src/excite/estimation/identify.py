@@ -84,6 +84,7 @@ Intervals = Literal["linear", "profile"]
 _SIZE_OF_SUSPECTS = 10_000  # measured values in which suspects are looked for
 _SAME = 0.01  # difference of sums of squares at one minimum, over the noise
 _FAR_ABOVE = 10.0  # times the declared noise; a larger residual is remarked
+_FAR_FACTOR = 10.0  # between an estimate and what was expected of it; a larger one is remarked
 _BY_CHANCE = 1e-3  # a fit with a larger p-value explains nothing
 
 
@@ -255,6 +256,8 @@ def identify(
     sd = np.where(fit.free, np.sqrt(np.maximum(np.diag(covariance), 0.0)), np.nan)
     half = np.where(fit.free, half_95(covariance, degrees), np.nan)
     ends = within_support(plant, np.stack([values - half, values + half], axis=1))
+    if isinstance(estimator, AbstractSearch):  # others can be biased as much
+        verdict = (*_far_from_expected(plant, begin, fit.free, values, ends), *verdict)
     profiles = {}
     if intervals == "profile" and isinstance(estimator, NLS) and fit.is_successful:
         estimate = jax.device_put(fit.estimate)
@@ -556,6 +559,37 @@ def _above_declared(plant: AbstractPlant, fit: Fit) -> tuple[str, ...]:
         f"{sd:.3g} {part.unit}): the plant leaves something out, or the declaration is wrong"
         for part, own, sd in zip(plant.definition.outputs, size, declared, strict=True)
         if sd > 0 and own > _FAR_ABOVE * sd
+    )
+
+
+def _far_from_expected(
+    plant: AbstractPlant,
+    start: Params,
+    free: np.ndarray,
+    values: Float[np.ndarray, " param"],
+    ends: Float[np.ndarray, "param end"],
+) -> tuple[str, ...]:
+    """A sentence on positive parameters that are far from their nominal and their start value.
+
+    What cannot be told from zero, or from its nominal value, is not far, and the nominal value of
+    an extension's parameter says nothing.
+    """
+    own, far = names_of(plain_kind(plant).definition.parameters), []
+    for part, begin, is_free, value, (low, high) in zip(
+        plant.definition.parameters, start, free, values, ends, strict=True
+    ):
+        if not (part.positive and is_free and part.name in own and low > 0):
+            continue
+        factors = value / np.array([part.nominal, float(begin)])
+        if min(abs(np.log(factors))) > np.log(_FAR_FACTOR) and not low < part.nominal < high:
+            far.append(
+                f"{part.name} = {f'{value:.4g} {part.unit}'.strip()} ({factors[0]:.2g} times its "
+                "nominal value)"
+            )
+    if not far:
+        return ()
+    return (
+        f"{', '.join(far)}: are units, scales and sampling time right (--unit, --scale, --dt)?",
     )
 
 
