@@ -259,7 +259,7 @@ def _traced(plant: AbstractPlant, name: str, arguments: tuple[Any, ...], what: s
 
 def _missing_name(plant: AbstractPlant, error: BaseException, what: str) -> ValueError | None:
     """The error for a parameter or constant that a plant does not have; None for another one."""
-    if not isinstance(error, AttributeError):
+    if not isinstance(error, AttributeError) or error.name is None:
         return None
     for kind, own, place in (
         ("parameter", plant.nominal, "params"),
