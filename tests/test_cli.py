@@ -402,10 +402,30 @@ def test_where_stderr_is_no_terminal_lines_tell_how_far_it_is(monkeypatch, capsy
 
     monkeypatch.setenv("EXCITE_PROGRESS", "0.05")
     with Lines("designing") as lines:
-        lines.update("trial 1 of 4", 1, 4)
+        lines.update("trial 1 of 4", 0, 4)
         assert re.fullmatch(r"designing: trial 1 of 4, \d+ s so far", told("trial 1"))
-        lines.update("trial 2 of 4", 2, 4)
-        assert re.fullmatch(r"designing: trial 2 of 4, 50 %, \d+ s left", told("trial 2"))
+        lines.update("trial 2 of 4", 1, 4)
+        assert re.fullmatch(r"designing: trial 2 of 4, 25 %, \d+ s so far", told("trial 2"))
+        lines.update("trial 3 of 4", 2, 4)
+        assert re.fullmatch(r"designing: trial 3 of 4, 50 %, \d+ s left", told("trial 3"))
+
+
+def test_the_time_left_counts_neither_start_up_nor_earlier_work(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr("excite.cli.options.time.monotonic", lambda: now[0])
+    lines = Lines("resumed")
+    for now[0], done, words in (
+        (0.0, 0.80, "80 %, 0 s so far"),
+        (20.0, 0.75, "75 %, 20 s so far"),  # from its checkpoint
+        (50.0, 0.80, "80 %, 50 s so far"),  # compiled
+        (60.0, 0.85, "85 %, 30 s left"),
+        (70.0, 0.90, "90 %, 20 s left"),
+        (80.0, float("nan"), "80 s so far"),
+        (95.0, float("nan"), "2 min so far"),
+        (99.0, 0.90, "90 %, 2 min so far"),
+    ):
+        lines.update("", done, 1.0)
+        assert lines.line() == f"resumed, {words}"
 
 
 # Plants, doctor
@@ -778,6 +798,7 @@ BAD: dict[str, tuple[str, tuple[str, ...]]] = {
     "pickle as MAT": (IDENTIFY.format("pickle.mat"), ("pickle.mat", "not a readable MAT")),
     "HDF5 MAT": (IDENTIFY.format("hdf5.mat"), ("hdf5.mat", "-v7")),
     "wrong ending": (IDENTIFY.format("study.toml"), ("study.toml", ".csv, .txt", "or .db3")),
+    "spreadsheet": (IDENTIFY.format("log.xlsx"), ("log.xlsx", "save the sheet as CSV or Parquet")),
     "no such file": (IDENTIFY.format("nowhere.csv"), ("nowhere.csv", "no such file")),
     "broken sidecar": (IDENTIFY.format("sidecar.csv"), ("sidecar.json", "JSON")),
     "sidecar by hand": (IDENTIFY.format("hand.csv"), ("hand.json", "plant")),

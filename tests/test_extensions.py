@@ -214,6 +214,10 @@ def test_extensions_are_named_in_one_order_and_can_be_combined():
         ("aero2+delay+delay_voltage", "plant 'aero2' has 'delay_voltage' already"),
         ("dc_motor+drift", r"there is drift_speed, drift_current\)"),
         ("nothing+delay", "unknown plant 'nothing'"),
+        ("aero2+linear_voltage", "'linear_voltage' .*, but the option --hold-input voltage=linear"),
+        ("aero2+constant_voltage", "but the option --hold-input voltage=constant"),
+        ("aero2+linear_thrust", "unknown extension of plant 'aero2' 'linear_thrust'"),
+        ("aero2+lag+outliers", "'outliers' is no extension .*the option --likelihood student"),
     ],
 )
 def test_an_extension_that_does_not_exist_is_refused(name, message):

@@ -188,8 +188,8 @@ MISTAKES = {
     "ex.identify(record, estimator='arx-rls', hold={'J_p': 1})": "takes no hold",
     "ex.Record([0, 1], [[0], [1]], [[0]])": "outputs of a record needs one row for each of 2",
     "ex.Record([0, 1], 'no', [[0]])": "inputs must be an array of numbers: got str 'no'",
-    "ex.simulate(Deciding)": "derivative of Deciding branches on the value of a state, an input or "
-    "a parameter (if, while, and, or, float, int): use jnp.where(condition, value, otherwise)",
+    "ex.simulate(Deciding)": "derivative of Deciding branches on the value of a state, an input, "
+    "a parameter or a constant (if, while, and, or): use jnp.where(condition, value, otherwise)",
     "ex.simulate(Numpy())": "derivative of Numpy uses NumPy: use jax.numpy",
     "ex.simulate(ex.AbstractPlant)": "AbstractPlant is not a complete plant",
 }

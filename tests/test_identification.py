@@ -335,6 +335,22 @@ def test_a_record_of_a_plant_with_other_constants_is_remarked(chirp):
     assert any("chirp.csv" in s and "other known constants" in s for s in result.verdict)
 
 
+def test_a_scale_that_only_the_parameters_show_is_asked_for(foreign):
+    """Without its factor of 30, the input makes the gain 30 times larger and fits as well."""
+    wrong = dataclasses.replace(foreign, inputs=foreign.inputs / 30)
+    right, found = identify([foreign], PLANT), identify([wrong], PLANT)
+    assert found.fit()["pitch"] == pytest.approx(right.fit()["pitch"], abs=0.1)
+    factor = found.params.K_pu / PLANT.definition.parameter("K_pu").nominal
+    unit = PLANT.definition.parameter("K_pu").unit
+    assert found.verdict[0] == (
+        f"K_pu = {found.params.K_pu:.4g} {unit} ({factor:.2g} times its nominal value): are units, "
+        "scales and sampling time right (--unit, --scale, --dt)?"
+    )
+    expected = identify([wrong], PLANT, start={"K_pu": 30 * right.params.K_pu})
+    for silent in (right, expected):  # what the caller expects is not remarked
+        assert not any("nominal value" in s for s in silent.verdict)
+
+
 def test_a_record_of_another_plant_is_remarked_first_or_refused(chirp):
     result = identify([chirp], Aero2Detailed())
     assert result.verdict[0].endswith("was made with plant 'aero2', not with 'aero2_detailed'")

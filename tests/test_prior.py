@@ -421,12 +421,62 @@ def test_a_share_that_is_none_is_refused(state):
         identify(noisy(), Ramp, validate=shifted(0.0), validate_state=state)
 
 
+def test_held_out_data_may_be_in_other_columns_of_the_same_file(tmp_path):
+    (one, other), path = (noisy(), noisy(7)), tmp_path / "both.csv"
+    cells = [TIME, one.inputs[:, 0], one.outputs[:, 0], other.inputs[:, 0], other.outputs[:, 0]]
+    names = "time,u,yEst,uVal,yVal"
+    np.savetxt(path, np.transpose(cells), delimiter=",", header=names, comments="")
+    given = {"columns": {"y": "yEst"}, "validate": path}
+    found = identify(path, Ramp, validate_columns={"u": "uVal", "y": "yVal"}, **given)
+    np.testing.assert_array_equal(found.validation[0].record.outputs, other.outputs)
+    np.testing.assert_array_equal(found.validation[0].record.inputs, other.inputs)
+    np.testing.assert_array_equal(found.fitted[0].record.outputs, one.outputs)
+    assert not any("there is" in s or "is also" in s for s in found.verdict)
+    part = identify(path, Ramp, validate_columns={"u": "uVal"}, **given)  # y is that of `columns`
+    np.testing.assert_array_equal(part.validation[0].record.outputs, one.outputs)
+    (tmp_path / "plants.py").write_text("from test_prior import Ramp as Own\nclass Ramp(Own): pass")
+    done = excite(
+        "identify", path, "--plant", f"{tmp_path}/plants.py:Ramp", "--column", "y=yEst",
+        "--validate", path, "--validate-column", "u=uVal,y=yVal", "--json",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)["validation"][0]
+    assert told["fit_percent"]["y"] == pytest.approx(found.validation[0].fit_percent["y"])
+
+
+def test_columns_of_held_out_records_need_one():
+    with pytest.raises(ValueError, match=r"validate_columns need a held-out record \(--validate\)"):
+        identify(noisy(), Ramp, validate_columns={"u": "uVal"})
+
+
+def test_a_record_that_is_there_twice_is_remarked():
+    one, late = noisy(), dataclasses.replace(noisy(), time=TIME + 100.0, source="copy.csv")
+    sentence = "is also a record of the estimation: its fit says nothing about new data"
+    found = identify([one, noisy(1)], Ramp, validate=[noisy(7), late])
+    assert [s for s in found.verdict if "also" in s] == [f"copy.csv {sentence}"]
+    twice = identify([one, late, one], Ramp).verdict
+    ends = "is there twice: it counts double, which narrows intervals"
+    assert [s for s in twice if "twice" in s] == [
+        f"copy.csv (the same data as ramp.csv) {ends}", f"ramp.csv {ends}"
+    ]  # fmt: skip
+    held_out = identify(one, Ramp, validate=[noisy(7), noisy(7)]).verdict
+    assert not any("twice" in s or "also" in s for s in held_out)
+
+
 def test_a_result_can_be_pickled():
     result = identify(noisy(), Ramp)
     again = pickle.loads(pickle.dumps(result))
     assert str(again) == str(result)
     with pytest.raises(ValueError, match="a result that was loaded has no posterior"):
         again.posterior()
+
+
+def test_a_prediction_error_search_does_not_claim_a_share_that_it_does_not_know():
+    told = []
+    identify(noisy(), Ramp, "pem", progress=lambda *step: told.append(step))
+    text, done, total = told[-1]
+    assert (text, total) == ("prediction error", 1.0)
+    assert np.isnan(done)
 
 
 def test_stages_are_told_in_order():

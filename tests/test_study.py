@@ -552,6 +552,8 @@ def test_each_input_may_have_an_amplitude_of_its_own():
 
 
 PLANT_FILE = """
+import math
+
 import jax.numpy as jnp
 from excite.description import Constant, Input, Output, Parameter, PlantDescription, State
 from excite.plant import AbstractPlant
@@ -561,6 +563,7 @@ class Tank(AbstractPlant):
     definition = PlantDescription(
         name="tank",
         states=(State("level", "m"),),
+        constants=(Constant("g", "m/s²", 9.81),),
         inputs=(Input("flow", "m³/s", 0.0, 1.0),),
         outputs=(Output("level_m", "m", 1.0, noise_sd=0.01),),
         parameters=(Parameter("area", "m²", 2.0), Parameter("leak", "m²/s", 0.3)),
@@ -615,6 +618,51 @@ class Complex(Tank):
         return 1j * state
 
 
+class Listed(Tank):
+    def derivative(self, state, input, params):
+        return [-state[0]]
+
+
+class Paired(Tank):
+    def output(self, state, params):
+        return state, state
+
+
+class Silent(Tank):
+    def output(self, state, params):
+        pass
+
+
+class Math(Tank):
+    def derivative(self, state, input, params):
+        return jnp.stack([-math.sin(state[0])])
+
+
+class MathOfConstant(Tank):
+    def derivative(self, state, input, params):
+        return -math.sqrt(self.constants.g) * state
+
+
+class Branching(Tank):
+    def derivative(self, state, input, params):
+        return -state if self.constants.g > 0 else state
+
+
+class OtherConstant(Tank):
+    def derivative(self, state, input, params):
+        return -self.constants.gg * state
+
+
+class OfPlant(Tank):
+    def derivative(self, state, input, params):
+        return -self.g * state
+
+
+class Late(Tank):
+    def delay(self, params):
+        return [params.leak]
+
+
 number = 3
 """
 
@@ -658,13 +706,22 @@ def test_a_users_plant_is_found_beside_its_study(plant_file, tmp_path, monkeypat
 @pytest.mark.parametrize(
     ("class_name", "words"),
     [
-        ("Tanc", "has no plant class 'Tanc'"),
+        ("Tanc", "has no plant class 'Tanc'; it has Tank, Half, Nameless, Wide"),
         ("number", "has no plant class 'number'"),
         ("State", "has no plant class 'State'"),
-        ("", "has no plant class ''"),
+        ("", "is a file: name the plant in it as .*tank.py:Tank or .*tank.py:Half"),
         ("Half", "Half in .* is not a complete plant: .*derivative"),
-        ("Wide", r"output of Wide in .* returns shape \(2,\); \(1,\) is needed"),
-        ("Typo", "derivative of Typo in .* fails: AttributeError: .*aera"),
+        ("Wide", r"output of Wide in .* returns shape \(2,\); .*\(1,\) is needed"),
+        ("Typo", "derivative of Typo in .*: unknown parameter 'aera'; did you mean 'area'?"),
+        ("OtherConstant", r"unknown constant 'gg'; did you mean 'g'\? \(there is g\)"),
+        ("OfPlant", r"the constant self\.g is self\.constants\.g"),
+        ("Listed", r"returns a list; one array of shape \(1,\) is needed, such as jnp\.stack"),
+        ("Paired", r"output of Paired in .* returns a tuple; .*jnp\.stack"),
+        ("Silent", r"output of Silent in .* returns None; .*jnp\.stack"),
+        ("Late", r"delay of Late in .* returns a list; .*jnp\.stack"),
+        ("Math", "Math in .* function of math, which take no JAX values: .* jnp.sin for math.sin"),
+        ("MathOfConstant", "a constant to .* a function of math, .* jnp.sin for math.sin"),
+        ("Branching", r"branches on the value of .* or a constant .*: use jnp\.where"),
         ("Nameless", "Nameless in .* is not a complete plant: .*definition"),
         ("Leaving", "derivative of Leaving in .* fails: SystemExit: 3"),
         ("Refusing", "Refusing in .* cannot be made: RuntimeError: no"),
@@ -675,6 +732,17 @@ def test_what_is_no_plant_class_is_said(class_name, words, plant_file):
     with pytest.raises(ValueError, match=words) as error:
         plant_named(f"{plant_file}:{class_name}")
     assert str(plant_file) in str(error.value)
+
+
+def test_a_file_without_a_class_names_its_classes(plant_file):
+    with pytest.raises(ValueError, match=f"{plant_file} is a file: .* as {plant_file}:Tank or "):
+        plant_named(str(plant_file))
+    plant_file.write_text("from excite.plant import Aero2\nclass Own(Aero2):\n    pass")
+    with pytest.raises(ValueError, match=f"name the plant in it as {plant_file}:Own$"):
+        plant_named(f"{plant_file}+delay")
+    plant_file.write_text("from excite.plant import Aero2")
+    with pytest.raises(ValueError, match="has no plant class ''; it has none"):
+        plant_named(str(plant_file))
 
 
 @pytest.mark.parametrize(

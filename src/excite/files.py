@@ -232,6 +232,7 @@ def class_at(path: Path, word: str, base: type, kind: str) -> Any:
     """A class derived from `base` in a user's file. Importing the file runs its code.
 
     Args:
+        word: the class's name; an empty one is an error that names the classes of the file.
         kind: what such a class is called in a message.
 
     Raises:
@@ -239,10 +240,19 @@ def class_at(path: Path, word: str, base: type, kind: str) -> Any:
     """
     if not path.is_file():
         raise ValueError(f"{path}: no such file")
-    found = getattr(module_at(path), word, None)
-    if not (isinstance(found, type) and issubclass(found, base)):
-        raise ValueError(f"{path} has no {kind} class {word!r}")
-    return found
+    module = module_at(path)
+    found = getattr(module, word, None)
+    if isinstance(found, type) and issubclass(found, base):
+        return found
+    own = [
+        name
+        for name, part in vars(module).items()
+        if isinstance(part, type) and issubclass(part, base) and part.__module__ == module.__name__
+    ]
+    if not word and own:
+        words = " or ".join(f"{path}:{name}" for name in own)
+        raise ValueError(f"{path} is a file: name the {kind} in it as {words}")
+    raise ValueError(f"{path} has no {kind} class {word!r}; it has {', '.join(own) or 'none'}")
 
 
 def module_at(path: Path) -> Any:

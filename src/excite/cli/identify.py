@@ -50,6 +50,12 @@ _OF_RECORDS = (
         "estimated from a share that does not count (10%).",
     ),
     click.option(
+        "--validate-column",
+        type=NAMES,
+        multiple=True,
+        help="Columns of held-out records where they differ from --column: u=uVal,y=yVal.",
+    ),
+    click.option(
         "--column",
         type=NAMES,
         multiple=True,
@@ -107,6 +113,7 @@ def arguments_of(options: Mapping[str, Any]) -> dict[str, Any]:
         "hold_input": NAMES.convert(hold_input, None, None) if "=" in hold_input else hold_input,
         "validate": options["validate"],
         "validate_state": options["validate_state"],
+        "validate_columns": merged(options["validate_column"]),
         "columns": merged(options["column"]),
         "scales": merged(options["scale"]),
         "units": merged(options["unit"]),

@@ -241,8 +241,9 @@ class Lines:
         """`what` the command does."""
         self._what, self._text = what, ""
         self._began = time.monotonic()
-        self._first: tuple[float, float] | None = None  # time and share of the first call
-        self._share = 0.0
+        self._share = math.nan
+        # Time and share when it first grew: what came before is work done earlier, and start-up.
+        self._first: tuple[float, float] | None = None
         self._end = threading.Event()
         self._teller = threading.Thread(target=self._tell, daemon=True)
 
@@ -257,20 +258,24 @@ class Lines:
         self._teller.join()
 
     def update(self, text: str, done: float, total: float) -> None:
-        """Sets the current step, how much is done, and the total."""
-        self._text, self._share = text, done / total if total else 0.0
-        self._first = self._first or (time.monotonic(), self._share)
+        """Sets the current step, how much is done (NaN: it is not known), and the total."""
+        share = done / total if total else 0.0
+        if share > self._share:
+            self._first = self._first or (time.monotonic(), share)
+        elif share != self._share:  # what is resumed may begin before what was told first
+            self._first = None
+        self._text, self._share = text, share
 
     def line(self) -> str:
         """The current step, how much of it is done, and the time left or elapsed."""
-        now = time.monotonic()
-        began, before = self._first or (now, 0.0)  # resumed work counts as done at the start
-        if (gained := self._share - before) > 0:
-            time_left = (now - began) * (1 - self._share) / gained
-            how_far = f"{100 * self._share:.0f} %, {_duration(time_left)} left"
+        now, share = time.monotonic(), self._share
+        since, before = self._first or (now, share)
+        if share > before:
+            how_long = f"{_duration((now - since) * (1 - share) / (share - before))} left"
         else:
-            how_far = f"{_duration(now - self._began)} so far"
-        return f"{': '.join(filter(None, (self._what, self._text)))}, {how_far}"
+            how_long = f"{_duration(now - self._began)} so far"
+        words = f"{100 * share:.0f} %, {how_long}" if share > 0 else how_long
+        return f"{': '.join(filter(None, (self._what, self._text)))}, {words}"
 
     def _tell(self) -> None:
         seconds = float(os.environ.get("EXCITE_PROGRESS", "10"))
@@ -304,7 +309,8 @@ def warnings_shown() -> Iterator[None]:
 def progress_bar(what: str) -> Iterator[Callable[[str, float, float], None]]:
     """Shows the progress of a command on stderr: a bar on a terminal, lines elsewhere.
 
-    Yields a function that sets the current step, how much is done, and the total.
+    Yields a function that sets the current step, how much is done (NaN: it is not known), and the
+    total.
     """
     with contextlib.ExitStack() as stack:
         if sys.stderr.isatty() or os.environ.get("FORCE_COLOR"):
@@ -317,7 +323,11 @@ def progress_bar(what: str) -> Iterator[Callable[[str, float, float], None]]:
             task = bar.add_task(what, total=None)
 
             def show(text: str, done: float, total: float) -> None:
-                bar.update(task, description=f"{what}: {text}", completed=done, total=total)
+                if math.isnan(done):
+                    bar.tasks[0].total = None  # for `update` None is no change
+                    bar.update(task, description=f"{what}: {text}")
+                else:
+                    bar.update(task, description=f"{what}: {text}", completed=done, total=total)
         else:
             show = stack.enter_context(Lines(what)).update
         came = stack.enter_context(_interrupts())

@@ -171,7 +171,7 @@ def _estimate(
         least_squares = NLS(known=estimator.known)
         first = _estimate(plant, experiments, least_squares, start, free, progress, others)
         start = first[0].params
-        progress("prediction error", 0.4, 1.0)
+        progress("prediction error", np.nan, 1.0)  # how long it takes is not known
     found = [search(estimator, start)]
     if not isinstance(estimator, NLS):
         return found

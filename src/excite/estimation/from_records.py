@@ -90,6 +90,32 @@ def require_enough(
         )
 
 
+def given_twice(records: Sequence[Record], held_out: Sequence[Record]) -> tuple[str, ...]:
+    """A sentence on each record that is there twice, and each held-out one that was fitted."""
+    told = []
+    for i, record in enumerate([*records, *held_out]):
+        twin = next((r for r in records[:i] if _is_same(r, record)), None)
+        if twin is None:
+            continue
+        where = record.source or "a record"
+        if i >= len(records):
+            told.append(
+                f"{where} is also a record of the estimation: its fit says nothing about new data"
+            )
+        else:
+            same = f" (the same data as {twin.source})" * (twin.source not in ("", record.source))
+            told.append(f"{where}{same} is there twice: it counts double, which narrows intervals")
+    return tuple(told)
+
+
+def _is_same(one: Record, other: Record) -> bool:
+    """Whether two records hold the same data; a recording may begin at another time."""
+    values = [(r.time - r.time[0], r.inputs, r.outputs) for r in (one, other)]
+    return len(one.time) == len(other.time) and all(
+        np.allclose(a, b, rtol=1e-9, atol=0, equal_nan=True) for a, b in zip(*values, strict=True)
+    )
+
+
 def require_short_delays(plant: AbstractPlant, begin: Params, records: Sequence[Record]) -> None:
     """Raises ValueError where the search begins with a delay that moves all inputs out."""
     delay, span = plant.delay(begin), max(float(np.ptp(record.time)) for record in records)

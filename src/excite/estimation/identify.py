@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Literal, TypeAlias, get_args
+from typing import Any, Literal, TypeAlias, get_args
 
 import jax
 import numpy as np
@@ -61,6 +61,7 @@ from .from_records import (
     by_record,
     experiments_of,
     finite,
+    given_twice,
     linear_inputs,
     parts_of,
     require_complete,
@@ -86,6 +87,7 @@ Intervals = Literal["linear", "profile"]
 _SIZE_OF_SUSPECTS = 10_000  # measured values in which suspects are looked for
 _SAME = 0.01  # difference of sums of squares at one minimum, over the noise
 _FAR_ABOVE = 10.0  # times the declared noise; a larger residual is remarked
+_FAR_FACTOR = 10.0  # between an estimate and what was expected of it; a larger one is remarked
 _BY_CHANCE = 1e-3  # a fit with a larger p-value explains nothing
 
 
@@ -108,6 +110,7 @@ def identify(
     hold_input: str | Mapping[str, str] = "constant",
     validate: RecordLike | Sequence[RecordLike] = (),
     validate_state: str | float = "auto",
+    validate_columns: Mapping[str, str] | None = None,
     columns: Mapping[str, str] | None = None,
     scales: Mapping[str, float] | None = None,
     units: Mapping[str, str] | None = None,
@@ -152,7 +155,9 @@ def identify(
             from this share of the record, which does not count in the fit; 1.0: from all of it,
             which counts. "auto": known where the sidecar says so, otherwise from the first
             measurements, otherwise from all of it, and the fit with a share of 10 % is told, too.
-        progress: called with a text, how much is done, and the total.
+        validate_columns: names in the files of held-out records where they differ from `columns`:
+            {"u": "uVal", "y": "yVal"}. One file may hold both kinds of records.
+        progress: called with a text, how much is done (NaN where it is not known), and the total.
         columns: names in the files where they are not the plant's: {"pitch": "qm"}.
         scales: factors from the files' units to the plant's: {"pitch": 0.01745}.
         units: the files' units where they are not the plant's: {"time": "ms", "pitch": "deg"}.
@@ -168,6 +173,9 @@ def identify(
     given = _listed(records, "records")
     if not given:
         raise ValueError("no record is given")
+    held_out = _listed(validate, "validate")
+    if validate_columns and not held_out:
+        raise ValueError("validate_columns need a held-out record (--validate)")
     plant = plant_from(_plant_of(given[0]) if plant is None else plant)
     estimator, begin = _chosen(estimator, plant, start, hold)
     estimator = _with_likelihood(estimator, likelihood)
@@ -187,19 +195,17 @@ def identify(
         raise ValueError(f"initial state {initial_state!r} is not one of: known, free, auto")
     progress("reading", 0.0, 1.0)
     read = partial(
-        read_record,
-        description=plant.description,
-        columns=columns,
+        _read,
+        plant.description,
         scales=scales,
         units=units,
         set_inputs=set_inputs,
         dt=dt,
         rows=rows,
     )
-    records, validation = (
-        [_require_kind(r, plant.description) if isinstance(r, Record) else read(r) for r in group]
-        for group in (given, _listed(validate, "validate"))
-    )
+    of_held_out = {**(columns or {}), **(validate_columns or {})}
+    records = [read(record, columns=columns) for record in given]
+    validation = [read(record, columns=of_held_out) for record in held_out]
     known = initial_state == "known" or (
         initial_state == "auto" and all(starts_at(record, plant) for record in records)
     )
@@ -245,7 +251,10 @@ def identify(
     )
     told = factor if intervals == "linear" else 1.0
     wrong = _wrong_structure(wrong, told, estimator)
-    others = tuple(s for record in [*records, *validation] for s in _other_plant(record, plant))
+    others = (
+        *(s for record in [*records, *validation] for s in _other_plant(record, plant)),
+        *given_twice(records, validation),
+    )
     large = _above_declared(plant, fit) if fit.is_successful else ()
     astray = _simulates_poorly(fitted) if isinstance(estimator, PEM) else ()
     remedies = *_remedies(found), *where
@@ -258,6 +267,8 @@ def identify(
         coarse = too_coarse(plant, experiments, estimator, fit.estimate, fit.free, sd)
         verdict = (*coarse, *verdict)
     ends = within_support(plant, np.stack([values - half, values + half], axis=1))
+    if isinstance(estimator, AbstractSearch):  # others can be biased as much
+        verdict = (*_far_from_expected(plant, begin, fit.free, values, ends), *verdict)
     profiles = {}
     if intervals == "profile" and isinstance(estimator, NLS) and fit.is_successful:
         estimate = jax.device_put(fit.estimate)
@@ -323,16 +334,18 @@ def _plant_of(record: RecordLike) -> str:
     return name
 
 
-def _require_kind(record: Record, description: PlantDescription) -> Record:
-    """The record; ValueError where it does not have the plant's inputs and outputs."""
-    found = record.inputs.shape[1], record.outputs.shape[1]
+def _read(description: PlantDescription, given: RecordLike, **options: Any) -> Record:
+    """A record or that of a file; ValueError where it does not have the plant's columns."""
+    if not isinstance(given, Record):
+        return read_record(given, description, **options)
+    found = given.inputs.shape[1], given.outputs.shape[1]
     if found != (len(description.inputs), len(description.outputs)):
         raise ValueError(
-            f"{record.source or 'the record'} has {found[0]} inputs and {found[1]} outputs; plant "
+            f"{given.source or 'the record'} has {found[0]} inputs and {found[1]} outputs; plant "
             f"{description.name!r} has {len(description.inputs)} and {len(description.outputs)}"
         )
-    require_columns(record, description)
-    return record
+    require_columns(given, description)
+    return given
 
 
 def _chosen(
@@ -611,6 +624,37 @@ def _simulates_poorly(fitted: Sequence[Fitted]) -> tuple[str, ...]:
     return (
         f"the simulation of {listed(sorted(poor))} is worse than a constant: process noise "
         "explains what the equations should; use these parameters to predict, not to simulate",
+    )
+
+
+def _far_from_expected(
+    plant: AbstractPlant,
+    start: Params,
+    free: np.ndarray,
+    values: Float[np.ndarray, " param"],
+    ends: Float[np.ndarray, "param end"],
+) -> tuple[str, ...]:
+    """A sentence on positive parameters that are far from their nominal and their start value.
+
+    What cannot be told from zero, or from its nominal value, is not far, and the nominal value of
+    an extension's parameter says nothing.
+    """
+    own, far = names_of(plain_kind(plant).definition.parameters), []
+    for part, begin, is_free, value, (low, high) in zip(
+        plant.definition.parameters, start, free, values, ends, strict=True
+    ):
+        if not (part.positive and is_free and part.name in own and low > 0):
+            continue
+        factors = value / np.array([part.nominal, float(begin)])
+        if min(abs(np.log(factors))) > np.log(_FAR_FACTOR) and not low < part.nominal < high:
+            far.append(
+                f"{part.name} = {f'{value:.4g} {part.unit}'.strip()} ({factors[0]:.2g} times its "
+                "nominal value)"
+            )
+    if not far:
+        return ()
+    return (
+        f"{', '.join(far)}: are units, scales and sampling time right (--unit, --scale, --dt)?",
     )
 
 

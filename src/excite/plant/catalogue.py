@@ -6,8 +6,9 @@ import inspect
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -89,6 +90,8 @@ def plant_named(name: str) -> AbstractPlant:
     """
     if name.endswith(PLANT_ENDING):
         return _plant_of_file(Path(name))
+    if name.endswith(".py") and Path(name).is_file():
+        name += ":"  # the refusal names the classes of the file
     path, colon, class_name = name.rpartition(":")
     plain, *extensions = class_name.split("+")
     if extensions:
@@ -211,27 +214,62 @@ def _check_plant(plant: AbstractPlant, where: str) -> None:
     for name, arguments, count in (
         ("derivative", (state, inputs, plant.nominal), len(d.states)),
         ("output", (state, plant.nominal), len(d.outputs)),
+        ("delay", (plant.nominal,), len(d.inputs)),
     ):
-        try:
-            found = jax.eval_shape(getattr(plant, name), *arguments)
-            shape, kind = jnp.shape(found), getattr(found, "dtype", float)
-        except jax.errors.ConcretizationTypeError as error:
-            raise ValueError(
-                f"{name} of {where} branches on the value of a state, an input or a parameter "
-                "(if, while, and, or, float, int): use jnp.where(condition, value, otherwise)"
-            ) from error
-        except jax.errors.TracerArrayConversionError as error:
-            raise ValueError(
-                f"{name} of {where} uses NumPy: use jax.numpy (import jax.numpy as jnp)"
-            ) from error
-        except KeyboardInterrupt:
-            raise
-        except BaseException as error:  # also sys.exit
-            raise ValueError(f"{name} of {where} fails: {told(error)}") from error
-        if shape != (count,):
-            raise ValueError(f"{name} of {where} returns shape {shape}; ({count},) is needed")
-        if jnp.issubdtype(kind, jnp.complexfloating):
-            raise ValueError(f"{name} of {where} returns complex numbers; real ones are needed")
+        what = f"{name} of {where}"
+        found = _traced(plant, name, arguments, what)
+        if name == "delay" and found is None:
+            continue
+        needed = f"one array of shape ({count},) is needed, such as jnp.stack([...])"
+        if not hasattr(found, "shape"):
+            kind = "None" if found is None else f"a {type(found).__name__}"
+            raise ValueError(f"{what} returns {kind}; {needed}")
+        if found.shape != (count,):
+            raise ValueError(f"{what} returns shape {found.shape}; {needed}")
+        if jnp.issubdtype(found.dtype, jnp.complexfloating):
+            raise ValueError(f"{what} returns complex numbers; real ones are needed")
+
+
+def _traced(plant: AbstractPlant, name: str, arguments: tuple[Any, ...], what: str) -> Any:
+    """What a function of a plant returns, where all numbers are traced as in a computation."""
+    values = "a state, an input, a parameter or a constant"
+    try:
+        return eqx.filter_eval_shape(
+            lambda own, given: getattr(own, name)(*given), plant, arguments
+        )
+    except jax.errors.TracerBoolConversionError as error:
+        raise ValueError(
+            f"{what} branches on the value of {values} (if, while, and, or): "
+            "use jnp.where(condition, value, otherwise)"
+        ) from error
+    except (jax.errors.ConcretizationTypeError, jax.errors.TracerIntegerConversionError) as error:
+        raise ValueError(
+            f"{what} gives {values} to float, int or a function of math, which take no JAX values: "
+            "use jax.numpy, such as jnp.sin for math.sin"
+        ) from error
+    except jax.errors.TracerArrayConversionError as error:
+        raise ValueError(f"{what} uses NumPy: use jax.numpy (import jax.numpy as jnp)") from error
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # also sys.exit
+        raise _missing_name(plant, error, what) or ValueError(
+            f"{what} fails: {told(error)}"
+        ) from error
+
+
+def _missing_name(plant: AbstractPlant, error: BaseException, what: str) -> ValueError | None:
+    """The error for a parameter or constant that a plant does not have; None for another one."""
+    if not isinstance(error, AttributeError) or error.name is None:
+        return None
+    for kind, own, place in (
+        ("parameter", plant.nominal, "params"),
+        ("constant", plant.constants, "self.constants"),
+    ):
+        if isinstance(error.obj, type(own)):
+            return ValueError(f"{what}: {unknown(kind, error.name, own._fields or ['none'])}")
+        if isinstance(error.obj, AbstractPlant) and error.name in own._fields:
+            return ValueError(f"{what}: the {kind} self.{error.name} is {place}.{error.name}")
+    return None
 
 
 def require_inputs(plant: AbstractPlant) -> None:

@@ -90,6 +90,11 @@ def extended(plant: AbstractPlant, extensions: Sequence[str]) -> AbstractPlant:
     for word in extensions:
         found = [e.name for e in possible if word in (e.kind, e.name)]
         if len(found) != 1:
+            if option := _option_for(kind.definition, word):
+                raise ValueError(
+                    f"{word!r} is no extension of plant {kind.definition.name!r}, but the option "
+                    f"{option}"
+                )
             allowed = found or [e.name for e in possible]
             raise unknown(f"extension of plant {kind.definition.name!r}", word, allowed)
         if found[0] in chosen:
@@ -103,6 +108,14 @@ def extended(plant: AbstractPlant, extensions: Sequence[str]) -> AbstractPlant:
     own = {p.name: p.nominal for p in plant.definition.parameters}
     is_changed = any(made.definition.parameter(name).nominal != own[name] for name in own)
     return with_nominal(made, own) if is_changed else made
+
+
+def _option_for(d: PlantDescription, word: str) -> str | None:
+    """The option of `identify` for an effect that it names and that is no extension."""
+    hold, _, channel = word.partition("_")
+    if hold in ("constant", "linear") and channel in names_of(d.inputs):
+        return f"--hold-input {channel}={hold}"
+    return "--likelihood student" if word == "outliers" else None
 
 
 class Extended(AbstractPlant):

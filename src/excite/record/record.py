@@ -28,6 +28,7 @@ RECORD_KIND = "excite record"
 TEXT_ENDINGS = (".csv", ".txt", ".dat", ".tsv")
 READ_ENDINGS = (*TEXT_ENDINGS, ".mat", ".h5", ".hdf5", ".parquet", ".mcap", ".db3")
 WRONG_ENDING = f"experiment files end in {', '.join(READ_ENDINGS[:-1])} or {READ_ENDINGS[-1]}"
+_SPREADSHEETS = (".xlsx", ".xlsm", ".xlsb", ".xls", ".ods")
 _MAX_FILE, _MAX_SIDECAR = 2**29, 2**24  # bytes
 
 
@@ -189,6 +190,10 @@ def require_readable(path: Path) -> None:
             if not part.is_dir():
                 _require_readable_file(part)
         return
+    if path.suffix.lower() in _SPREADSHEETS:
+        raise ValueError(
+            f"{path}: spreadsheets are not read; save the sheet as CSV or Parquet (.csv, .parquet)"
+        )
     if path.suffix.lower() not in READ_ENDINGS:
         raise ValueError(f"{path}: {WRONG_ENDING}")
     _require_readable_file(path)
