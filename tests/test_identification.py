@@ -249,14 +249,14 @@ def test_a_sentence_names_the_held_parameter_and_where_it_was_held(decay):
 
 
 class Slow(AbstractPlant):
-    """A first-order lag, of which the search begins at ten times the sampling time."""
+    """A first-order lag, of which the search begins at five sampling times."""
 
     definition = PlantDescription(
         name="slow",
         states=(State("x", "m", scale=1.0),),
         inputs=(Input("u", "m", -2.0, 2.0, amplitude=1.0),),
-        outputs=(Output("x", "m", scale=1.0, noise_sd=0.05),),
-        parameters=(Parameter("gain", "1", 1.0), Parameter("tau", "s", 1.0)),
+        outputs=(Output("x", "m", scale=1.0, noise_sd=0.4),),
+        parameters=(Parameter("gain", "1", 1.0), Parameter("tau", "s", 0.5)),
         dt=0.1,
         substeps=16,
     )
@@ -269,12 +269,12 @@ class Slow(AbstractPlant):
 
 
 def test_an_unseen_parameter_is_not_held_where_it_ruins_the_fit():
-    record = record_of(Slow(), PRBS(clock=1), params=Slow().Params(0.8, 0.018), sidecar=False)
+    record = record_of(Slow(), PRBS(clock=1), params=Slow().Params(0.8, 0.012), sidecar=False)
     result = identify([record], Slow())
     assert result.held == ("tau",)
-    assert result.params["tau"] < 0.04
-    assert result.params["gain"] == pytest.approx(0.8, abs=0.02)
-    assert result.fitted[0].fit_percent["x"] > 90
+    assert result.params["tau"] < 0.05
+    assert result.params["gain"] == pytest.approx(0.8, abs=0.1)
+    assert result.fitted[0].fit_percent["x"] > 50
 
 
 def test_a_coarse_integration_is_told():
@@ -291,14 +291,21 @@ def test_a_coarse_integration_is_told():
 
 
 def test_an_interval_ends_at_a_parameters_bound_and_zero_is_told():
-    record = dataclasses.replace(free_decay(), outputs=free_decay().outputs[:12])
-    record = dataclasses.replace(record, time=record.time[:12], inputs=record.inputs[:12])
-    result = identify([record], PLANT, hold={"K_pu": 0.0125})
-    low = {name: ends[0] for name, ends in result.intervals.items() if name not in result.held}
-    assert min(low.values()) >= 0
-    lost = [name for name, value in low.items() if value == 0]
-    assert lost
-    assert any(s.startswith("the 95 % interval") and "zero" in s for s in result.verdict)
+    decay, hold = free_decay(), {"K_pu": 0.0125, "J_p": TRUTH["J_p"]}
+    noise = np.random.default_rng(3).normal(size=(7, 1))
+
+    def found(sd: float) -> Identification:
+        outputs = decay.outputs[::30] + sd * noise
+        return identify(
+            [Record(decay.time[::30], decay.inputs[::30], outputs, {})], PLANT, hold=hold
+        )
+
+    quiet = found(1e-4)
+    uncertain = 1.45 * quiet.params["D_p"] / quiet.std_error["D_p"]
+    result = found(1e-4 * uncertain)
+    assert result.held == ("J_p", "K_pu")
+    assert result.intervals["D_p"][0] == 0
+    assert "the 95 % interval of D_p includes zero" in result.verdict
 
 
 def test_a_held_parameter_is_null_in_json_but_for_its_value(decay):
