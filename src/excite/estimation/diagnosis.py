@@ -6,7 +6,7 @@ Everything here runs once, after a fit, on NumPy arrays; nothing is differentiat
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -18,6 +18,7 @@ from ..description import HALF_95
 _FEW = 15
 """Samples of a residual below which the fit itself correlates it too much to be tested."""
 _MOST_LAGS = 25  # of an autoregression
+_BLOCK = 2**13  # samples of a long record that are looked at together
 _STATIONARY = 0.999  # largest partial autocorrelation
 _LEAST = 1e-4  # of its inverse transfer function, where rounding leaves less
 _CORRECTIONS = 3  # of the autocovariances for what the fit took along
@@ -131,31 +132,71 @@ def _following(
     for residual, record in zip(residuals, signals, strict=True):
         centred, past = residual - residual.mean(), min(order, residual.size // 20)
         lags = min(num_lags, residual.size // 10)
-        own = _lagged(centred[:, None], past)
-        memory = np.linalg.lstsq(own[past:], centred[past:], rcond=None)[0]
-        white = (centred - own @ memory)[past + lags :]
-        before = _lagged(record, past).reshape(len(record), past, record.shape[1])
-        filtered = record - np.einsum("spi,p->si", before, memory)
-        regressors = _lagged(filtered, lags)[past + lags :]
-        if not regressors.size:
+        memory = _autoregression([centred], past, past)
+        white = _filtered(centred, memory)[past + lags :, None]
+        if not (white.size and lags and record.shape[1]):
             continue
-        left, sizes, _ = np.linalg.svd(regressors - regressors.mean(axis=0), full_matrices=False)
+        filtered = _filtered(record, memory)
+        rows = (
+            np.hstack([np.ones((len(own), 1)), own, white[before : before + len(own)]])
+            for before, own in _lagged(filtered, lags, past + lags)
+        )
+        triangle = _triangle(rows)[1:, 1:]
+        left, sizes, _ = np.linalg.svd(triangle[:-1, :-1])
         seen = left[:, sizes > 1e-6 * max(sizes[0], 1e-300)]
-        power = float(np.mean((white - white.mean()) ** 2))
+        power = float(np.var(white))
         if power > 0:
-            statistic += float(np.sum((seen.T @ white) ** 2)) / power
+            statistic += float(np.sum((seen.T @ triangle[:-1, -1]) ** 2)) / power
             degrees += seen.shape[1]
     return statistic, degrees
 
 
 def _lagged(
-    values: Float[np.ndarray, "sample part"], num_lags: int
-) -> Float[np.ndarray, "sample column"]:
-    """Values 1, 2, ... samples before each sample, side by side; zero before the first."""
+    values: Float[np.ndarray, "sample part"], num_lags: int, first: int
+) -> Iterator[tuple[int, Float[np.ndarray, "row column"]]]:
+    """Values 1, 2, ... samples before each sample from the first one on, side by side.
+
+    In blocks, each with the number of samples before it; values before the record are zero.
+    """
     padded = np.concatenate([np.zeros((num_lags, values.shape[1])), values])
-    starts = range(num_lags - 1, -1, -1)
-    columns = [padded[start : start + len(values)] for start in starts]
-    return np.concatenate(columns, axis=1) if columns else np.zeros((len(values), 0))
+    for k in range(first, len(values), _BLOCK):
+        stop = min(k + _BLOCK, len(values))
+        back = range(num_lags - 1, -1, -1)
+        columns = [padded[k + lag : stop + lag] for lag in back]
+        yield k - first, np.concatenate([np.zeros((stop - k, 0)), *columns], axis=1)
+
+
+def _triangle(blocks: Iterable[Float[np.ndarray, "row column"]]) -> Float[np.ndarray, "row column"]:
+    """Triangular factor of the blocks one below the other, as many rows as columns."""
+    triangle = np.zeros((0, 0))
+    for block in blocks:
+        triangle = np.linalg.qr(np.vstack([triangle.reshape(-1, block.shape[1]), block]), mode="r")
+    missing = triangle.shape[1] - len(triangle)
+    return np.vstack([triangle, np.zeros((missing, triangle.shape[1]))])
+
+
+def _autoregression(
+    residuals: Sequence[Float[np.ndarray, " _sample"]], order: int, first: int = 0
+) -> Float[np.ndarray, " lag"]:
+    """The autoregression that predicts residuals best from their own past.
+
+    From the samples from `first` on; what lies before a record counts as zero.
+    """
+    rows = (
+        np.hstack([own, r[first + before : first + before + len(own), None]])
+        for r in residuals
+        for before, own in _lagged(r[:, None], order, first)
+    )
+    triangle = _triangle(rows)
+    return np.linalg.lstsq(triangle[:, :-1], triangle[:, -1], rcond=None)[0]
+
+
+def _filtered(values: np.ndarray, memory: Float[np.ndarray, " lag"]) -> np.ndarray:
+    """What values do not follow from their own past by an autoregression."""
+    left = values.copy()
+    for lag, coefficient in enumerate(memory, 1):
+        left[lag:] -= coefficient * values[:-lag]
+    return left
 
 
 def innovations(residuals: Sequence[Float[np.ndarray, " _sample"]]) -> list[np.ndarray]:
@@ -163,10 +204,8 @@ def innovations(residuals: Sequence[Float[np.ndarray, " _sample"]]) -> list[np.n
 
     One autoregression, of order 10 at most, is fitted to all of them.
     """
-    order = min(10, sum(r.size for r in residuals) // 20)
-    past = [_lagged(r[:, None], order) for r in residuals]
-    memory = np.linalg.lstsq(np.concatenate(past), np.concatenate(residuals), rcond=None)[0]
-    return [r - own @ memory for r, own in zip(residuals, past, strict=True)]
+    memory = _autoregression(residuals, min(10, sum(r.size for r in residuals) // 20))
+    return [_filtered(r, memory) for r in residuals]
 
 
 def log_likelihood(

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
-
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -16,6 +15,7 @@ from .diagnosis import inverse_information
 from .nls import NLS
 
 _ENOUGH = 0.5  # standard errors by which an estimate may change with a finer integration
+_LONGEST = 5_000  # samples of an experiment that are integrated again
 _LEAST = 1e-4  # relative change that is told
 
 
@@ -30,16 +30,14 @@ def too_coarse(
     """A sentence where twice the Runge-Kutta steps would change an estimate noticeably.
 
     By the implicit function theorem an estimate changes by -(S' S)^-1 S' d, for sensitivities S
-    and a change d of the residual; no part of it is more than |d| standard errors.
+    and a change d of the residual; no part of it is more than |d| standard errors. With a long
+    record more steps may be needed, because its standard errors are smaller.
     """
     experiments, estimate, is_free = jax.device_put((experiments, estimate, free))
-    finer = plant.integrated_in(2 * plant.substeps)
-    sd = np.asarray(estimator.weights(plant, experiments, estimate))
-    noise = np.linalg.norm(np.asarray(estimate.residual) / sd) / math.sqrt(estimate.residual.size)
-    change = np.asarray(_residual(finer, experiments, estimate) - estimate.residual) / sd
-    if not np.linalg.norm(change) > _ENOUGH * noise:
+    part, estimate, change, noise = _changed(plant, experiments, estimator, estimate)
+    if not np.linalg.norm(change) > _ENOUGH * float(noise):
         return ()
-    S = np.asarray(estimator.sensitivity(plant, experiments, estimate, is_free)[0])
+    S = np.asarray(estimator.sensitivity(plant, part, estimate, is_free)[0])
     P = np.asarray(estimator.prior_information(plant, estimate, S.shape[-1], is_free))
     moves = inverse_information(S, P) @ np.einsum("etou,eto->u", S, change)
     d, values = plant.definition, map(float, estimate.params)
@@ -58,9 +56,26 @@ def too_coarse(
 
 
 @eqx.filter_jit
-def _residual(
-    plant: AbstractPlant, experiments: Experiments, estimate: Estimate
-) -> Float[Array, "experiment sample output"]:
-    """Measured minus simulated outputs."""
-    simulated = simulate_experiments(plant, estimate.params, experiments, estimate.initial_state)
-    return residual_of(experiments, simulated)
+def _changed(
+    plant: AbstractPlant, experiments: Experiments, estimator: NLS, estimate: Estimate
+) -> tuple[Experiments, Estimate, Float[Array, "experiment sample output"], Float[Array, ""]]:
+    """The change of the residual by twice the steps, and its own size, over the weights.
+
+    Of the first samples of each experiment, which tell as well as all, and which come first.
+    """
+    sd = estimator.weights(plant, experiments, estimate)[None, None]
+    noise = jnp.sqrt(jnp.mean((estimate.residual / sd) ** 2))
+    e, n = experiments, _LONGEST
+    part = Experiments(
+        inputs=e.inputs[:, : n - 1],
+        measured=e.measured[:, :n],
+        valid=e.valid[:, :n],
+        initial_state=e.initial_state,
+        initial_state_known=e.initial_state_known,
+        dt=None if e.dt is None else e.dt[:, : n - 1],
+        next_inputs=None if e.next_inputs is None else e.next_inputs[:, : n - 1],
+    )
+    estimate = eqx.tree_at(lambda x: x.residual, estimate, estimate.residual[:, :n])
+    finer = plant.integrated_in(2 * plant.substeps)
+    simulated = simulate_experiments(finer, estimate.params, part, estimate.initial_state)
+    return part, estimate, (residual_of(part, simulated) - estimate.residual) / sd, noise

@@ -16,6 +16,7 @@ import contextlib
 import copy
 import dataclasses
 import math
+import os
 from collections import namedtuple
 from collections.abc import Mapping
 from functools import cache
@@ -33,6 +34,10 @@ from .fields import floats
 # Estimation and information need double precision. Every computation imports this module,
 # so JAX is switched here and nowhere else.
 jax.config.update("jax_enable_x64", True)
+# The programs of this package have nothing to share among threads: handing work from one to the
+# next costs up to a third of a fit. XLA reads the size of its pool of threads when it begins.
+os.environ.setdefault("NPROC", "1")
+jax.config.update("jax_cpu_enable_async_dispatch", False)
 
 
 def require_double_precision() -> None:
@@ -64,7 +69,10 @@ class Sensor(eqx.Module):
     @property
     def sd(self) -> Float[Array, " output"]:
         """Standard deviation of one measurement; rounding counts as uniform noise."""
-        return jnp.sqrt(self.noise_sd**2 + self.resolution**2 / 12)
+        noise, step = self.noise_sd, self.resolution
+        if isinstance(noise, jax.core.Tracer) or isinstance(step, jax.core.Tracer):
+            return jnp.sqrt(noise**2 + step**2 / 12)
+        return floats(np.sqrt(np.square(noise) + np.square(step) / 12))  # compiles nothing
 
 
 if TYPE_CHECKING:
