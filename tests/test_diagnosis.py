@@ -9,6 +9,8 @@ from excite.estimation.diagnosis import (
     coloured_noise,
     correlation,
     fit_percent,
+    innovations,
+    input_dependence,
     ljung_box,
     mean_or_trend,
     misfit_factor,
@@ -147,18 +149,30 @@ def test_correlation_of_a_held_parameter_is_no_number():
 # An error of the structure
 
 
-def test_the_misfit_of_noise_is_one_and_that_of_a_wrong_structure_larger():
+def test_the_misfit_of_noise_is_small_and_that_of_a_wrong_structure_as_expected():
     rng = np.random.default_rng(7)
     signals, noise = rng.normal(size=(2000, 2)), rng.normal(size=2000)
     coloured = np.convolve(noise, [1.0, 0.8, 0.6, 0.3])[:2000]
     for own in (noise, coloured):
-        factor = misfit_factor([[own]], [[signals]], 2)
-        assert 1 <= factor < 1.6
+        assert misfit_factor([own], [signals], 2) < 1.6
     follows = noise + 0.2 * np.roll(signals[:, 0], 1)
     # Of four directions one has 0.04 * 2000 more than the variance of the noise.
     expected = np.sqrt(1 + 0.04 * 2000 / 4 / 1.04)
-    assert misfit_factor([[follows]], [[signals]], 2) == pytest.approx(expected, rel=0.3)
-    assert misfit_factor([[]], [[]], 2) == 1
+    factor = misfit_factor([follows], [signals], 2)
+    assert factor == pytest.approx(expected, rel=0.3)
+    assert misfit_factor([follows], [signals * [1e5, 1e-5]], 2) == pytest.approx(factor)
+    assert misfit_factor([], [], 2) == 1
+
+
+def test_a_long_residual_is_tested_block_by_block(monkeypatch):
+    rng = np.random.default_rng(8)
+    residual, inputs = np.cumsum(rng.normal(size=3001)), rng.normal(size=(3001, 2))
+    whole = input_dependence([residual], [inputs])
+    errors = innovations([residual])[0]
+    monkeypatch.setattr("excite.estimation.diagnosis._BLOCK", 500)
+    assert input_dependence([residual], [inputs]) == pytest.approx(whole, rel=1e-9)
+    np.testing.assert_allclose(innovations([residual])[0], errors, atol=1e-9)
+    assert innovations([np.zeros(0)])[0].size == 0
 
 
 # What the data cannot see

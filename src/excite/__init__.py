@@ -11,12 +11,17 @@ when they are first used: `import excite` alone costs nothing, and loads neither
 The package computes in double precision, which it switches on when a plant is first used.
 """
 
+import os
 import sys
 from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING
 
 __version__ = "0.1.0"
+
+# Threads of XLA, which reads this when JAX first computes. The programs of this package have
+# nothing to share among them: handing work over would cost a fifth of a fit.
+os.environ.setdefault("NPROC", "1")
 
 _PLACES = {
     # verbs

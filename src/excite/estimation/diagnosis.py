@@ -99,13 +99,13 @@ def input_dependence(
 
 
 def misfit_factor(
-    residuals: Sequence[Sequence[Float[np.ndarray, " _sample"]]],
-    signals: Sequence[Sequence[Float[np.ndarray, "_sample signal"]]],
+    residuals: Sequence[Float[np.ndarray, " _sample"]],
+    signals: Sequence[Float[np.ndarray, "_sample signal"]],
     num_lags: int,
 ) -> float:
     """How much wider than noise an error of the structure makes intervals; at least 1.
 
-    The residual of each output, in some records, is filtered as in `input_dependence`, and
+    The residuals of an output in some records are filtered as in `input_dependence`, and
     projected on the past of signals that follow from the inputs, such as simulated outputs. Noise
     has its own variance in each of these directions. An error of the structure has more; what
     the estimates took of it cannot be seen, and is taken to be as large as in the mean of them.
@@ -113,9 +113,8 @@ def misfit_factor(
     Args:
         num_lags: past samples; as many as the plant has states determine its next output.
     """
-    found = [_following(*own, num_lags) for own in zip(residuals, signals, strict=True)]
-    degrees = sum(count for _, count in found)
-    return math.sqrt(max(sum(own for own, _ in found) / degrees, 1.0)) if degrees else 1.0
+    statistic, degrees = _following(residuals, signals, num_lags)
+    return math.sqrt(max(statistic / degrees, 1.0)) if degrees else 1.0
 
 
 def _following(
@@ -142,7 +141,9 @@ def _following(
             for before, own in _lagged(filtered, lags, past + lags)
         )
         triangle = _triangle(rows)[1:, 1:]
-        left, sizes, _ = np.linalg.svd(triangle[:-1, :-1])
+        regressors = triangle[:-1, :-1]
+        lengths = np.linalg.norm(regressors, axis=0)
+        left, sizes, _ = np.linalg.svd(regressors / np.where(lengths > 0, lengths, 1.0))
         seen = left[:, sizes > 1e-6 * max(sizes[0], 1e-300)]
         power = float(np.var(white))
         if power > 0:
@@ -188,6 +189,8 @@ def _autoregression(
         for before, own in _lagged(r[:, None], order, first)
     )
     triangle = _triangle(rows)
+    if not triangle.size:
+        return np.zeros(order)
     return np.linalg.lstsq(triangle[:, :-1], triangle[:, -1], rcond=None)[0]
 
 
@@ -218,7 +221,7 @@ def log_likelihood(
     total = 0.0
     for parts in residuals:
         errors = innovations(parts) if whiten else parts
-        count = sum(map(len, errors))
+        count = max(sum(map(len, errors)), 1)
         variance = max(sum(float(r @ r) for r in errors) / count, 1e-300)
         total -= count * (math.log(2 * math.pi * variance) + 1) / 2
     return total

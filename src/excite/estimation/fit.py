@@ -23,7 +23,7 @@ from .contract import (
     quality,
     to_search,
 )
-from .diagnosis import mean_or_trend, whiteness_of
+from .diagnosis import is_more_than_rounding, mean_or_trend, whiteness_of
 from .held import structure_of
 from .nls import NLS
 from .pem import PEM
@@ -117,7 +117,7 @@ def _fit_seen(
     """Fits; holds a parameter that ends at a bound or is not identifiable, and fits again."""
     names = names_of(plant.definition.parameters)
     known = known_parameters(plant, estimator)
-    free, reasons = ~known, {}
+    begin, free, reasons = start, ~known, {}
     found = _estimate(plant, experiments, estimator, start, free, progress)
     first = Fit(found[0], free, known, reasons, found[1:])
     while True:
@@ -130,7 +130,7 @@ def _fit_seen(
             return fit
         chosen, why, bound = held
         name, ended = names[chosen], found[0]
-        value = float(start[chosen]) if bound is None else bound
+        value = float(begin[chosen]) if bound is None else bound
         start, last = (params._replace(**{name: floats(value)}) for params in (start, ended.params))
         free = free & (np.arange(len(names)) != chosen)
         if not free.any():
@@ -142,11 +142,14 @@ def _fit_seen(
             lost = [f"{STRUCTURALLY_NOT}: {group.sentence}" for group in groups]
             raise NothingLeftError("; ".join([*lost, NOTHING_SEEN]), first)
         found = _estimate(plant, experiments, estimator, start, free, progress, [last])
-        if bound is None and _fits_worse(found[0], ended) and _is_near(plant, chosen, value, ended):
-            start, value = ended.params, float(ended.params[chosen])
-            found = _estimate(plant, experiments, estimator, start, free, progress, [])
-        why = why if bound is not None else f"{why}; {name} was held at {value:g}"
-        reasons = {**reasons, name: why}
+        contradicts = ""
+        if bound is None and _fits_worse(plant, found[0], ended):
+            contradicts = ", which contradicts the data (--start)"
+            if _is_near(plant, chosen, value, ended):
+                start, value, contradicts = ended.params, float(ended.params[chosen]), ""
+                found = _estimate(plant, experiments, estimator, start, free, progress, [])
+        held_at = "" if bound is not None else f"; {name} was held at {value:g}{contradicts}"
+        reasons = {**reasons, name: why + held_at}
 
 
 def _estimate(
@@ -245,10 +248,20 @@ def _to_hold(plant: AbstractPlant, fit: Fit) -> tuple[int, str, float | None] | 
     return None if unseen is None else (*unseen, None)
 
 
-def _fits_worse(estimate: Estimate, other: Estimate) -> bool:
-    """Whether a fit with one free parameter less is worse than the other by more than chance."""
+def _fits_worse(plant: AbstractPlant, estimate: Estimate, other: Estimate) -> bool:
+    """Whether a fit with one free parameter less is worse than the other by more than chance.
+
+    Fits that leave nothing but rounding are alike.
+    """
+    growth, residual = float(estimate.cost) - float(other.cost), np.asarray(estimate.residual)
+    if estimate.prediction is not None:  # the cost is minus the logarithm of the likelihood
+        return not growth < _MORE_THAN_CHANCE / 2
     noise = float(other.cost) / max(np.count_nonzero(other.residual), 1)
-    return not float(estimate.cost) - float(other.cost) < _MORE_THAN_CHANCE * noise
+    is_seen = any(
+        not np.all(np.isfinite(own)) or is_more_than_rounding(own, part.scale)
+        for own, part in zip(np.moveaxis(residual, 2, 0), plant.definition.outputs, strict=True)
+    )
+    return is_seen and not growth < _MORE_THAN_CHANCE * noise
 
 
 def _is_near(plant: AbstractPlant, index: int, start: float, estimate: Estimate) -> bool:

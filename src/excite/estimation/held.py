@@ -44,19 +44,19 @@ def told_of_held(
     known: Bool[np.ndarray, " param"],
     names: Sequence[str],
 ) -> tuple[str, ...]:
-    """A sentence on each held parameter, in the order of `names`, that is not held at a bound.
+    """A sentence on each parameter of `names` that is not held at a bound, in their order.
 
     Whether it is structurally not identifiable or practically not, with those before it known,
     and how the other estimates move if its value is wrong: by the implicit function theorem,
     d theta = -(S' S)^-1 S' s for sensitivities S of what was estimated and s of the parameter.
     """
     parameters, params = plant.definition.parameters, estimate.params
-    held = [
-        i
-        for i in map(params._fields.index, names)
-        if bound_reached(plant.definition, _with(plant.nominal, i, params[i])) is None
+    held = [params._fields.index(name) for name in names]
+    at_bound = [
+        bound_reached(plant.definition, _with(plant.nominal, i, params[i])) is not None
+        for i in held
     ]
-    if not held:
+    if all(at_bound):
         return ()
     given = jax.device_put((plant, experiments, estimate))
     own = estimator if isinstance(estimator, NLS) else NLS()
@@ -68,10 +68,11 @@ def told_of_held(
     effects = -(inverse @ rows)[: free.sum()]
     others = [p for p, is_free in zip(parameters, free, strict=True) if is_free]
     told = []
-    for i, effect in zip(held, effects.T, strict=True):
-        why = _why(parameters[i].name, structure_of(plant, experiments, params, known))
+    for i, is_at_bound, effect in zip(held, at_bound, effects.T, strict=True):
+        if not is_at_bound:
+            why = _why(parameters[i].name, structure_of(plant, experiments, params, known))
+            told.append(f"{why}; {_cost(parameters[i], others, effect)}")
         known = known | (np.arange(len(known)) == i)
-        told.append(f"{why}; {_cost(parameters[i], others, effect)}")
     return tuple(told)
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from ..description import RARE, Named, PlantDescription, listed, names_of, unknown, wrong_type
 from ..files import json_ready
-from ..information.identifiability import identifiability
+from ..information.identifiability import UNSEEN_SD, identifiability
 from ..plant import AbstractPlant, Params, params_from
 from ..plant.catalogue import PLANTS, PlantLike, plant_from
 from ..plant.extension import plain_kind
@@ -38,6 +38,7 @@ from .diagnosis import (
     effect_of_constants,
     half_95,
     input_dependence,
+    inverse_information,
     is_more_than_rounding,
     misfit_factor,
     robust_covariance,
@@ -241,22 +242,21 @@ def identify(
         for i, name in enumerate(names_of(plant.definition.outputs))
     }
     structure = {
-        name: input_dependence(*_seen(residual, records, i, plant.definition.outputs[i].scale))
-        for i, name in enumerate(whiteness)
+        part.name: input_dependence(*_residual_and_signals(records, residual, i, part.scale))
+        for i, part in enumerate(plant.definition.outputs)
     }
     wrong = [n for n, p in structure.items() if p < RARE / len(structure)] * fit.is_successful
-    factor = _misfit(plant, residual, records, fitted) if wrong else 1.0
+    factor = _misfit(plant, records, residual, fitted) if wrong else 1.0
     covariance, degrees, verdict = _confidence(
         plant, experiments, estimator, fit, whiteness, uncertain_sd, factor
     )
-    told = factor if intervals == "linear" else 1.0
-    wrong = _wrong_structure(wrong, told, estimator)
     others = (
         *(s for record in [*records, *validation] for s in _other_plant(record, plant)),
         *given_twice(records, validation),
     )
+    wrong = _wrong_structure(wrong, factor, estimator)
     large = _above_declared(plant, fit) if fit.is_successful else ()
-    astray = _simulates_poorly(fitted) if isinstance(estimator, PEM) else ()
+    astray = _simulates_poorly(fitted) if fit.is_successful and isinstance(estimator, PEM) else ()
     remedies = *_remedies(found), *where
     verdict = (*others, *wrong, *large, *astray, *remedies, *_agreement(fit), *verdict)
     names = names_of(plant.definition.parameters)
@@ -264,9 +264,10 @@ def identify(
     sd = np.where(fit.free, np.sqrt(np.maximum(np.diag(covariance), 0.0)), np.nan)
     half = np.where(fit.free, half_95(covariance, degrees), np.nan)
     if isinstance(estimator, NLS) and fit.is_successful:
-        coarse = too_coarse(plant, experiments, estimator, fit.estimate, fit.free, sd)
+        coarse = too_coarse(plant, experiments, fit.estimate, fit.free, sd)
         verdict = (*coarse, *verdict)
-    ends = within_support(plant, np.stack([values - half, values + half], axis=1))
+    ends = np.stack([values - half, values + half], axis=1)
+    ends = within_support(plant, ends) if fit.is_successful else ends
     if isinstance(estimator, AbstractSearch):  # others can be biased as much
         verdict = (*_far_from_expected(plant, begin, fit.free, values, ends), *verdict)
     profiles = {}
@@ -294,6 +295,7 @@ def identify(
         information=np.asarray(fit.estimate.information),
         whiteness=whiteness,
         structure=structure,
+        misfit_factor=factor,
         verdict=verdict,
         suspects=found,
         fitted=fitted,
@@ -473,7 +475,7 @@ def _confidence(
 ) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
     """Covariance of the estimates, its degrees of freedom, and the sentences of the verdict.
 
-    An error of the structure widens the intervals by a factor.
+    An error of the structure widens what the data tell by a factor, and not what a prior tells.
     """
     names = names_of(plant.definition.parameters)
     covariance, its = np.asarray(fit.estimate.covariance), fit.estimate.degrees
@@ -482,43 +484,37 @@ def _confidence(
         sentence = Status(int(fit.estimate.status)).sentence
         needed = f"; {estimator.name} needs {estimator.needs}" if estimator.needs else ""
         return covariance, degrees, (*fit.reasons.values(), sentence + needed)
-    parameters = zip(plant.definition.parameters, fit.estimate.params, strict=True)
-    size = np.array([float(value) if p.positive else p.scale for p, value in parameters])
     coloured, remarks = [name for name, p in whiteness.items() if p < RARE], []
     not_white = f"the residual of {' and '.join(coloured)} is not white: the intervals"
-    S = residual = prior = np.zeros(0)
-    if isinstance(estimator, NLS) and (coloured or uncertain.any()):
+    but = "" if factor > 1 else ", not for an error in the plant's equations"
+    parameters = zip(plant.definition.parameters, fit.estimate.params, strict=True)
+    size = np.array([float(value) if p.positive else p.scale for p, value in parameters])
+    if not isinstance(estimator, NLS):
+        covariance = factor**2 * covariance
+        if coloured:
+            remarks.append(f"{not_white} assume white noise, and are too narrow")
+    elif coloured or uncertain.any() or factor > 1:
         estimate, free = jax.device_put((fit.estimate, fit.free))
         S, residual = map(np.asarray, estimator.sensitivity(plant, experiments, estimate, free))
         prior = np.asarray(estimator.prior_information(plant, estimate, S.shape[-1], free))
-    if coloured and isinstance(estimator, NLS):
-        robust, its = robust_covariance(S, residual, np.asarray(experiments.valid), prior)
-        robust = np.outer(size, size) * robust[: len(names), : len(names)]
-        is_wider = np.diag(robust) > np.diag(covariance)
-        degrees = np.where(is_wider, its[: len(names)], degrees)
-        covariance = widened(covariance, robust)
-        but = "" if factor > 1 else ", not for an error in the plant's equations"
-        remarks.append(f"{not_white} allow for coloured noise{but}")
-    elif coloured:
-        remarks.append(f"{not_white} assume white noise, and are too narrow")
-    covariance = factor**2 * covariance
-    if isinstance(estimator, NLS) and uncertain.any():
-        estimate = jax.device_put(fit.estimate)
-        to_constants = np.asarray(estimator.constant_sensitivity(plant, experiments, estimate))
-        effect = effect_of_constants(S, to_constants, prior)[: len(names)] * uncertain[None]
-        effect = effect * size[:, None]
-        covariance, degrees = with_independent(covariance, degrees, effect @ effect.T)
-        remarks.append(
-            f"the intervals include the standard deviation of {_sd_in_words(plant, uncertain)}"
-        )
-    half = half_95(covariance, degrees)
-    is_told = fit.free & (half < np.abs([float(value) for value in fit.estimate.params]))
-    seen = []
-    if is_told.any():
-        seen.append(identifiability(names, covariance / np.outer(size, size), is_told))
-    if lost := [n for n, is_lost in zip(names, fit.free & ~is_told, strict=True) if is_lost]:
-        includes = "intervals of {} include" if len(lost) > 1 else "interval of {} includes"
-        seen.append(f"the 95 % {includes.format(listed(lost))} zero")
+        if coloured:
+            robust, its = robust_covariance(S, residual, np.asarray(experiments.valid), prior)
+            robust = np.outer(size, size) * robust[: len(names), : len(names)]
+            is_wider = np.diag(robust) > np.diag(covariance)
+            degrees = np.where(is_wider, its[: len(names)], degrees)
+            covariance = widened(covariance, robust)
+            remarks.append(f"{not_white} allow for coloured noise{but}")
+        inverse = inverse_information(S, prior)
+        known = (inverse @ prior @ inverse)[: len(names), : len(names)] * np.outer(size, size)
+        covariance = factor**2 * (covariance - known) + known
+        if uncertain.any():
+            to_constants = np.asarray(estimator.constant_sensitivity(plant, experiments, estimate))
+            effect = effect_of_constants(S, to_constants, prior)[: len(names)] * uncertain[None]
+            effect = effect * size[:, None]
+            covariance, degrees = with_independent(covariance, degrees, effect @ effect.T)
+            remarks.append(
+                f"the intervals include the standard deviation of {_sd_in_words(plant, uncertain)}"
+            )
     if isinstance(estimator, NLS) and estimator.prior is not None:
         values = dict(zip(names, map(float, fit.estimate.params), strict=True))
         sd = dict(zip(names, np.sqrt(np.diag(np.asarray(fit.estimate.covariance))), strict=True))
@@ -526,7 +522,22 @@ def _confidence(
     held = told_of_held(
         plant, experiments, estimator, fit.estimate, fit.free, fit.known, tuple(fit.reasons)
     )
+    seen = _certainty(names, covariance / np.outer(size, size), fit.free)
     return covariance, degrees, (*fit.reasons.values(), *held, *seen, *remarks)
+
+
+def _certainty(names: tuple[str, ...], covariance: np.ndarray, free: np.ndarray) -> tuple[str, ...]:
+    """Sentences on the certainty of the free parameters by their relative covariance.
+
+    With intervals that are wider than those of white noise, some may be as uncertain as what is not
+    identifiable.
+    """
+    is_told = free & (np.diag(covariance) < UNSEEN_SD**2)
+    lost = [name for name, is_lost in zip(names, free & ~is_told, strict=True) if is_lost]
+    told = [identifiability(names, covariance, is_told)] if is_told.any() else []
+    if lost:
+        told.append(f"{listed(lost)}: standard error above {100 * UNSEEN_SD:.0f} %")
+    return tuple(told)
 
 
 def _sd_in_words(plant: AbstractPlant, uncertain: np.ndarray) -> str:
@@ -545,20 +556,23 @@ def _noise(description: PlantDescription, estimate: Estimate) -> Noise | None:
     return Noise(dict(of_states), dict(of_outputs))
 
 
-def _seen(
-    residual: Sequence[np.ndarray],
+def _residual_and_signals(
     records: Sequence[Record],
+    residual: Sequence[np.ndarray],
     output: int,
     scale: float,
     simulated: Sequence[np.ndarray] | None = None,
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Residuals of an output that are more than rounding, and the inputs at the same times.
+    """By record, residuals of an output that are more than rounding, and the inputs beside them.
 
-    The simulated outputs, where they are given, stand beside the inputs.
+    Simulated outputs, where they are given, are signals, too.
     """
     signals = [record.inputs for record in records]
     if simulated is not None:
-        signals = [np.hstack(both) for both in zip(signals, simulated, strict=True)]
+        signals = [
+            np.hstack([record.inputs, _between(record.time, outputs)])
+            for record, outputs in zip(records, simulated, strict=True)
+        ]
     pairs = [
         (r[seen, output], rows[seen])
         for r, rows in zip(residual, signals, strict=True)
@@ -568,20 +582,29 @@ def _seen(
     return [r for r, _ in pairs], [rows for _, rows in pairs]
 
 
+def _between(
+    time: Float[np.ndarray, " sample"], values: Float[np.ndarray, "sample output"]
+) -> Float[np.ndarray, "sample output"]:
+    """Values with those that are missing interpolated."""
+    filled = np.zeros_like(values)
+    for i, seen in enumerate(np.isfinite(values).T):
+        if seen.any():
+            filled[:, i] = np.interp(time, time[seen], values[seen, i])
+    return filled
+
+
 def _misfit(
     plant: AbstractPlant,
-    residual: Sequence[np.ndarray],
     records: Sequence[Record],
+    residual: Sequence[np.ndarray],
     fitted: Sequence[Fitted],
 ) -> float:
     """How much wider than noise an error of the structure makes intervals."""
-    simulated = [record.simulated for record in fitted]
-    found = [
-        _seen(residual, records, i, part.scale, simulated)
+    simulated, num_lags = [record.simulated for record in fitted], len(plant.definition.states)
+    return max(
+        misfit_factor(*_residual_and_signals(records, residual, i, part.scale, simulated), num_lags)
         for i, part in enumerate(plant.definition.outputs)
-    ]
-    residuals, signals = zip(*found, strict=True)
-    return misfit_factor(residuals, signals, len(plant.definition.states))
+    )
 
 
 def _wrong_structure(

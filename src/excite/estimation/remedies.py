@@ -63,7 +63,7 @@ _HUGE = 1e30
 _BOUND = 20.0  # the search coordinate of a parameter at its bound, which is infinite
 _FREEDOMS = 2.0, 3.0, 4.0, 6.0, 10.0, 20.0  # of Student's t for outliers
 _FAR = 4.0  # standard deviations, told by the median, beyond which a sample is an outlier
-_SIMPLER = 1.05  # advantage of a cause without a parameter
+_SIMPLER = 1.05  # advantage of the other hold over a delay
 _MUCH = 0.1  # part of a coloured residual that a likely cause explains
 
 
@@ -203,8 +203,8 @@ class Question:
         """Those that explain more than chance, the likeliest first.
 
         What a plant leaves out has heavy tails, too: of a coloured residual outliers are a cause
-        only where no effect explains much. The other hold is as good as a delay of half a sample,
-        and needs no parameter.
+        only where no effect explains much. A delay of half a sample is as good as the other hold,
+        which needs no parameter and is named first where the two are alike.
         """
         likely = [s for s in found if s.log_likelihood > 0 and s.p_value * self.num_tests <= RARE]
         parts, outputs = _parts(before, valid), self.plant.definition.outputs
@@ -213,11 +213,16 @@ class Question:
         )
 
         def rank(s: Suspect) -> tuple[bool, float]:
-            simplicity = _SIMPLER if s.name.startswith(HOLDS) else 1.0
             explains_little = is_coloured and not s.reduction > _MUCH
-            return explains_little, -simplicity * s.evidence(int(valid.sum()))
+            return explains_little, -s.evidence(int(valid.sum()))
 
-        return tuple(sorted(likely, key=rank))
+        ranked = sorted(likely, key=rank)
+        holds = [s for s in ranked if s.name.startswith(HOLDS)]
+        if holds and ranked[0].name.startswith("delay_"):
+            delay, hold = (s.evidence(int(valid.sum())) for s in (ranked[0], holds[0]))
+            if _SIMPLER * hold > delay:
+                ranked = [holds[0], *(s for s in ranked if s is not holds[0])]
+        return tuple(ranked)
 
 
 Told = Callable[[str, float, float], None]
@@ -589,7 +594,7 @@ def outliers(residual: Residual, valid: np.ndarray) -> Suspect | None:
     p = chi2_tail(residual.shape[2], 2 * gained)
     if p > RARE or not count:
         return None
-    far = f"{count} of {int(valid.sum())} samples are more than {_FAR:g} robust standard deviations"
+    far = f"{count} of {int(valid.sum())} values are more than {_FAR:g} robust standard deviations"
     remedy = f"{far} off: --likelihood student"
     return Suspect("outliers", None, None, "", math.nan, gained, p, remedy)
 

@@ -106,12 +106,14 @@ class Identification:
         params, std_error: by parameter, in its unit, as attribute or item; the error of a held
             one is nan.
         intervals: 95 % interval of each parameter.
-        held: parameters not estimated: not identifiable and held at their start value, or
-            held at a bound that they reached.
-        covariance, information: of the estimates; see `excite.estimation.Estimate`.
+        held: parameters not estimated: not identifiable, or held at a bound that they reached.
+        covariance, information: of the estimates; see `excite.estimation.Estimate`. The covariance,
+            and with it the errors, allow for coloured noise and for an error of the structure.
         whiteness: by output, p-value of the residual being white (Ljung-Box); with `pem` the
             residual is the error of the one-step prediction.
         structure: by output, p-value of the residual not following past inputs.
+        misfit_factor: by which errors and intervals are wider because a residual follows the input;
+            1 where none does.
         verdict: sentences on identifiability and on the validity of the intervals.
         suspects: what the plant may leave out, the likeliest first; see `Suspect`.
         fitted, validation: records and their simulation.
@@ -135,6 +137,7 @@ class Identification:
     information: Float[np.ndarray, "param param"]
     whiteness: Mapping[str, float]
     structure: Mapping[str, float]
+    misfit_factor: float
     verdict: tuple[str, ...]
     suspects: tuple[Suspect, ...]
     fitted: tuple[Fitted, ...]
@@ -158,8 +161,8 @@ class Identification:
         """95 % interval of a parameter: estimate ± t standard errors, or by profile likelihood.
 
         t is 1.96 where the noise is known; where its size is estimated from the residual, it is
-        that of Student's distribution. No interval leaves a uniform prior. An end where a profile
-        stays open is infinite.
+        that of Student's distribution. No interval leaves a parameter's bounds or its uniform
+        prior. An end where a profile stays open is infinite.
         """
         return self.intervals[name]
 
@@ -331,6 +334,7 @@ class Identification:
             "correlation": correlation(self.covariance),
             "whiteness_p_value": dict(self.whiteness),
             "structure_p_value": dict(self.structure),
+            "misfit_factor": self.misfit_factor,
             "verdict": list(self.verdict),
             "prediction_fit_percent": self.prediction_fit(),
             "process_noise": None if self.noise is None else dict(self.noise.process),

@@ -424,7 +424,7 @@ def worst_seen(
     if value * UNSEEN_SD**2 >= 1:
         return None
     involved = [names[i] for i, v in zip(index, direction, strict=True) if abs(v) > 0.3]
-    chosen = int(index[_told_best(block, direction)])
+    chosen = int(index[_best_to_hold(block, direction)])
     if len(involved) == 1:
         kind = PRACTICALLY_NOT if is_planned else "not identifiable from the data"
         return chosen, f"{names[chosen]} is {kind}"
@@ -439,7 +439,7 @@ def worst_seen(
     return chosen, f"{' and '.join(involved)} are {kind}: {combination} is undetermined"
 
 
-def _told_best(
+def _best_to_hold(
     information: Float[np.ndarray, "param param"], direction: Float[np.ndarray, " param"]
 ) -> int:
     """Which parameter of an undetermined direction, once held, makes the others most certain."""
@@ -448,8 +448,9 @@ def _told_best(
     if len(alike) == 1 or not np.all(np.isfinite(information)):
         return int(np.argmax(size))
     rest = [np.delete(np.delete(information, i, 0), i, 1) for i in alike]
-    least = [float(np.linalg.eigvalsh(block)[0]) if block.size else 0.0 for block in rest]
-    equal = [i for i, value in zip(alike, least, strict=True) if value > _ALIKE * max(least)]
+    rounding = UNDETERMINED * float(np.abs(information).max())
+    least = [max(np.linalg.eigvalsh(block)[0], rounding) if block.size else 0.0 for block in rest]
+    equal = [i for i, value in zip(alike, least, strict=True) if value >= _ALIKE * max(least)]
     return int(max(equal or alike, key=lambda i: size[i]))
 
 

@@ -16,7 +16,6 @@ import contextlib
 import copy
 import dataclasses
 import math
-import os
 from collections import namedtuple
 from collections.abc import Mapping
 from functools import cache
@@ -32,11 +31,9 @@ from ..description import Parameter, PlantDescription, names_of, unknown, wrong_
 from .fields import floats
 
 # Estimation and information need double precision. Every computation imports this module,
-# so JAX is switched here and nowhere else.
+# so JAX is switched here and nowhere else; processes of a pool are told before they start.
 jax.config.update("jax_enable_x64", True)
-# The programs of this package have nothing to share among threads: handing work from one to the
-# next costs up to a third of a fit. XLA reads the size of its pool of threads when it begins.
-os.environ.setdefault("NPROC", "1")
+# Handing a program over to another thread would cost up to a third of a short fit.
 jax.config.update("jax_cpu_enable_async_dispatch", False)
 
 
@@ -69,10 +66,9 @@ class Sensor(eqx.Module):
     @property
     def sd(self) -> Float[Array, " output"]:
         """Standard deviation of one measurement; rounding counts as uniform noise."""
-        noise, step = self.noise_sd, self.resolution
-        if isinstance(noise, jax.core.Tracer) or isinstance(step, jax.core.Tracer):
-            return jnp.sqrt(noise**2 + step**2 / 12)
-        return floats(np.sqrt(np.square(noise) + np.square(step) / 12))  # compiles nothing
+        parts = self.noise_sd, self.resolution
+        xp = jnp if any(isinstance(part, jax.core.Tracer) for part in parts) else np
+        return floats(xp.sqrt(xp.square(parts[0]) + xp.square(parts[1]) / 12))
 
 
 if TYPE_CHECKING:

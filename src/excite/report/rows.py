@@ -334,6 +334,7 @@ class EstimateSummary(Saved):
     correlation: tuple[tuple[Number, ...], ...]
     whiteness_p_value: dict[str, Number]
     structure_p_value: dict[str, Number]
+    misfit_factor: Number = 1.0
     verdict: tuple[str, ...]
     prediction_fit_percent: dict[str, Number] | None = None
     process_noise: dict[str, Number] | None = None
