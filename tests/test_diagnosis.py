@@ -151,17 +151,28 @@ def test_correlation_of_a_held_parameter_is_no_number():
 
 def test_the_misfit_of_noise_is_small_and_that_of_a_wrong_structure_as_expected():
     rng = np.random.default_rng(7)
-    signals, noise = rng.normal(size=(2000, 2)), rng.normal(size=2000)
-    coloured = np.convolve(noise, [1.0, 0.8, 0.6, 0.3])[:2000]
-    for own in (noise, coloured):
-        assert misfit_factor([own], [signals], 2) < 1.6
-    follows = noise + 0.2 * np.roll(signals[:, 0], 1)
-    # Of four directions one has 0.04 * 2000 more than the variance of the noise.
-    expected = np.sqrt(1 + 0.04 * 2000 / 4 / 1.04)
-    factor = misfit_factor([follows], [signals], 2)
-    assert factor == pytest.approx(expected, rel=0.3)
-    assert misfit_factor([follows], [signals * [1e5, 1e-5]], 2) == pytest.approx(factor)
-    assert misfit_factor([], [], 2) == 1
+    signals, white = rng.normal(size=(1, 2000, 2)), rng.normal(size=(1, 2000, 1))
+    S, valid = rng.normal(size=(1, 2000, 1, 1)), np.ones((1, 2000, 1), bool)
+    coloured = autoregressive(rng, (1, 2000), 0.9)[..., None]
+    for noise in (white, coloured):
+        assert misfit_factor(S, noise, valid, signals, 2) < 1.8
+    follows = white + 0.2 * np.roll(signals[:, :, :1], 1, axis=1)
+    factor = misfit_factor(S, follows, valid, signals, 2)
+    # Of five directions, one of them the mean, one has 0.04 * 2000 more than noise has.
+    assert factor == pytest.approx(np.sqrt(1 + 0.04 * 2000 / 5 / 1.04), rel=0.3)
+    other_units = signals * np.array([1e5, 1e-5])
+    assert misfit_factor(S, follows, valid, other_units, 2) == pytest.approx(factor)
+    quiet = np.concatenate([follows, white], axis=2)
+    both = np.concatenate([S, np.zeros_like(S)], axis=2), quiet, np.tile(valid, (1, 1, 2))
+    assert misfit_factor(*both, signals, 2) == pytest.approx(factor, rel=0.05)
+
+
+def test_autocovariances_of_no_process_end_the_recursion():
+    """Those of a smooth residual are not exactly those of a process."""
+    smooth = np.cos(0.05 * np.arange(30))
+    smooth[3:] *= 1.02
+    found = Autoregression.of(smooth, 1000.0)
+    assert found.variance > 1e-9
 
 
 def test_a_long_residual_is_tested_block_by_block(monkeypatch):

@@ -86,6 +86,7 @@ def input_dependence(
     residuals: Sequence[Float[np.ndarray, " _sample"]],
     inputs: Sequence[Float[np.ndarray, "_sample input"]],
     num_lags: int = 20,
+    order: int = 10,
 ) -> float:
     """p-value of the hypothesis that the residuals of some records do not follow past inputs.
 
@@ -94,41 +95,8 @@ def input_dependence(
     Residual and inputs are first filtered by an autoregression fitted to the residual, so
     that coloured noise alone does not fail the test. NaN for residuals of zeros.
     """
-    statistic, degrees = _following(residuals, inputs, num_lags)
-    return chi2_tail(degrees, statistic) if degrees else math.nan
-
-
-def misfit_factor(
-    residuals: Sequence[Float[np.ndarray, " _sample"]],
-    signals: Sequence[Float[np.ndarray, "_sample signal"]],
-    num_lags: int,
-) -> float:
-    """How much wider than noise an error of the structure makes intervals; at least 1.
-
-    The residuals of an output in some records are filtered as in `input_dependence`, and
-    projected on the past of signals that follow from the inputs, such as simulated outputs. Noise
-    has its own variance in each of these directions. An error of the structure has more; what
-    the estimates took of it cannot be seen, and is taken to be as large as in the mean of them.
-
-    Args:
-        num_lags: past samples; as many as the plant has states determine its next output.
-    """
-    statistic, degrees = _following(residuals, signals, num_lags)
-    return math.sqrt(max(statistic / degrees, 1.0)) if degrees else 1.0
-
-
-def _following(
-    residuals: Sequence[Float[np.ndarray, " _sample"]],
-    signals: Sequence[Float[np.ndarray, "_sample signal"]],
-    num_lags: int,
-    order: int = 10,
-) -> tuple[float, int]:
-    """Sum of squares of filtered residuals along past signals, over their variance.
-
-    With its number of directions: of noise it is a chi-squared variable of these degrees.
-    """
     statistic, degrees = 0.0, 0
-    for residual, record in zip(residuals, signals, strict=True):
+    for residual, record in zip(residuals, inputs, strict=True):
         centred, past = residual - residual.mean(), min(order, residual.size // 20)
         lags = min(num_lags, residual.size // 10)
         memory = _autoregression([centred], past, past)
@@ -149,7 +117,7 @@ def _following(
         if power > 0:
             statistic += float(np.sum((seen.T @ triangle[:-1, -1]) ** 2)) / power
             degrees += seen.shape[1]
-    return statistic, degrees
+    return chi2_tail(degrees, statistic) if degrees else math.nan
 
 
 def _lagged(
@@ -329,6 +297,8 @@ class Autoregression:
             if order:
                 known, a = autocovariance[order - 1 : 0 : -1], found.coefficients
                 partial = (autocovariance[order] - a @ known) / found.variance
+                if not abs(partial) < 1:  # these are the autocovariances of no process
+                    break
                 partial = float(np.clip(partial, -_STATIONARY, _STATIONARY))
                 a = np.append(a - partial * a[::-1], partial)
                 found = cls(a, found.variance * (1 - partial**2), count)
@@ -463,6 +433,56 @@ def robust_covariance(
     degrees = np.full(count, np.inf)
     np.divide(2 * variance**2, spread, out=degrees, where=spread > 0)
     return covariance, degrees
+
+
+def misfit_factor(
+    sensitivity: Float[np.ndarray, "experiment sample output unknown"],
+    residual: Float[np.ndarray, "experiment sample output"],
+    valid: Bool[np.ndarray, "experiment sample output"],
+    signals: Float[np.ndarray, "experiment sample signal"],
+    num_lags: int,
+) -> float:
+    """How much wider than coloured noise an error of the structure makes intervals; at least 1.
+
+    The residual of each output is projected on the past of signals that follow from the inputs,
+    such as simulated outputs. Noise of its colour has a known variance in these directions; an
+    error of the structure has more. What the estimates took of it, the part along the
+    sensitivities, cannot be seen: it is taken to be as large as in the mean of the others. The
+    output with the largest error counts.
+
+    Args:
+        sensitivity, residual, valid: see `robust_covariance`.
+        num_lags: past samples; as many as the plant has states determine its next output.
+    """
+    past = np.zeros((*signals.shape[:2], num_lags, signals.shape[2]))
+    for lag in range(1, num_lags + 1):
+        past[:, lag:, lag - 1] = signals[:, :-lag]
+    past = past.reshape(-1, num_lags * signals.shape[2])
+    ratios = [1.0]
+    for o, noise in enumerate(coloured_noise(sensitivity, residual, valid)):
+        seen = valid[:, :, o].reshape(-1)
+        estimated = _basis(sensitivity[:, :, o].reshape(len(seen), -1))
+        directions = np.column_stack([np.ones(len(seen)), past]) * seen[:, None]
+        directions = _basis(directions, estimated)
+        along = directions.T @ residual[:, :, o].reshape(-1)
+        by_experiment = directions.reshape(*valid.shape[:2], -1)
+        expected = float(np.sum(by_experiment * noise.times(by_experiment)))
+        if expected > 0:
+            ratios.append(float(along @ along) / expected)
+    return math.sqrt(max(ratios))
+
+
+def _basis(
+    columns: Float[np.ndarray, "row column"],
+    without: Float[np.ndarray, "row other"] | None = None,
+) -> Float[np.ndarray, "row direction"]:
+    """Orthonormal directions of columns, less what other directions explain of them."""
+    lengths = np.linalg.norm(columns, axis=0)
+    columns = columns[:, lengths > 0] / lengths[lengths > 0]
+    if without is not None:
+        columns = columns - without @ (without.T @ columns)
+    basis, sizes, _ = np.linalg.svd(columns, full_matrices=False)
+    return basis[:, sizes > 1e-6]
 
 
 def inverse_information(

@@ -32,6 +32,7 @@ from .contract import (
     Estimate,
     Experiments,
     Status,
+    simulate_experiments,
 )
 from .diagnosis import (
     chance_of_fit,
@@ -242,11 +243,12 @@ def identify(
         for i, name in enumerate(names_of(plant.definition.outputs))
     }
     structure = {
-        part.name: input_dependence(*_residual_and_signals(records, residual, i, part.scale))
+        part.name: input_dependence(*_residual_and_inputs(records, residual, i, part.scale))
         for i, part in enumerate(plant.definition.outputs)
     }
     wrong = [n for n, p in structure.items() if p < RARE / len(structure)] * fit.is_successful
-    factor = _misfit(plant, records, residual, fitted) if wrong else 1.0
+    is_nls = isinstance(estimator, NLS)
+    factor = _misfit(plant, experiments, estimator, fit) if wrong and is_nls else 1.0
     covariance, degrees, verdict = _confidence(
         plant, experiments, estimator, fit, whiteness, uncertain_sd, factor
     )
@@ -490,7 +492,6 @@ def _confidence(
     parameters = zip(plant.definition.parameters, fit.estimate.params, strict=True)
     size = np.array([float(value) if p.positive else p.scale for p, value in parameters])
     if not isinstance(estimator, NLS):
-        covariance = factor**2 * covariance
         if coloured:
             remarks.append(f"{not_white} assume white noise, and are too narrow")
     elif coloured or uncertain.any() or factor > 1:
@@ -556,55 +557,28 @@ def _noise(description: PlantDescription, estimate: Estimate) -> Noise | None:
     return Noise(dict(of_states), dict(of_outputs))
 
 
-def _residual_and_signals(
-    records: Sequence[Record],
-    residual: Sequence[np.ndarray],
-    output: int,
-    scale: float,
-    simulated: Sequence[np.ndarray] | None = None,
+def _residual_and_inputs(
+    records: Sequence[Record], residual: Sequence[np.ndarray], output: int, scale: float
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """By record, residuals of an output that are more than rounding, and the inputs beside them.
-
-    Simulated outputs, where they are given, are signals, too.
-    """
-    signals = [record.inputs for record in records]
-    if simulated is not None:
-        signals = [
-            np.hstack([record.inputs, _between(record.time, outputs)])
-            for record, outputs in zip(records, simulated, strict=True)
-        ]
+    """By record, residuals of an output that are more than rounding, and the inputs beside them."""
     pairs = [
-        (r[seen, output], rows[seen])
-        for r, rows in zip(residual, signals, strict=True)
+        (r[seen, output], record.inputs[seen])
+        for r, record in zip(residual, records, strict=True)
         for seen in [np.isfinite(r[:, output])]
     ]
-    pairs = [(r, rows) for r, rows in pairs if is_more_than_rounding(r, scale)]
-    return [r for r, _ in pairs], [rows for _, rows in pairs]
+    pairs = [(r, inputs) for r, inputs in pairs if is_more_than_rounding(r, scale)]
+    return [r for r, _ in pairs], [inputs for _, inputs in pairs]
 
 
-def _between(
-    time: Float[np.ndarray, " sample"], values: Float[np.ndarray, "sample output"]
-) -> Float[np.ndarray, "sample output"]:
-    """Values with those that are missing interpolated."""
-    filled = np.zeros_like(values)
-    for i, seen in enumerate(np.isfinite(values).T):
-        if seen.any():
-            filled[:, i] = np.interp(time, time[seen], values[seen, i])
-    return filled
-
-
-def _misfit(
-    plant: AbstractPlant,
-    records: Sequence[Record],
-    residual: Sequence[np.ndarray],
-    fitted: Sequence[Fitted],
-) -> float:
+def _misfit(plant: AbstractPlant, experiments: Experiments, estimator: NLS, fit: Fit) -> float:
     """How much wider than noise an error of the structure makes intervals."""
-    simulated, num_lags = [record.simulated for record in fitted], len(plant.definition.states)
-    return max(
-        misfit_factor(*_residual_and_signals(records, residual, i, part.scale, simulated), num_lags)
-        for i, part in enumerate(plant.definition.outputs)
-    )
+    e, (estimate, free) = experiments, jax.device_put((fit.estimate, fit.free))
+    S, residual = map(np.asarray, estimator.sensitivity(plant, e, estimate, free))
+    simulated = simulate_experiments(plant, estimate.params, e, estimate.initial_state)
+    inputs = np.pad(np.asarray(e.inputs), [(0, 0), (0, 1), (0, 0)])  # the last one acts no more
+    signals = np.concatenate([inputs, np.asarray(simulated)], axis=2)
+    num_lags = len(plant.definition.states)
+    return misfit_factor(S, residual, np.asarray(e.valid), signals, num_lags)
 
 
 def _wrong_structure(
