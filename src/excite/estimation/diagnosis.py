@@ -454,10 +454,7 @@ def misfit_factor(
         sensitivity, residual, valid: see `robust_covariance`.
         num_lags: past samples; as many as the plant has states determine its next output.
     """
-    past = np.zeros((*signals.shape[:2], num_lags, signals.shape[2]))
-    for lag in range(1, num_lags + 1):
-        past[:, lag:, lag - 1] = signals[:, :-lag]
-    past = past.reshape(-1, num_lags * signals.shape[2])
+    past = np.concatenate([own for rows in signals for _, own in _lagged(rows, num_lags, 0)])
     ratios = [1.0]
     for o, noise in enumerate(coloured_noise(sensitivity, residual, valid)):
         seen = valid[:, :, o].reshape(-1)

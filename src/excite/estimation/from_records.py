@@ -10,13 +10,13 @@ from jaxtyping import Bool, Float
 
 from ..description import names_of
 from ..plant import AbstractPlant, Params
+from ..plant.extension import HOLDS
 from ..record import Record, is_even, require_even, unbroken
 from .contract import (
     AbstractEstimator,
     Experiments,
     stack_experiments,
 )
-from .remedies import HOLDS
 
 
 def starts_at(record: Record, plant: AbstractPlant) -> bool:

@@ -243,14 +243,12 @@ def identify(
         for i, name in enumerate(names_of(plant.definition.outputs))
     }
     structure = {
-        part.name: input_dependence(*_residual_and_inputs(records, residual, i, part.scale))
-        for i, part in enumerate(plant.definition.outputs)
+        name: _dependence(residual, records, i, plant.definition.outputs[i].scale)
+        for i, name in enumerate(whiteness)
     }
     wrong = [n for n, p in structure.items() if p < RARE / len(structure)] * fit.is_successful
-    is_nls = isinstance(estimator, NLS)
-    factor = _misfit(plant, experiments, estimator, fit) if wrong and is_nls else 1.0
-    covariance, degrees, verdict = _confidence(
-        plant, experiments, estimator, fit, whiteness, uncertain_sd, factor
+    covariance, degrees, factor, verdict = _confidence(
+        plant, experiments, estimator, fit, whiteness, uncertain_sd, bool(wrong)
     )
     others = (
         *(s for record in [*records, *validation] for s in _other_plant(record, plant)),
@@ -473,11 +471,12 @@ def _confidence(
     fit: Fit,
     whiteness: Mapping[str, float],
     uncertain: np.ndarray,
-    factor: float,
-) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
+    is_wrong: bool,
+) -> tuple[np.ndarray, np.ndarray, float, tuple[str, ...]]:
     """Covariance of the estimates, its degrees of freedom, and the sentences of the verdict.
 
-    An error of the structure widens what the data tell by a factor, and not what a prior tells.
+    A wrong structure widens what the data tell, and not what a prior tells: by the factor that
+    stands before the sentences.
     """
     names = names_of(plant.definition.parameters)
     covariance, its = np.asarray(fit.estimate.covariance), fit.estimate.degrees
@@ -485,25 +484,29 @@ def _confidence(
     if not fit.is_successful:
         sentence = Status(int(fit.estimate.status)).sentence
         needed = f"; {estimator.name} needs {estimator.needs}" if estimator.needs else ""
-        return covariance, degrees, (*fit.reasons.values(), sentence + needed)
-    coloured, remarks = [name for name, p in whiteness.items() if p < RARE], []
+        return covariance, degrees, 1.0, (*fit.reasons.values(), sentence + needed)
+    coloured, remarks, factor = [name for name, p in whiteness.items() if p < RARE], [], 1.0
     not_white = f"the residual of {' and '.join(coloured)} is not white: the intervals"
-    but = "" if factor > 1 else ", not for an error in the plant's equations"
     parameters = zip(plant.definition.parameters, fit.estimate.params, strict=True)
     size = np.array([float(value) if p.positive else p.scale for p, value in parameters])
     if not isinstance(estimator, NLS):
         if coloured:
             remarks.append(f"{not_white} assume white noise, and are too narrow")
-    elif coloured or uncertain.any() or factor > 1:
+    elif coloured or uncertain.any() or is_wrong:
         estimate, free = jax.device_put((fit.estimate, fit.free))
         S, residual = map(np.asarray, estimator.sensitivity(plant, experiments, estimate, free))
         prior = np.asarray(estimator.prior_information(plant, estimate, S.shape[-1], free))
+        valid = np.asarray(experiments.valid)
+        if is_wrong:
+            signals = _signals(plant, experiments, estimate)
+            factor = misfit_factor(S, residual, valid, signals, len(plant.definition.states))
         if coloured:
-            robust, its = robust_covariance(S, residual, np.asarray(experiments.valid), prior)
+            robust, its = robust_covariance(S, residual, valid, prior)
             robust = np.outer(size, size) * robust[: len(names), : len(names)]
             is_wider = np.diag(robust) > np.diag(covariance)
             degrees = np.where(is_wider, its[: len(names)], degrees)
             covariance = widened(covariance, robust)
+            but = "" if factor > 1 else ", not for an error in the plant's equations"
             remarks.append(f"{not_white} allow for coloured noise{but}")
         inverse = inverse_information(S, prior)
         known = (inverse @ prior @ inverse)[: len(names), : len(names)] * np.outer(size, size)
@@ -524,7 +527,7 @@ def _confidence(
         plant, experiments, estimator, fit.estimate, fit.free, fit.known, tuple(fit.reasons)
     )
     seen = _certainty(names, covariance / np.outer(size, size), fit.free)
-    return covariance, degrees, (*fit.reasons.values(), *held, *seen, *remarks)
+    return covariance, degrees, factor, (*fit.reasons.values(), *held, *seen, *remarks)
 
 
 def _certainty(names: tuple[str, ...], covariance: np.ndarray, free: np.ndarray) -> tuple[str, ...]:
@@ -557,28 +560,27 @@ def _noise(description: PlantDescription, estimate: Estimate) -> Noise | None:
     return Noise(dict(of_states), dict(of_outputs))
 
 
-def _residual_and_inputs(
-    records: Sequence[Record], residual: Sequence[np.ndarray], output: int, scale: float
-) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """By record, residuals of an output that are more than rounding, and the inputs beside them."""
+def _dependence(
+    residual: Sequence[np.ndarray], records: Sequence[Record], output: int, scale: float
+) -> float:
+    """p-value of an output's residual not following the input; see `whiteness_of`."""
     pairs = [
         (r[seen, output], record.inputs[seen])
         for r, record in zip(residual, records, strict=True)
         for seen in [np.isfinite(r[:, output])]
     ]
     pairs = [(r, inputs) for r, inputs in pairs if is_more_than_rounding(r, scale)]
-    return [r for r, _ in pairs], [inputs for _, inputs in pairs]
+    return input_dependence([r for r, _ in pairs], [inputs for _, inputs in pairs])
 
 
-def _misfit(plant: AbstractPlant, experiments: Experiments, estimator: NLS, fit: Fit) -> float:
-    """How much wider than noise an error of the structure makes intervals."""
-    e, (estimate, free) = experiments, jax.device_put((fit.estimate, fit.free))
-    S, residual = map(np.asarray, estimator.sensitivity(plant, e, estimate, free))
+def _signals(
+    plant: AbstractPlant, experiments: Experiments, estimate: Estimate
+) -> Float[np.ndarray, "experiment sample signal"]:
+    """Inputs and simulated outputs: what an error of the structure follows."""
+    e = experiments
     simulated = simulate_experiments(plant, estimate.params, e, estimate.initial_state)
     inputs = np.pad(np.asarray(e.inputs), [(0, 0), (0, 1), (0, 0)])  # the last one acts no more
-    signals = np.concatenate([inputs, np.asarray(simulated)], axis=2)
-    num_lags = len(plant.definition.states)
-    return misfit_factor(S, residual, np.asarray(e.valid), signals, num_lags)
+    return np.concatenate([inputs, np.asarray(simulated)], axis=2)
 
 
 def _wrong_structure(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import equinox as eqx
@@ -64,19 +65,18 @@ def too_coarse(
 def _changed(
     plant: AbstractPlant, experiments: Experiments, estimate: Estimate
 ) -> tuple[Experiments, Estimate, Float[Array, "experiment sample output"], Float[Array, ""]]:
-    """The change of the residual by twice the steps, and its own size, over the weights.
+    """The change of the residual by twice the steps, and its size in all samples, over the weights.
 
-    Of the first samples of each experiment, which stand before them as an experiment of their own.
+    It is that of the first samples of each experiment; these and their estimate stand before it.
     """
     e, n = experiments, max(_LONGEST // len(experiments.valid), 2)
     sd = NLS().weights(plant, experiments, estimate)[None, None]
     noise = jnp.sqrt(jnp.sum((estimate.residual / sd) ** 2) / jnp.sum(e.valid))
-    part = Experiments(
+    part = dataclasses.replace(
+        e,
         inputs=e.inputs[:, : n - 1],
         measured=e.measured[:, :n],
         valid=e.valid[:, :n],
-        initial_state=e.initial_state,
-        initial_state_known=e.initial_state_known,
         dt=None if e.dt is None else e.dt[:, : n - 1],
         next_inputs=None if e.next_inputs is None else e.next_inputs[:, : n - 1],
     )

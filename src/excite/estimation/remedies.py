@@ -12,7 +12,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import equinox as eqx
@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..description import RARE, names_of
 from ..plant import AbstractPlant, Params
-from ..plant.extension import extended, extensions_of
+from ..plant.extension import HOLDS, extended, extensions_of
 from .contract import (
     Estimate,
     Experiments,
@@ -54,7 +54,6 @@ _TRIED = {
     "drift": (1.0,),
 }
 """Values of a suspect's parameter: sampling times, parts of the largest input, usual sizes."""
-HOLDS = "constant", "linear"  # an input between samples
 _MOST_FITTED, _STEPS = 7, 30  # suspects that are fitted, and most steps of one fit
 _MOST_CONFIRMED = 2  # suspects found in parts of a record that are fitted to all of it
 _STEP = 1e-6  # of a difference
@@ -144,6 +143,11 @@ class Question:
         """Extensions that are suspects; a gain cannot be told from the plant's own."""
         return [name for name in extensions_of(self.plant) if not name.startswith("gain_")]
 
+    @cached_property
+    def whole(self) -> AbstractPlant:
+        """The plant with all of them."""
+        return extended(self.plant, self.names)
+
     @property
     def num_tests(self) -> int:
         """Number of suspects."""
@@ -157,11 +161,10 @@ class Question:
     def search(self, part: Excerpt | None = None) -> _Search:
         """For suspects that are extensions, from the estimate; in a part of the record."""
         sd = self.estimator.weights(self.plant, self.experiments, jax.device_put(self.estimate))
-        whole = extended(self.plant, self.names)
         experiments, elapsed = part or (self.experiments, None)
         return _Search(
             self.plant,
-            whole,
+            self.whole,
             experiments,
             self.start,
             self.estimate,
@@ -184,7 +187,7 @@ class Question:
         word, _, channel = name.partition("_")
         remedy, unit = f"--hold-input {channel}={word}", ""
         if value is not None:
-            unit = extended(self.plant, [name]).definition.parameter(name).unit
+            unit = self.whole.definition.parameter(name).unit
             remedy = f"--plant {self.plant_word}+{name} --start {name}={value:.4g}"
         return Suspect(
             name=name,
@@ -212,16 +215,16 @@ class Question:
             whiteness_of(r, o.scale) < RARE for r, o in zip(parts, outputs, strict=True)
         )
 
-        def rank(s: Suspect) -> tuple[bool, float]:
-            explains_little = is_coloured and not s.reduction > _MUCH
-            return explains_little, -s.evidence(int(valid.sum()))
+        def evidence(s: Suspect) -> float:
+            return s.evidence(int(valid.sum()))
 
-        ranked = sorted(likely, key=rank)
-        holds = [s for s in ranked if s.name.startswith(HOLDS)]
-        if holds and ranked[0].name.startswith("delay_"):
-            delay, hold = (s.evidence(int(valid.sum())) for s in (ranked[0], holds[0]))
-            if _SIMPLER * hold > delay:
-                ranked = [holds[0], *(s for s in ranked if s is not holds[0])]
+        ranked = sorted(
+            likely, key=lambda s: (is_coloured and not s.reduction > _MUCH, -evidence(s))
+        )
+        hold = next((s for s in ranked if s.name.startswith(HOLDS)), None)
+        is_delay = bool(ranked) and ranked[0].name.startswith("delay_")
+        if hold and is_delay and _SIMPLER * evidence(hold) > evidence(ranked[0]):
+            ranked = [hold, *(s for s in ranked if s is not hold)]
         return tuple(ranked)
 
 

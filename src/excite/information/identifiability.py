@@ -449,9 +449,9 @@ def _best_to_hold(
         return int(np.argmax(size))
     rest = [np.delete(np.delete(information, i, 0), i, 1) for i in alike]
     rounding = UNDETERMINED * float(np.abs(information).max())
-    least = [max(np.linalg.eigvalsh(block)[0], rounding) if block.size else 0.0 for block in rest]
+    least = [max(np.linalg.eigvalsh(block)[0], rounding) for block in rest]
     equal = [i for i, value in zip(alike, least, strict=True) if value >= _ALIKE * max(least)]
-    return int(max(equal or alike, key=lambda i: size[i]))
+    return int(max(equal, key=lambda i: size[i]))
 
 
 def identifiability(

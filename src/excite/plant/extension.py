@@ -33,6 +33,8 @@ _INPUT, _VELOCITY, _OUTPUT = (
     ("coulomb", "drag"),
     ("bias", "drift"),
 )
+HOLDS = "constant", "linear"
+"""What an input does between samples; it is no extension, but explains a residual like one."""
 _VELOCITIES = "m/s", "rad/s"
 _SHARP = 0.02  # scales of a velocity in which Coulomb friction changes its sign
 _SHORTEST = 0.4  # Runge-Kutta steps; a shorter lag would be integrated without stability
@@ -113,7 +115,7 @@ def extended(plant: AbstractPlant, extensions: Sequence[str]) -> AbstractPlant:
 def _option_for(d: PlantDescription, word: str) -> str | None:
     """The option of `identify` for an effect that it names and that is no extension."""
     hold, _, channel = word.partition("_")
-    if hold in ("constant", "linear") and channel in names_of(d.inputs):
+    if hold in HOLDS and channel in names_of(d.inputs):
         return f"--hold-input {channel}={hold}"
     return "--likelihood student" if word == "outliers" else None
 
