@@ -922,6 +922,14 @@ BAD: dict[str, tuple[str, tuple[str, ...]]] = {
 }  # fmt: skip
 
 
+def test_a_plant_file_leaves_no_compiled_code(run, here, monkeypatch):
+    monkeypatch.setattr(sys, "dont_write_bytecode", False)
+    before = contents(here)
+    assert run("information", "own.py:Tank", "--excitation", "chirp").code == 0
+    assert contents(here) == before
+    assert not sys.dont_write_bytecode
+
+
 @pytest.mark.parametrize(("words", "fragments"), BAD.values(), ids=list(BAD))
 def test_a_mistake_is_one_sentence_and_leaves_nothing(words, fragments, run, here):
     before = contents(here)

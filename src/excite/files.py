@@ -256,19 +256,25 @@ def class_at(path: Path, word: str, base: type, kind: str) -> Any:
 
 
 def module_at(path: Path) -> Any:
-    """The module in a user's file, whose code is run; ValueError where it cannot be imported."""
+    """The module in a user's file, whose code is run; ValueError where it cannot be imported.
+
+    No compiled code is written beside the file.
+    """
     name = f"excite_file_{path.stem}"
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
         raise ValueError(f"{path} cannot be imported")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # Equinox looks up a class's module by name
+    writes_nothing, sys.dont_write_bytecode = sys.dont_write_bytecode, True
     try:
         spec.loader.exec_module(module)
     except KeyboardInterrupt:
         raise
     except BaseException as error:  # also sys.exit
         raise ValueError(f"{path} cannot be imported: {told(error)}") from error
+    finally:
+        sys.dont_write_bytecode = writes_nothing
     return module
 
 

@@ -244,8 +244,8 @@ def _traced(plant: AbstractPlant, name: str, arguments: tuple[Any, ...], what: s
         ) from error
     except (jax.errors.ConcretizationTypeError, jax.errors.TracerIntegerConversionError) as error:
         raise ValueError(
-            f"{what} gives {values} to float, int, range or a function of math, or takes it as an "
-            "index; these take no JAX values: use jax.numpy, such as jnp.sin for math.sin"
+            f"{what} gives {values} to float, int, range, a list (as an index) or a function of "
+            "math, which take no JAX values: use jax.numpy, such as jnp.sin for math.sin"
         ) from error
     except jax.errors.TracerArrayConversionError as error:
         raise ValueError(f"{what} uses NumPy: use jax.numpy (import jax.numpy as jnp)") from error
