@@ -180,7 +180,7 @@ def search(
 
     def add(name: str, cases: Cases, sizes: np.ndarray, count: int, violations: int) -> None:
         stages.append(Stage(name, count, violations, float(sizes.max())))
-        seen.append((cases, sizes))
+        seen.append((jax.device_get(cases), sizes))
 
     def play_all(name: str, cases: Cases) -> None:
         sizes = _played(play, cases, lambda *done: progress(name, *done))
@@ -189,7 +189,7 @@ def search(
     def worst(count: int) -> Cases:
         cases = _joined(*(found for found, _ in seen))
         order = np.argsort(np.concatenate([sizes for _, sizes in seen]))[::-1][:count]
-        return jax.tree.map(lambda leaf: leaf[order], cases)
+        return jax.device_put(jax.tree.map(lambda leaf: leaf[order], cases))
 
     def climb(name: str, cases: Cases, bound: float = 0.0) -> None:
         top, sizes, violations = _climbed(
@@ -222,7 +222,7 @@ def _seeds(key: PRNGKeyArray, count: int) -> Int[Array, " case"]:
 
 
 def _joined(*parts: Cases) -> Cases:
-    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
 
 def _chunks(cases: Cases, progress: Callable[[int, int], None]) -> Iterator[tuple[Cases, int]]:

@@ -318,6 +318,8 @@ def to_search(description: PlantDescription, params: Params) -> Float[Array, " p
     """
     b = _Bounds(description)
     c = b.relative(jnp.stack([jnp.asarray(p, float) for p in params]))
+    if not np.any(b.has_lower | b.has_upper):
+        return c
     fraction = jnp.where(b.both, (c - b.lower) / b.width, 0.5)
     between = b.width / 4 * (jnp.log(fraction) - jnp.log1p(-fraction))
     above = jnp.where(b.has_lower, c - b.lower, 1.0)

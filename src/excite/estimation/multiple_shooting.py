@@ -221,33 +221,42 @@ class _Search(NamedTuple):
     converged: Bool[Array, ""]
 
 
-class MultipleShooting:
+class MultipleShooting(eqx.Module):
     """A sum of squares to be minimised: a plant, segments of experiments, and what z means.
 
-    Args:
+    Attributes:
         params_at: parameters, as a vector, at search coordinates z.
         first_is_free: False where every experiment starts at its known initial state.
         prior: further residuals of the search coordinates, in standard deviations.
         student: scale of each output's noise, if it has Student's distribution; default normal.
     """
 
-    def __init__(
-        self,
-        plant: AbstractPlant,
-        segments: Segments,
-        params_at: Callable[[Float[Array, " param"]], Float[Array, " param"]],
-        first_is_free: bool,
-        prior: Callable[[Float[Array, " param"]], Float[Array, " row"]] | None = None,
-        student: Float[Array, " output"] | None = None,
-    ) -> None:
-        self.plant, self.segments, self.params_at = plant, segments, params_at
-        self.first_is_free, self.prior, self.student = first_is_free, prior, student
-        self.scales = jnp.asarray([s.scale for s in plant.definition.states])
-        self.output_scales = jnp.asarray([o.scale for o in plant.definition.outputs])
-        self.num_states = len(plant.definition.states)
-        self.largest = jnp.asarray(
-            [LARGEST_CHANGE[p.positive] for p in plant.definition.parameters]
-        )
+    plant: AbstractPlant
+    segments: Segments
+    params_at: Callable[[Float[Array, " param"]], Float[Array, " param"]]
+    first_is_free: bool = eqx.field(static=True)
+    prior: Callable[[Float[Array, " param"]], Float[Array, " row"]] | None = None
+    student: Float[Array, " output"] | None = None
+
+    @property
+    def scales(self) -> Float[np.ndarray, " state"]:
+        """Typical size of each state."""
+        return np.array([s.scale for s in self.plant.definition.states])
+
+    @property
+    def num_states(self) -> int:
+        """Number of states."""
+        return len(self.plant.definition.states)
+
+    @property
+    def num_outputs(self) -> int:
+        """Number of outputs."""
+        return len(self.plant.definition.outputs)
+
+    @property
+    def largest(self) -> Float[np.ndarray, " param"]:
+        """Largest change of each search coordinate in one step."""
+        return np.array([LARGEST_CHANGE[p.positive] for p in self.plant.definition.parameters])
 
     def delayed(self, z: Array) -> Segments:
         """The segments with the inputs of a plant that delays them."""
@@ -290,6 +299,7 @@ class MultipleShooting:
 
         return jax.lax.scan(advance, start * self.scales, steps)
 
+    @eqx.filter_jit  # both phases simulate: it is traced once
     def shoot(self, z: Array, starts: Array, next_starts: Array, block: Segments) -> Shots:
         """Simulates the segments of one block."""
         n = self.num_states
@@ -339,7 +349,7 @@ class MultipleShooting:
     def sweep(self, point: Point) -> Sweep:
         """Simulates all segments, and closes their gaps to first order."""
         n, width = self.num_states, self.num_states + len(point.z) + 1
-        num_experiments, num_outputs = self.segments.shape[0], len(self.output_scales)
+        num_experiments, num_outputs = self.segments.shape[0], self.num_outputs
         first = jnp.eye(n, width) if self.first_is_free else jnp.zeros((n, width))
 
         def follow(moves: Array, parts: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -375,7 +385,7 @@ class MultipleShooting:
         """
         n, z = self.num_states, start.z
         params = self.plant.Params(*self.params_at(z))
-        few = -(-2 * n // len(self.output_scales)) + 1
+        few = -(-2 * n // self.num_outputs) + 1
         here, _, segments = self._blocks(start)
         parts = segments.steps, segments.measured, segments.valid
         parts = jax.tree.map(lambda a: a[:, :, :, :few], parts)

@@ -13,6 +13,7 @@ from typing import Literal, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..description import names_of
@@ -277,6 +278,7 @@ class Problem(eqx.Module):
     plant: AbstractPlant
     experiments: Experiments
     start: Float[Array, " param"]
+    usual: Float[Array, " param"]
     free: Bool[Array, " param"]
     prior: Prior | None
 
@@ -289,7 +291,7 @@ class Problem(eqx.Module):
         prior: Prior | None = None,
     ) -> None:
         self.plant, self.experiments, self.prior = plant, experiments, prior
-        self.start = to_search(plant.definition, start)
+        self.start, self.usual = (to_search(plant.definition, p) for p in (start, plant.nominal))
         self.free = jnp.ones(len(self.start), bool) if free is None else free
 
     @property
@@ -319,9 +321,8 @@ class Problem(eqx.Module):
         A positive one stays within a factor of exp(30) of its nominal value.
         """
         d = self.plant.definition
-        usual = to_search(d, self.plant.nominal)
-        positive = jnp.asarray([p.positive for p in d.parameters])
-        beyond = jax.lax.stop_gradient(z - jnp.clip(z, usual - FAR, usual + FAR))
+        positive = np.array([p.positive for p in d.parameters])
+        beyond = jax.lax.stop_gradient(z - jnp.clip(z, self.usual - FAR, self.usual + FAR))
         z = z - jnp.where(positive, beyond, 0.0)  # the derivative is kept beyond the limit
         return from_search(d, jnp.where(self.free, z, self.start))
 

@@ -78,6 +78,7 @@ class AbstractShape(AbstractSignal):
     def shape(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> Sequence:
         """The whole sequence in [-1, 1]."""
 
+    @eqx.filter_jit
     def sequence(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> Sequence:
         """The shape, scaled and clipped to the input limits."""
         lower, upper = plant.input_limits

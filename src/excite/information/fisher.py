@@ -80,6 +80,7 @@ def marginal_information(
     return R.T @ R
 
 
+@eqx.filter_jit
 def experiment_information(
     plant: AbstractPlant,
     params: Params,

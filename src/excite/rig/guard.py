@@ -51,7 +51,7 @@ _LOST = 2.0  # times the critical levels: what is beyond is not braked any more
 _BY_FAR, _CLEARLY, _LARGE = 100.0, 0.02, 100.0
 
 
-@dataclass(frozen=True, eq=False)  # hashable: a static argument of compiled functions
+@dataclass(frozen=True, eq=False)
 class GuardRules:
     """What a guard knows of the declared plants; arrays are in the plant's units.
 

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -309,6 +310,19 @@ def _scores(play: OnRig, cases: Cases) -> Float[Array, "case 3"]:
     return jax.vmap(lambda case: play.run(case).memory.largest)(cases)
 
 
+def _of_leaves(depth: int, leaves: Iterable[Any]) -> GuardRules:
+    """Rules with leaves that may be traced."""
+    rules = object.__new__(GuardRules)
+    vars(rules).update(zip(_ARRAYS, leaves, strict=True), depth=depth)
+    return rules
+
+
+_ARRAYS = tuple(f.name for f in dataclasses.fields(GuardRules) if f.name != "depth")
+jax.tree_util.register_pytree_node(
+    GuardRules, lambda rules: ([getattr(rules, n) for n in _ARRAYS], rules.depth), _of_leaves
+)
+
+
 class GuardFilter(AbstractFilter):
     """A guard between excitation and supervisor, for batches of simulated experiments.
 
@@ -319,7 +333,7 @@ class GuardFilter(AbstractFilter):
     """
 
     model: GuardModel
-    rules: GuardRules = eqx.field(static=True)
+    rules: GuardRules
     trips_at: Int[Array, ""] | None = None
 
     def start(self) -> Belief:
