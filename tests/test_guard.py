@@ -181,6 +181,30 @@ def test_after_a_flip_the_brake_turns_its_sign_too(guarding):
     assert np.abs(np.asarray(runs.measured)[:, -1]).max() < 0.2
 
 
+@pytest.mark.parametrize("what", ["late", "strong", "biased"])
+def test_other_faults_are_not_taken_for_a_turned_sign(guarding, what):
+    guard_ = guarding.guard()
+    rules, model, rng = guard_.rules, guard_.model, np.random.default_rng(4)
+    found = []
+    for begin in range(15, 27):
+        point, belief = rules.mean.copy(), guard.start(np, rules)
+        past = np.zeros((rules.depth + 3, 1))
+        for k in range(begin + 20):
+            is_wrong = k >= begin
+            measured = model.output(point[None])[0] + rules.noise * rng.normal(size=1)
+            jump = 80 * rules.noise if what == "biased" and is_wrong else 0.0
+            belief = guard.observed(np, rules, model, belief, measured + jump)
+            input = guard.decided(np, rules, belief, np.array([12.0 * (-1) ** (k // 4)]))
+            belief = guard.moved(np, rules, model, belief, input)
+            past = np.concatenate([past[1:], input[None]])
+            late, gain = 3 * (what == "late" and is_wrong), 3.0 if what == "strong" else 1.0
+            acting = past[3 - late : 3 - late + rules.depth] * (gain if is_wrong else 1.0)
+            point[: rules.num_states] = model.advance(point[None], acting[None])[0]
+        assert belief.num_braked > 0
+        found.append(float(belief.sign))
+    assert -1.0 not in found
+
+
 def test_the_estimate_starts_again_where_the_sign_turns(guarding):
     """A state that the wrong sign explained would mislead the brake for many samples."""
     guard_ = guarding.guard()
@@ -326,3 +350,13 @@ def test_a_damaged_guard_is_one_sentence(guarded_file, tmp_path):
     broken = policy.certified(policy.certificate, {"rules": {}})
     with pytest.raises(ValueError, match="the guard is damaged"):
         ex.run(policy=broken, plant="aero2", guard=True, fast=True, out=tmp_path / "r.csv")
+
+
+def test_a_guard_of_another_version_is_refused(guarding):
+    whole, functions = guarding.guard(), guarding.model.functions()
+    rules = whole.rules
+    few = np.tile(rules.mean, (guard.num_points(rules) - 3, 1))
+    past = np.zeros((len(few), rules.depth, len(rules.rest)))
+    advance, output = program_of(functions.advance, few, past), program_of(functions.output, few)
+    with pytest.raises(ValueError, match="made by another version of excite: make it again"):
+        Guard.from_dict(Guard(rules, advance, output).to_dict())

@@ -317,7 +317,7 @@ def to_search(description: PlantDescription, params: Params) -> Float[Array, " p
     has one bound only), so that the search never leaves its bounds.
     """
     b = _Bounds(description)
-    c = b.relative(jnp.stack([jnp.asarray(p, float) for p in params]))
+    c = jnp.asarray(b.relative(jnp.stack([jnp.asarray(p, float) for p in params])))
     if not np.any(b.has_lower | b.has_upper):
         return c
     fraction = jnp.where(b.both, (c - b.lower) / b.width, 0.5)

@@ -18,6 +18,7 @@ As for a supervisor (`excite.safety`), the functions are pure, over arrays of Nu
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from types import ModuleType
@@ -36,19 +37,31 @@ NUM_RECENT = 10
 NUM_REPLAYED = 5
 """Samples from which the guard infers what was wrong."""
 
-NUM_CAUSES = 1 + 2 * (NUM_REPLAYED - 1)
-"""As declared, and an actuator that turned its sign or died at one of the first samples."""
+_GAINS, _LATE = (1.5, 2.0, 3.0), (1, 2, 3)
+"""Factors of the actuator, and samples by which it is late, that may explain the last samples."""
 
-_NUM_ONSETS = NUM_REPLAYED - 1  # samples at which a fault of the actuator may have begun
+_CAUSES = np.array(
+    [
+        (1.0, 0, 0),
+        *((gain, 0, 0) for gain in _GAINS),
+        *((1.0, 0, late) for late in _LATE),
+        *((sign, since, 0) for sign in (-1.0, 0.0) for since in range(NUM_REPLAYED - 1)),
+    ]
+)
+"""Factor of the actuator, the sample at which it began, and samples by which the input is late.
+
+The first is as declared. A fault of the last sample but one is not told from a late plant.
+"""
+
 _SQUARE = 3.0  # of the distance of the filter's points, in standard deviations: that of a normal
 _WIDE = 0.05  # after a trip, how far a state may move in one sample unexplained, in its scales
 _QUIET = 0.25  # fraction of critical levels and input limits below which it is at rest
 _NUM_QUIET, _LONGEST = 5, 60  # samples of rest that end the brake; samples after which it ends
 _LOST = 2.0  # times the critical levels: what is beyond is not braked any more
-# A fault of the actuator must explain the last samples as well as a declared plant would, and
-# better by so much in squares; or so much better, where what is unexplained is so large. Without
-# this, a late plant was taken for one that turned its sign.
-_BY_FAR, _CLEARLY, _LARGE = 100.0, 0.02, 100.0
+# Another sign must explain the last samples better by so much, in squares of standard deviations,
+# and leave less than this, or than this part.
+_BETTER, _EXPLAINED, _PART = 15.0, 50.0, 0.02
+_BIAS = 300.0  # of a sensor, in standard deviations of its noise, as far as it may have jumped
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,9 +161,27 @@ class Guard:
             depth, watched = int(rules.pop("depth")), np.array(rules.pop("watched"), int)
             arrays = {name: np.array(value, float) for name, value in rules.items()}
             programs = (Program.from_text(data[name]) for name in _PROGRAMS)
-            return cls(GuardRules(depth=depth, watched=watched, **arrays), *programs)
+            read = cls(GuardRules(depth=depth, watched=watched, **arrays), *programs)
         except (KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"the guard is damaged ({error!r})") from None
+        if not read._has_its_points():
+            raise ValueError(
+                "the guard was made by another version of excite: make it again "
+                "(excite falsify POLICY --guard --certify FILE)"
+            )
+        return read
+
+    def _has_its_points(self) -> bool:
+        """Whether the programs are for as many points as the filter has."""
+        rules, count = self.rules, num_points(self.rules)
+        points = np.tile(rules.mean, (count, 1))
+        past = np.tile(rules.rest, (count, rules.depth, 1))
+        try:
+            with np.errstate(all="ignore"):
+                states, outputs = self.advance(points, past), self.output(points)
+        except (ValueError, IndexError):
+            return False
+        return states.shape == (count, rules.num_states) and outputs.shape[:1] == (count,)
 
 
 _PROGRAMS = "advance", "output"
@@ -158,7 +189,8 @@ _PROGRAMS = "advance", "output"
 
 def num_points(rules: GuardRules) -> int:
     """Points of a guard's programs: those of its filter, or of a replay."""
-    return max(2 * len(rules.mean) + 1, NUM_CAUSES)
+    n = len(rules.mean)
+    return max(2 * n + 1, len(_CAUSES) + n)
 
 
 class Model(NamedTuple):
@@ -180,12 +212,13 @@ class Belief(NamedTuple):
     Attributes:
         mean, root: of states and quantities.
         inputs: applied.
-        means: estimates.
+        means, roots: estimates, and roots of their covariance.
         measured: outputs.
         recent: squared innovations.
         score: the three numbers that are compared with the thresholds, now.
         largest: their largest values so far.
         sign: factor of the actuator in the brake: 1, -1 or 0.
+        num_since: samples since it was inferred.
         is_blind: whether the brake does not believe the sensor.
         k: samples so far.
         num_braked: samples since the trip; 0 before it.
@@ -196,11 +229,13 @@ class Belief(NamedTuple):
     root: AnyArray
     inputs: AnyArray
     means: AnyArray
+    roots: AnyArray
     measured: AnyArray
     recent: AnyArray
     score: AnyArray
     largest: AnyArray
     sign: AnyArray
+    num_since: AnyArray
     is_blind: AnyArray
     k: AnyArray
     num_braked: AnyArray
@@ -219,17 +254,20 @@ class Belief(NamedTuple):
 
 def start(xp: ModuleType, rules: GuardRules) -> Belief:
     """Before the first measurement."""
-    mean, count = xp.asarray(rules.mean, float), NUM_REPLAYED + rules.depth
+    mean, root = (xp.asarray(x, float) for x in (rules.mean, rules.root))
+    count = max(_LATE) + NUM_REPLAYED + rules.depth
     return Belief(
         mean=mean,
-        root=xp.asarray(rules.root, float),
+        root=root,
         inputs=xp.tile(xp.asarray(rules.rest, float), (count, 1)),
         means=xp.tile(mean, (NUM_REPLAYED, 1)),
+        roots=xp.tile(root, (NUM_REPLAYED, 1, 1)),
         measured=xp.full((NUM_REPLAYED, len(rules.noise)), np.nan),
         recent=xp.ones(NUM_RECENT) * len(rules.noise),
         score=xp.zeros(3),
         largest=xp.zeros(3),
         sign=xp.asarray(1.0),
+        num_since=xp.asarray(0),
         is_blind=xp.asarray(False),
         k=xp.asarray(0),
         num_braked=xp.asarray(0),
@@ -287,11 +325,13 @@ def observed(
         mean=mean,
         root=root,
         means=xp.concatenate([belief.means[1:], mean[None]]),
+        roots=xp.concatenate([belief.roots[1:], root[None]]),
         measured=xp.concatenate([belief.measured[1:], measured[None]]),
         recent=recent,
         score=score,
         largest=xp.where(is_braking, belief.largest, xp.fmax(belief.largest, score)),
         sign=sign,
+        num_since=xp.where(sign != belief.sign, 0, belief.num_since + 1),
         is_blind=is_blind,
         k=belief.k + 1,
         num_braked=belief.num_braked + (is_braking | trips),
@@ -379,35 +419,58 @@ def _replayed(
 ) -> tuple[AnyArray, AnyArray]:
     """State now, and the actuator's sign, that explain the last samples best.
 
-    The last samples are played again from the estimate before them: as declared, and with an
-    actuator that turned its sign or died two or more samples ago: in less, a plant that is
-    only late looks the same.
+    The last samples are played again from the estimate before them, once for each cause. How well
+    a cause explains them is its marginal likelihood, to first order in what was uncertain of that
+    estimate. A jump of the sensor explains them, too: for it, a declared plant is believed.
     """
-    n, depth = rules.num_states, rules.depth
-    since = range(_NUM_ONSETS)
-    signs = np.array([1.0] + [-1.0] * _NUM_ONSETS + [0.0] * _NUM_ONSETS)
-    onsets = np.array([NUM_REPLAYED, *since, *since])
+    n, depth, count = rules.num_states, rules.depth, len(_CAUSES)
+    noise = xp.asarray(rules.noise)
+    gain, since, late = _CAUSES.T
     # A fault since the first of these samples was there before: older inputs had it too.
-    begins = np.where(onsets == 0, -depth, onsets)
-    factor = np.where(np.arange(-depth, NUM_REPLAYED) >= begins[:, None], signs[:, None], 1.0)
-    inputs = xp.asarray(factor)[:, :, None] * belief.inputs[None]
-    quantities = xp.clip(belief.means[0, n:], -1.0, 1.0)
-    points = xp.tile(xp.concatenate([belief.means[0, :n], quantities]), (len(signs), 1))
-    seen = xp.concatenate([belief.measured[1:], measured[None]])
-    error = xp.zeros(len(signs))
-    for i in range(NUM_REPLAYED):
+    begins = np.where(since == 0, -depth, since)
+    factor = np.where(np.arange(-depth, NUM_REPLAYED) >= begins[:, None], gain[:, None], 1.0)
+    starts, length = (max(_LATE) - late).astype(int), NUM_REPLAYED + depth
+    acting = xp.stack([belief.inputs[first : first + length] for first in starts])
+    acting = xp.asarray(factor)[:, :, None] * acting
+    before = xp.concatenate([belief.means[0, :n], xp.clip(belief.means[0, n:], -1.0, 1.0)])
+    # Each cause from the estimate, then as declared from one standard deviation beside it.
+    points = xp.concatenate([xp.tile(before, (count, 1)), before[None] + belief.roots[0].T])
+    inputs = xp.concatenate([acting, xp.tile(acting[:1], (len(before), 1, 1))])
+    offs, slopes = [], []
+    for i, seen in enumerate([*belief.measured[1:], measured]):
         states = model.advance(points, inputs[:, i + 1 : i + 1 + depth])
         points = xp.concatenate([states, points[:, n:]], axis=1)
-        off = (model.output(points) - seen[i][None]) / xp.asarray(rules.noise)[None]
-        error = error + xp.sum(xp.where(xp.isfinite(seen[i])[None], off, 0.0) ** 2, axis=1)
+        outputs, is_seen = model.output(points), xp.isfinite(seen)[None]
+        offs.append(xp.where(is_seen, (outputs[:count] - seen[None]) / noise[None], 0.0))
+        slope = (outputs[count:] - outputs[:1]) / noise[None]
+        slopes.append(xp.where(is_seen, slope, 0.0))
+    off, slope = xp.concatenate(offs, axis=1), xp.concatenate(slopes, axis=1)
+    covariance = xp.eye(off.shape[1]) + slope.T @ slope
+    # A sensor that jumped at one of the samples: one more uncertain number.
+    jumps = _jumps(len(noise))
+    solved = xp.linalg.solve(covariance, xp.concatenate([off.T, xp.asarray(jumps.T)], axis=1))
+    error = xp.sum(off.T * solved[:, :count], axis=0)
+    size = 1 + _BIAS**2 * xp.sum(jumps.T * solved[:, count:], axis=0)
+    told = _BIAS**2 * (off[0] @ solved[:, count:]) ** 2 / size - xp.log(size)
+    as_declared = error[:1] - xp.maximum(xp.max(told), 0.0)
+    error = xp.concatenate([as_declared, error[1:]])
     error = xp.where(xp.isfinite(error), error, xp.inf)
+    signs = np.minimum(gain, 1.0)
+    # The first estimates after a fault are of a plant without it, and seem to acquit the actuator.
+    is_early = (belief.sign != 1.0) & (belief.num_since < NUM_REPLAYED)
+    error = xp.where((signs == 1.0) & is_early, xp.inf, error)
     best, as_now = xp.argmin(error), xp.argmin(xp.where(signs == belief.sign, error, xp.inf))
-    limit, better = rules.thresholds[0], error[as_now] - error[best]
-    is_explained = (error[best] < limit) & (error[as_now] > limit) & (better > _BY_FAR)
-    is_large = error[as_now] > _LARGE * limit
-    is_clear = is_explained | (is_large & (error[best] < _CLEARLY * error[as_now]))
+    limit = max(_EXPLAINED, off.shape[1] + 4 * math.sqrt(2 * off.shape[1]))
+    is_explained = error[best] < xp.maximum(limit, _PART * error[as_now])
+    is_clear = is_explained & (error[as_now] - error[best] > _BETTER)
     best = xp.where(is_clear, best, as_now)
     return points[best, :n], xp.asarray(signs)[best]
+
+
+def _jumps(num_outputs: int) -> np.ndarray:
+    """A step of each output at each of the last samples: rows of [jump, sample and output]."""
+    since = np.tril(np.ones((NUM_REPLAYED, NUM_REPLAYED))).T
+    return np.kron(since, np.eye(num_outputs))
 
 
 class GuardedPlayer(AbstractPlayer):
