@@ -18,7 +18,6 @@ As for a supervisor (`excite.safety`), the functions are pure, over arrays of Nu
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from types import ModuleType
@@ -460,8 +459,7 @@ def _replayed(
     is_early = (belief.sign != 1.0) & (belief.num_since < NUM_REPLAYED)
     error = xp.where((signs == 1.0) & is_early, xp.inf, error)
     best, as_now = xp.argmin(error), xp.argmin(xp.where(signs == belief.sign, error, xp.inf))
-    limit = max(_EXPLAINED, off.shape[1] + 4 * math.sqrt(2 * off.shape[1]))
-    is_explained = error[best] < xp.maximum(limit, _PART * error[as_now])
+    is_explained = error[best] < xp.maximum(_EXPLAINED, _PART * error[as_now])
     is_clear = is_explained & (error[as_now] - error[best] > _BETTER)
     best = xp.where(is_clear, best, as_now)
     return points[best, :n], xp.asarray(signs)[best]
