@@ -5,8 +5,9 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --co
 
 PYTEST := $(BIN)/python -m pytest -n 2 --dist worksteal
 # Thousands of small programs are compiled in the tests and run once: compiling is most of their time.
-# The flags are of the jaxlib in constraints.txt; the other suites compile as users do.
-QUICK := XLA_FLAGS="--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
+# What is long is optimised as users' programs are. The flags are of the jaxlib in constraints.txt.
+FEWER_PASSES := --xla_cpu_use_fusion_emitters=false
+QUICK := XLA_FLAGS="$(FEWER_PASSES) --xla_backend_optimization_level=0"
 
 .PHONY: help demo test units test-pages test-science test-all check-results coverage lint types docs results \
     agents policies certificates evaluations clean
@@ -27,8 +28,8 @@ units: .venv/dev ## unit and command-line tests
 test-pages: .venv/dev ## commands of the documentation, and the bench page in a browser
 	$(QUICK) $(PYTEST) tests/pages
 
-test-science: .venv/dev ## promises of the shipped policies, baselines, trainings from end to end
-	$(PYTEST) -m science
+test-science: .venv/dev ## promises of the shipped policies, baselines, trainings from end to end, and what takes long
+	XLA_FLAGS="$(FEWER_PASSES)" $(PYTEST) -m science
 
 check-results: .venv/dev ## the committed results are what the documentation says of them
 	$(BIN)/python -m pytest tests/results

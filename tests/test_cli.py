@@ -713,6 +713,7 @@ def test_options_override_the_study(run, here):
 # A user's own plant
 
 
+@pytest.mark.science
 def test_a_users_plant_goes_through_everything(run, here):
     plant = "own.py:Tank"
     assert run("plants", plant, "--json").json["plants"][0]["name"] == "tank"
@@ -1071,6 +1072,7 @@ def test_an_interrupt_that_a_library_has_swallowed_is_not_lost():
         signal.signal(signal.SIGINT, before)
 
 
+@pytest.mark.science
 def test_an_interrupted_benchmark_ends_with_130_and_leaves_nothing(here, tmp_path):
     before, cache = contents(here), tmp_path / "cache"
     program = subprocess.Popen(

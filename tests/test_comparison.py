@@ -26,6 +26,7 @@ def compared() -> Comparison:
     return ex.compare_plants(records[0], plants, validate=records[1])
 
 
+@pytest.mark.science
 def test_the_plant_that_made_a_record_comes_first(compared):
     best, *others = compared.plants
     assert best.name == "aero2+coulomb_pitch_rate"
@@ -37,6 +38,7 @@ def test_the_plant_that_made_a_record_comes_first(compared):
     assert [p.bic for p in compared.plants] == sorted(p.bic for p in compared.plants)
 
 
+@pytest.mark.science
 def test_the_criterion_counts_parameters_states_and_noise(compared):
     best = compared.plants[0]
     assert best.num_unknowns == 4 + 1  # J_p, K_pu, D_p, the friction; and one output's noise
@@ -59,6 +61,7 @@ def test_an_effect_that_is_not_there_gains_by_chance_only():
     assert second.p_value > 0.01
 
 
+@pytest.mark.science
 def test_the_table_shows_fits_tests_and_the_held_out_record(compared):
     lines = str(compared).splitlines()
     assert lines[1].split()[:2] == ["plant", "unknowns"]

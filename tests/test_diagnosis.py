@@ -314,6 +314,7 @@ def regressions(rho: float, count: int = 300) -> tuple[np.ndarray, np.ndarray, n
     return true, np.sqrt(np.mean(found, axis=0)), np.sqrt(np.mean(white, axis=0))
 
 
+@pytest.mark.science
 def test_robust_standard_errors_hold_for_noise_that_remembers():
     true, found, white = regressions(0.9)
     assert np.all(np.abs(found / true - 1) < 0.1)

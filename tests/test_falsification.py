@@ -162,6 +162,7 @@ def test_a_range_that_is_not_allowed_is_one_sentence(ranges, words):
         Uncertainty.of(Aero2(), 0.3, ranges)
 
 
+@pytest.mark.science
 @pytest.mark.parametrize("effect", ["bias_y", "drift_y"])
 def test_levels_are_judged_without_errors_of_the_sensor(effect):
     plant = Oscillator()
@@ -184,6 +185,7 @@ def test_levels_are_judged_without_errors_of_the_sensor(effect):
 # -------------------------------------------------------------------------------- the search
 
 
+@pytest.mark.science
 def test_the_search_finds_a_resonance_inside_the_box_that_no_corner_shows():
     plant = Oscillator()
     box = Uncertainty.of(plant, 0.3, {"zeta": (0.05, 0.05)})
@@ -198,6 +200,7 @@ def test_the_search_finds_a_resonance_inside_the_box_that_no_corner_shows():
     assert abs(w - np.linspace(3.5, 6.5, 201)[int(np.argmax(grid))]) < 0.03
 
 
+@pytest.mark.science
 def test_searched_noise_is_at_least_as_bad_as_that_of_a_seed_and_stays_within_its_bound():
     loop = PositionLoop(Square(), amplitude=0.5, gain=1.5)
     found = search(OnPlant(Uncertainty.of(Oscillator(), 0.1), loop, 100), SMALL, seed=1)
@@ -290,6 +293,7 @@ def test_a_certificate_travels_in_the_policy_and_leaves_its_hash():
     assert again.certified(None).to_bytes() == policy.certified(None).to_bytes()
 
 
+@pytest.mark.science
 def test_a_part_of_the_policys_length_gives_no_certificate(tmp_path):
     short = ex.falsify(small_policy(Aero2()), budget=100, steps=10)
     with pytest.raises(ValueError, match="whole length of 20 steps: got 10"):
@@ -300,6 +304,7 @@ def test_a_part_of_the_policys_length_gives_no_certificate(tmp_path):
     assert "whole length of 500 steps" in result.stderr
 
 
+@pytest.mark.science
 def test_the_plants_of_the_training_are_the_default():
     decision = {"spread": 0.4, "constants": {"d_S": [0.0018, 0.0021], "of_another": [0, 1]}}
     made = {"spread": 0.1, "decision": decision, "uncertainty": {"initial_pitch": [-0.1, 0.1]}}
@@ -364,6 +369,7 @@ def test_a_largest_output_is_shown_in_few_digits(value, text):
     assert shown_nearness(value) == text
 
 
+@pytest.mark.science
 def test_the_worst_experiment_with_searched_noise_is_kept():
     loop = PositionLoop(Square(), amplitude=0.5, gain=1.5)
     found = ex.falsify(loop, Oscillator(), steps=60, budget=100)
@@ -381,6 +387,7 @@ def test_the_worst_experiment_with_searched_noise_is_kept():
     assert f"{found.noise_nearness:.3f} of the level" in repr(found)
 
 
+@pytest.mark.science
 def test_a_policys_nearness_is_that_of_its_replay(tmp_path):
     policy = small_policy(Aero2(), steps=60)
     found = ex.falsify(policy, budget=100)
@@ -539,6 +546,7 @@ def certified():
     return ex.falsify(small_policy(Aero2()), budget=100).certified()
 
 
+@pytest.mark.science
 @pytest.mark.parametrize(
     ("change", "options", "words"),
     [
@@ -560,6 +568,7 @@ def test_a_run_that_needs_a_certificate_refuses_any_other(certified, change, opt
         ex.run(policy=policy, **arguments)
 
 
+@pytest.mark.science
 def test_a_run_with_the_certificate_it_needs(certified):
     planned = ex.run(policy=certified, plant="aero2", dry_run=True, require_certificate=True)
     assert len(planned.inputs) == 20
@@ -567,6 +576,7 @@ def test_a_run_with_the_certificate_it_needs(certified):
         ex.run(excitation="chirp", plant="aero2", dry_run=True, require_certificate=True)
 
 
+@pytest.mark.science
 @pytest.mark.parametrize(
     "change",
     [

@@ -257,6 +257,7 @@ def test_the_penalty_grows_while_plants_are_in_danger():
     assert dangerous["penalty_weight"] == pytest.approx(FEW.penalty_weight * np.exp(0.02 * 6))
 
 
+@pytest.mark.science
 def test_a_training_that_was_interrupted_ends_with_the_same_policy():
     env, files = env_of(OBJECTIVES["D"]), []
     whole = train(env, FEW, 0, on_boundary=lambda make, _: files.append(make().to_bytes()))
@@ -320,7 +321,8 @@ class Steep(InformationGain):
         return jnp.sqrt(jnp.where(is_flat, 1.0, 0.0) + value - jax.lax.stop_gradient(value))
 
 
-@pytest.mark.parametrize("limit", [LONG(0.0), 0.028])
+@pytest.mark.science
+@pytest.mark.parametrize("limit", [0.0, 0.028])
 def test_updates_that_are_not_finite_are_counted_and_never_reach_the_weights(limit):
     env = env_of(Steep(ALL, prior_sd_of(0.3), dense=False, limit=limit))
     settings = dataclasses.replace(FEW, num_updates=12, watch_every=12)
@@ -374,6 +376,7 @@ def adversaries_after(steps: int, settings=AGAINST):
     return after.adversaries, np.asarray(jax.vmap(play)(after.adversaries))
 
 
+@pytest.mark.science
 def test_adversaries_climb_from_where_they_start_and_come_nearest_first():
     _, started = adversaries_after(1)  # one step looks at the start alone
     _, climbed = adversaries_after(4)
@@ -381,6 +384,7 @@ def test_adversaries_climb_from_where_they_start_and_come_nearest_first():
     np.testing.assert_array_equal(np.argsort(-climbed), np.arange(6))
 
 
+@pytest.mark.science
 def test_noise_of_adversaries_is_searched_within_its_bound():
     half = dataclasses.replace(AGAINST, adversary_noise=0.5)
     within, _ = adversaries_after(4, half)
@@ -399,6 +403,7 @@ def test_without_their_time_adversaries_stay_where_they_began():
     np.testing.assert_array_equal(same.adversaries.point, 0.0)
 
 
+@pytest.mark.science
 def test_the_penalty_of_adversaries_lowers_the_nearness_in_the_declared_uncertainty():
     env = uncertain_env()
     heavy = dataclasses.replace(AGAINST, penalty_weight=1e6, adversary_margin=0.05)
@@ -440,6 +445,7 @@ def test_a_policy_that_a_search_finds_too_near_ranks_below_a_safe_one_of_less_wo
     assert rank(settings, {**row, "worst_nearness": 0.9}) == rank(settings, row)
 
 
+@pytest.mark.science
 def test_adversaries_that_diverge_leave_the_weights_finite_and_moving():
     env = uncertain_env()
     fast = Uncertainty.of(env.plant, 0.3, {"J_p": (1e-7, 0.03)})

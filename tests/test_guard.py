@@ -161,12 +161,14 @@ def played(guarding: GuardFilter, faults=None, **effects):
     return run_batch(hardware, CHIRP, rules, STEPS, READINGS, guarding)
 
 
+@pytest.mark.science
 def test_declared_plants_do_not_trip(guarding):
     runs = played(guarding)
     np.testing.assert_array_equal(runs.trip, Trip.NONE)
     assert (np.asarray(runs.memory.largest) < guarding.rules.thresholds).all()
 
 
+@pytest.mark.science
 def test_a_wrong_sign_is_found_at_once_and_ends_the_experiment_at_rest(guarding):
     runs = played(guarding, gain_voltage=-1.0)
     np.testing.assert_array_equal(runs.trip, Trip.UNEXPLAINED)
@@ -174,6 +176,7 @@ def test_a_wrong_sign_is_found_at_once_and_ends_the_experiment_at_rest(guarding)
     assert not np.asarray(runs.is_violation).any()
 
 
+@pytest.mark.science
 def test_after_a_flip_the_brake_turns_its_sign_too(guarding):
     runs = played(guarding, Faults(actuator_sign=3.0))
     assert (np.asarray(runs.memory.tripped_at) >= 30).all()
@@ -181,6 +184,7 @@ def test_after_a_flip_the_brake_turns_its_sign_too(guarding):
     assert np.abs(np.asarray(runs.measured)[:, -1]).max() < 0.2
 
 
+@pytest.mark.science
 @pytest.mark.parametrize("what", ["late", "strong", "biased"])
 def test_other_faults_are_not_taken_for_a_turned_sign(guarding, what):
     guard_ = guarding.guard()
@@ -205,6 +209,7 @@ def test_other_faults_are_not_taken_for_a_turned_sign(guarding, what):
     assert -1.0 not in found
 
 
+@pytest.mark.science
 def test_the_estimate_starts_again_where_the_sign_turns(guarding):
     """A state that the wrong sign explained would mislead the brake for many samples."""
     guard_ = guarding.guard()
@@ -227,6 +232,7 @@ def test_the_estimate_starts_again_where_the_sign_turns(guarding):
     assert np.max(errors) < 0.05
 
 
+@pytest.mark.science
 def test_what_seems_dead_is_braked_all_the_same(guarding):
     rules = guarding.rules
     belief = guard.start(np, rules)
@@ -237,6 +243,7 @@ def test_what_seems_dead_is_braked_all_the_same(guarding):
     assert abs(acting[0]) > 1
 
 
+@pytest.mark.science
 def test_the_guard_knows_what_the_supervisor_let_through(guarding):
     """Without it, inputs that a slew limit or a trip changed would look like another plant."""
     keys = jax.random.split(jax.random.key(3), 2)
@@ -248,6 +255,7 @@ def test_the_guard_knows_what_the_supervisor_let_through(guarding):
     np.testing.assert_array_equal(runs.memory.num_braked, 0)
 
 
+@pytest.mark.science
 def test_at_its_level_a_plant_is_braked_not_let_go(guarding):
     rules, model = guarding.rules, guarding.model.functions()
     free = dataclasses.replace(rules, thresholds=np.full(3, np.inf))
@@ -258,6 +266,7 @@ def test_at_its_level_a_plant_is_braked_not_let_go(guarding):
     assert int(belief.num_braked) == 1
 
 
+@pytest.mark.science
 def test_a_sensor_that_stands_still_is_not_believed(guarding):
     runs = played(guarding, Faults(sensor_frozen=3.0))
     assert np.asarray(runs.memory.is_blind).all()
@@ -266,6 +275,7 @@ def test_a_sensor_that_stands_still_is_not_believed(guarding):
     assert (last < RULES.critical).all()
 
 
+@pytest.mark.science
 def test_numpy_and_jax_come_to_the_same_belief(guarding):
     own = Guard.from_dict(json.loads(json.dumps(guarding.guard().to_dict())))
     record = ex.simulate(PLANT, CHIRP, steps=STEPS, params={"J_p": 0.025}, seed=2)
@@ -306,6 +316,7 @@ def guarded_file(tmp_path_factory):
     return path
 
 
+@pytest.mark.science
 def test_the_guard_travels_in_the_policys_file_and_leaves_its_hash(guarded_file):
     policy = ex.read_policy(guarded_file)
     assert policy.guard is not None
@@ -313,6 +324,7 @@ def test_the_guard_travels_in_the_policys_file_and_leaves_its_hash(guarded_file)
     assert "with a guard" in repr(policy)
 
 
+@pytest.mark.science
 def test_run_plays_behind_the_guard_and_records_what_it_did(guarded_file, tmp_path):
     good = ex.run(policy=guarded_file, plant="aero2", guard=True, fast=True, spread=0.2,
                   out=tmp_path / "good.csv")  # fmt: skip
@@ -328,6 +340,7 @@ def test_run_plays_behind_the_guard_and_records_what_it_did(guarded_file, tmp_pa
     assert np.abs(bad.record.outputs).max() < np.deg2rad(40)
 
 
+@pytest.mark.science
 def test_a_guard_is_refused_where_there_is_none(tmp_path, guarded_file):
     bare = tmp_path / "bare.safetensors"
     lively_policy().save(bare)
@@ -345,6 +358,7 @@ def test_a_guard_is_refused_where_there_is_none(tmp_path, guarded_file):
         ex.falsify("chirp", "aero2", guard=True, budget=100)
 
 
+@pytest.mark.science
 def test_a_damaged_guard_is_one_sentence(guarded_file, tmp_path):
     policy = ex.read_policy(guarded_file)
     broken = policy.certified(policy.certificate, {"rules": {}})
@@ -352,6 +366,7 @@ def test_a_damaged_guard_is_one_sentence(guarded_file, tmp_path):
         ex.run(policy=broken, plant="aero2", guard=True, fast=True, out=tmp_path / "r.csv")
 
 
+@pytest.mark.science
 def test_a_guard_of_another_version_is_refused(guarding):
     whole, functions = guarding.guard(), guarding.model.functions()
     rules = whole.rules

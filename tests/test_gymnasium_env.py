@@ -283,6 +283,7 @@ np.savez(sys.argv[1], *seen)
 """
 
 
+@pytest.mark.science
 def test_a_program_in_single_precision_sees_the_same_and_stays_in_it(tmp_path):
     files = [tmp_path / "single.npz", tmp_path / "double.npz"]
     for path in files:

@@ -380,6 +380,7 @@ def identified(name: str, **hold: float) -> ex.Identification:
     return ex.identify(record, plant, hold=hold)
 
 
+@pytest.mark.science
 @pytest.mark.parametrize("name", ["sum", "scaling"])
 def test_a_held_parameter_moves_the_others_as_told(name):
     """Against another fit with the held parameter 1 % larger."""
@@ -424,6 +425,7 @@ def test_a_record_may_show_what_random_inputs_do_not():
     assert seen.tried.endswith("and the given inputs, 500 samples")
 
 
+@pytest.mark.science
 def test_a_parameter_held_at_its_bound_or_known_needs_no_explanation():
     assert not [s for s in identified("ratio", J=2.0).verdict if "structurally" in s]
     plant = CASES["all seen"][0]
@@ -441,6 +443,7 @@ def test_a_parameter_held_at_its_bound_or_known_needs_no_explanation():
     assert not [s for s in result.verdict if "structurally" in s]
 
 
+@pytest.mark.science
 def test_data_in_which_nothing_can_be_seen_name_the_structure():
     plant = mass(lambda x, u, p: [x[1], u - x[1] - 9 * x[0] + 0 * p.z], {"z": 2})
     with pytest.raises(

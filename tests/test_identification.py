@@ -141,6 +141,7 @@ def test_a_known_parameter_is_held_and_the_others_gain(chirp, result):
         assert known.std_error[name] <= result.std_error[name] * 1.001
 
 
+@pytest.mark.science
 def test_a_lag_may_be_known_or_estimated():
     plant = Aero2Lag()
     signal = Chirp().sequence(plant, 300, jax.random.key(0))
@@ -268,6 +269,7 @@ class Slow(AbstractPlant):
         return state
 
 
+@pytest.mark.science
 def test_an_unseen_parameter_is_not_held_where_it_ruins_the_fit():
     record = record_of(Slow(), PRBS(clock=1), params=Slow().Params(0.8, 0.012), sidecar=False)
     result = identify([record], Slow())
@@ -277,6 +279,7 @@ def test_an_unseen_parameter_is_not_held_where_it_ruins_the_fit():
     assert result.fitted[0].fit_percent["x"] > 50
 
 
+@pytest.mark.science
 def test_a_held_value_that_contradicts_the_data_is_told():
     """The search runs away to zero, which may be the truth or a sign of wrong data."""
     record = record_of(PLANT, params=TRUE._replace(D_p=jnp.asarray(1e-9)))
@@ -289,6 +292,7 @@ def test_a_held_value_that_contradicts_the_data_is_told():
     assert_within_sd(right, TRUTH)
 
 
+@pytest.mark.science
 def test_a_coarse_integration_is_told():
     class Coarse(DCMotor):
         definition = dataclasses.replace(DCMotor.definition, substeps=1)
@@ -325,6 +329,7 @@ def test_a_finer_integration_is_advised_for_the_sampling_time_of_the_data():
     assert finer.substeps == 2 * Coarse().changed(dt=DCMotor.definition.dt).substeps
 
 
+@pytest.mark.science
 def test_an_interval_ends_at_a_parameters_bound_and_zero_is_told():
     decay, hold = free_decay(), {"K_pu": 0.0125, "J_p": TRUTH["J_p"]}
     noise = np.random.default_rng(3).normal(size=(7, 1))
@@ -365,6 +370,7 @@ def noise_only(record: Record) -> Record:
     return dataclasses.replace(record, outputs=noise)
 
 
+@pytest.mark.science
 @pytest.mark.parametrize(
     "spoil",
     [
@@ -402,6 +408,7 @@ def test_a_scale_that_only_the_parameters_show_is_asked_for(foreign):
         assert not any("nominal value" in s for s in silent.verdict)
 
 
+@pytest.mark.science
 def test_a_record_of_another_plant_is_remarked_first_or_refused(chirp):
     result = identify([chirp], Aero2Detailed())
     assert result.verdict[0].endswith("was made with plant 'aero2', not with 'aero2_detailed'")
@@ -430,6 +437,7 @@ def test_a_failed_estimate_says_what_the_estimator_needs_and_shows_no_fit(chirp)
     assert "– to –" not in shown
 
 
+@pytest.mark.science
 def test_a_correlation_needs_two_estimates(chirp):
     held = {"J_p": 0.0232, "D_p": 0.00071}
     assert "correlation" in str(identify([chirp], PLANT))
@@ -680,6 +688,7 @@ def emps_record() -> Record:
     return read_record(path, EMPS.definition, columns, {"force": gain})
 
 
+@pytest.mark.science
 @pytest.mark.parametrize(
     "signs", [(1, -1, 1, -1), (1, 1, 1, 1)], ids=["alternating", "all too large"]
 )

@@ -197,6 +197,7 @@ def test_intervals_of_refitted_records_hold_in_noise_that_remembers(rho):
     assert np.all((share > 0.91) & (share < 0.985)), share
 
 
+@pytest.mark.science
 def test_noise_that_remembers_has_fewer_degrees_of_freedom():
     record = record_of(SLOW, PRBS(clock=20), num_steps=500)
     usual = identify(record, SLOW)
@@ -232,6 +233,7 @@ class Heater(AbstractPlant):
         return state
 
 
+@pytest.mark.science
 def test_the_effect_of_a_constant_is_that_of_another_fit():
     record = record_of(Heater(), num_steps=60)
     result = identify(record, Heater(), uncertain={"mass": "5%", "gain": 0.02})

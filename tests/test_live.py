@@ -60,6 +60,7 @@ def assert_same(first: Path, second: Path) -> None:
     assert read(first / "run.json")["plant"] == read(second / "run.json")["plant"]
 
 
+@pytest.mark.science
 @pytest.mark.parametrize("change", CHANGES.values(), ids=list(CHANGES))
 def test_the_command_of_an_experiment_makes_it_again(change: dict[str, Any], tmp_path: Path):
     run = tmp_path / "page" / "run"

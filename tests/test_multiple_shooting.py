@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.optimize
-from catalogue import FEW_AND_ALL, LONG, PLANTS
+from catalogue import FEW_AND_ALL, PLANTS
 
 from excite.estimation import NLS, Status, stack_experiments
 from excite.estimation.multiple_shooting import MultipleShooting, Point, Segments
@@ -68,6 +68,7 @@ def test_without_gaps_the_triangle_is_of_the_derivatives_of_one_simulation(known
     np.testing.assert_allclose(found.moves[0, : len(starts), :, -1], 0.0, atol=1e-13)
 
 
+@pytest.mark.science
 @pytest.mark.parametrize("known", [True, False])
 def test_blocks_change_nothing(known):
     plant, sd = PLANTS["emps"], jnp.array([1e-3])
@@ -112,6 +113,7 @@ def test_the_estimate_is_the_minimum_that_scipy_finds_for_one_simulation(name):
     assert np.all(np.abs(best.x) < 0.01 * error), (best.x / error).round(4)
 
 
+@pytest.mark.science
 @pytest.mark.parametrize("known", [True, False])
 def test_the_length_of_segments_changes_nothing(known):
     plant = Aero2()
@@ -125,7 +127,8 @@ def test_the_length_of_segments_changes_nothing(known):
         np.testing.assert_allclose(first.covariance, other.covariance, rtol=1e-3)
 
 
-@pytest.mark.parametrize("count", [20, LONG(1000)])
+@pytest.mark.science
+@pytest.mark.parametrize("count", [20, 1000])
 @pytest.mark.parametrize("excitation", [Chirp(), PRBS(), Random()], ids=["chirp", "prbs", "random"])
 def test_plants_within_a_factor_of_three_are_found(excitation, count):
     plant = Aero2()

@@ -340,6 +340,7 @@ def test_the_covariance_allows_for_noise_that_was_declared_wrong(initial_state):
     assert np.all(np.diag(estimate.covariance) > 0.95 * np.diag(right.covariance))
 
 
+@pytest.mark.science
 def test_known_noise_is_not_estimated():
     plant = Aero2()
     doubled = plant.changed(sensor=Sensor(2 * plant.sensor.noise_sd, plant.sensor.resolution))

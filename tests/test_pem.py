@@ -230,6 +230,7 @@ def test_the_intervals_of_disturbed_plants_hold_what_they_promise(name):
     np.testing.assert_allclose(noise, sigma, rtol=0.15)
 
 
+@pytest.mark.science
 def test_without_disturbance_it_is_least_squares():
     record = record_of(AERO2, PRBS(), params=spread_params(AERO2))
     u, y = jnp.asarray(record.inputs[:-1]), jnp.asarray(record.outputs)
@@ -269,6 +270,7 @@ def identified() -> Identification:
     return identify(tank_record(1), TANK, PEM(), validate=tank_record(2, name="v.csv"))
 
 
+@pytest.mark.science
 def test_the_errors_of_the_prediction_are_white_and_those_of_the_simulation_larger():
     result = identified()
     assert result.status == "successful"
@@ -291,6 +293,7 @@ def test_held_out_samples_lie_inside_the_band():
     assert validated.predicted.fit_percent["level"] > validated.fit_percent["level"]
 
 
+@pytest.mark.science
 def test_prediction_and_simulation_are_told_apart():
     result = identified()
     text, data = str(result), json.loads(json.dumps(json_ready(result.to_dict())))
@@ -315,6 +318,7 @@ def test_the_run_folder_has_the_prediction(tmp_path):
     assert "predicted one step ahead" in report_html([tmp_path / "run"])
 
 
+@pytest.mark.science
 def test_uneven_records_with_missing_samples_and_a_known_parameter():
     record, rng = tank_record(1), np.random.default_rng(0)
     is_jump = np.arange(len(record.time)) % 10 == 0  # of the input

@@ -98,6 +98,7 @@ def test_there_is_nothing_to_design(verb):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.science
 def test_a_gap_in_time_begins_nothing_new():
     time = np.array([0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 30.0, 30.1])
     values = concentrations(**TRUTH, time=time)

@@ -113,6 +113,7 @@ def quantiles(values: np.ndarray, log_density: np.ndarray) -> np.ndarray:
 # ---------------------------------------------------------------------- linear plants
 
 
+@pytest.mark.science
 def test_a_linear_plant_has_students_t():
     record = line(1.3, 0.4)
     result = ex.identify(record, Line, initial_state="known")
@@ -153,6 +154,7 @@ def require_density_of_slope(plant, record: Record, prior: str, slope: np.ndarra
     require_quantiles(drawn, quantiles(slope, log_prior - np.sum(misfit**2, axis=1) / 2))
 
 
+@pytest.mark.science
 def test_a_normal_prior_counts_in_the_unit_of_the_parameter():
     """Of a positive parameter, too, which is searched by its logarithm."""
     slope = np.linspace(1.0, 1.35, 4001)
@@ -160,11 +162,13 @@ def test_a_normal_prior_counts_in_the_unit_of_the_parameter():
     require_density_of_slope(Bounded, line(1.3), "normal:1.2:0.05", slope, log_prior)
 
 
+@pytest.mark.science
 def test_a_uniform_prior_is_one_of_the_parameter():
     slope = np.linspace(0.2, 1.2, 4001)
     require_density_of_slope(Loud, line(0.7), "uniform:0.2:1.2", slope, 0.0)
 
 
+@pytest.mark.science
 def test_initial_states_are_drawn_too():
     """Two records with times of their own, of which one lacks a measurement."""
     first, second = line(1.3, 0.4, seed=1), line(1.3, -0.2, seed=2)
@@ -200,6 +204,7 @@ def squares(record: Record, log_slope: np.ndarray, offset: float = 0.0) -> np.nd
     return np.sum(error**2, axis=1)
 
 
+@pytest.mark.science
 def test_bounds_cut_the_posterior_noise_may_be_known_and_a_held_parameter_stays_held():
     record = line(1.3, 0.4)
     options = {"hold": {"a": 0.38}, "initial_state": "known"}
@@ -215,6 +220,7 @@ def test_bounds_cut_the_posterior_noise_may_be_known_and_a_held_parameter_stays_
     require_quantiles(samples["posterior"].dataset["b"], np.exp(expected))
 
 
+@pytest.mark.science
 def test_what_cannot_be_simulated_has_no_density_and_constants_may_be_uncertain():
     record = line(2.0)
     result = ex.identify(record, Wall, uncertain={"c": "5%"}, initial_state="known")
@@ -265,6 +271,7 @@ def test_a_curved_posterior_is_that_of_a_grid():
 # ---------------------------------------------------------------------- doors
 
 
+@pytest.mark.science
 def test_the_command_line_writes_samples_and_shows_them(tmp_path):
     record = product()
     rows = np.column_stack([record.time, record.outputs])

@@ -141,6 +141,7 @@ def run() -> tuple[Any, dict[int, bytes]]:
     return train(aero2(), TINY, 3, on_boundary=keep), files
 
 
+@pytest.mark.science
 def test_training_twice_gives_the_same_weights(run):
     again = train(aero2(), TINY, 3)
     assert same(again.weights, run[0].weights)

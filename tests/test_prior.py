@@ -78,6 +78,7 @@ def test_with_known_noise_it_is_the_posterior_of_a_linear_regression():
     np.testing.assert_allclose(found.covariance, np.linalg.inv(information), rtol=1e-6)
 
 
+@pytest.mark.science
 def test_the_estimate_of_other_records_is_a_prior_for_these(tmp_path):
     first, second = noisy(1), noisy(2)
     both = identify([first, second], Ramp)
@@ -311,6 +312,7 @@ def test_students_estimate_is_the_likeliest_one():
     assert not any("cause" in sentence for sentence in found.verdict)
 
 
+@pytest.mark.science
 def test_students_intervals_hold_with_outliers():
     records = [with_outliers(seed).outputs for seed in range(400)]
     plant = Ramp()
@@ -449,6 +451,7 @@ def test_columns_of_held_out_records_need_one():
         identify(noisy(), Ramp, validate_columns={"u": "uVal"})
 
 
+@pytest.mark.science
 def test_a_record_that_is_there_twice_is_remarked():
     one, late = noisy(), dataclasses.replace(noisy(), time=TIME + 100.0, source="copy.csv")
     sentence = "is also a record of the estimation: its fit says nothing about new data"
@@ -471,6 +474,7 @@ def test_a_result_can_be_pickled():
         again.posterior()
 
 
+@pytest.mark.science
 def test_a_prediction_error_search_does_not_claim_a_share_that_it_does_not_know():
     told = []
     identify(noisy(), Ramp, "pem", progress=lambda *step: told.append(step))

@@ -75,6 +75,7 @@ def test_profile_intervals_of_a_reaction_are_scipys():
     assert not any("profile" in axis.get_title() for axis in linear.plot("diagnosis").axes)
 
 
+@pytest.mark.science
 def test_profile_intervals_of_many_samples_are_those_of_standard_errors():
     record = tank_record(1.8)
     linear = ex.identify(record, Tank())

@@ -87,6 +87,7 @@ def test_what_the_plant_leaves_out_is_named_first(effect):
     assert first.p_value < 1e-6
 
 
+@pytest.mark.science
 @pytest.mark.parametrize("effect", ["delay_voltage", "coulomb_pitch_rate"])
 def test_the_remedy_is_a_plant_that_explains_the_record(effect):
     record = recorded("aero2", effect, seed=2)
@@ -98,6 +99,7 @@ def test_the_remedy_is_a_plant_that_explains_the_record(effect):
     assert result.suspects == ()
 
 
+@pytest.mark.science
 def test_a_plant_with_an_extension_may_leave_out_another():
     """The order of the effects is not that in which they are found."""
     both = "aero2+coulomb_pitch_rate+delay_voltage"
@@ -153,6 +155,7 @@ def test_outliers_are_no_cause_of_a_residual_that_an_effect_explains():
     assert result.suspects[0].name in ("delay_voltage", "linear_voltage")
 
 
+@pytest.mark.science
 def test_an_error_of_the_structure_widens_the_intervals_towards_the_true_values():
     parts, inside, as_for_noise = plant_from("aero2").definition.parameters, 0, 0
     for seed in (1, 2, 3):
@@ -171,6 +174,7 @@ def test_an_error_of_the_structure_widens_the_intervals_towards_the_true_values(
     assert as_for_noise < inside
 
 
+@pytest.mark.science
 def test_an_error_of_the_structure_does_not_widen_what_a_prior_tells():
     record = recorded("aero2", "linear_voltage", 1)
     result = ex.identify(
@@ -180,6 +184,7 @@ def test_an_error_of_the_structure_does_not_widen_what_a_prior_tells():
     assert result.std_error["J_p"] < 1.01 * 0.0232 * 1e-6
 
 
+@pytest.mark.science
 def test_outputs_of_different_times_have_a_misfit_too():
     record = unnamed(ex.simulate("dc_motor+delay", "multisine", seed=1))
     outputs = record.outputs.copy()
@@ -237,6 +242,7 @@ def test_an_excerpt_has_the_states_and_the_residual_of_the_whole():
         assert not own[length:].any()
 
 
+@pytest.mark.science
 def test_a_refusal_names_what_would_explain_the_record():
     record = unnamed(ex.simulate("aero2+drift", "multisine", params={"drift_pitch": 0.05}))
     with pytest.raises(ValueError, match=r"no parameter.*; likely cause: with drift_pitch = 0\.05"):

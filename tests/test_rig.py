@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from catalogue import LONG
 from commands import PATIENCE
 
 import excite
@@ -619,6 +620,7 @@ def test_the_loop_and_the_batch_are_one_experiment(many, tmp_path):
     assert ("chirp", Trip.NONE) in trips
 
 
+@pytest.mark.science
 def test_experiments_on_rigs_are_scored_like_those_on_plants():
     keys = jax.random.split(jax.random.key(3), 4)
     bare = {"latency": 0.0, "jitter": 0.0}
@@ -696,6 +698,7 @@ def test_without_latency_the_physics_is_that_of_the_plant(tmp_path):
     np.testing.assert_allclose(largest, np.abs(true).max(axis=0), rtol=1e-9)
 
 
+@pytest.mark.science
 def test_a_record_with_latency_identifies_without_bias(tmp_path):
     seen, (_, sequence) = [], chirp(NUM_SAMPLES, 5.0)
     hardware = Hardware.draw(IDEAL, NUM_READINGS, 0.1, jax.random.key(1), latency=0.01, jitter=0.0)
@@ -1131,8 +1134,8 @@ CODES = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGHUP: 129}
     ("first", "second", "wait"),
     [
         (signal.SIGINT, signal.SIGINT, 0.0),
-        (signal.SIGTERM, signal.SIGINT, 0.005),
-        (signal.SIGINT, signal.SIGTERM, 0.01),
+        LONG(signal.SIGTERM, signal.SIGINT, 0.005),
+        LONG(signal.SIGINT, signal.SIGTERM, 0.01),
     ],
 )
 def test_two_signals_are_an_end_as_one_is(first, second, wait, tmp_path):
@@ -1149,7 +1152,9 @@ def test_two_signals_are_an_end_as_one_is(first, second, wait, tmp_path):
     assert len(read_record(tmp_path / "r.csv", IDEAL.description).time) >= ended["num_samples"] > 3
 
 
-@pytest.mark.parametrize(("number", "code"), CODES.items())
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 130), LONG(signal.SIGTERM, 143), LONG(signal.SIGHUP, 129)]
+)
 def test_a_signal_ends_it_with_its_own_code_and_a_whole_record(number, code, tmp_path):
     with experiment_under_way(tmp_path, 5) as process:
         process.send_signal(number)

@@ -64,6 +64,7 @@ def hardware(plant=PLANT, effects=None, **options) -> Hardware:
 # ----------------------------------------------------------------------------------- delays
 
 
+@pytest.mark.science
 def test_a_delay_acts_on_the_rig_as_in_an_episode():
     """Exactly for whole samples; parts of them are an approximation in the episode."""
     plant, delays = extended(PLANT, ["delay_voltage"]), (0.0, 0.1, 0.3, 0.04, 0.17)
@@ -126,6 +127,7 @@ def test_a_safe_input_does_not_overtake_those_before_it():
     np.testing.assert_allclose(acted, expected)
 
 
+@pytest.mark.science
 def test_a_derivative_by_the_delay_is_that_of_differences():
     plant = extended(PLANT, ["delay_voltage"])
     rig = hardware(effects={"delay_voltage": 0.2})
@@ -283,6 +285,7 @@ def test_a_fault_that_is_not_allowed_is_one_sentence(fault, words):
 # --------------------------------------------------------------------------- falsification
 
 
+@pytest.mark.science
 def test_a_case_on_the_rig_is_the_run_of_its_plant_and_seed():
     plant = Aero2()
     box = Uncertainty.of(plant, 0.3, {"delay_voltage": (0.0, 0.2), "initial_pitch": (-0.1, 0.1)})
@@ -306,6 +309,7 @@ def test_a_case_on_the_rig_is_the_run_of_its_plant_and_seed():
     np.testing.assert_allclose(silent.measured, episode.outputs, rtol=0, atol=1e-5)
 
 
+@pytest.mark.science
 def test_a_gradient_through_the_rig_is_that_of_differences():
     box = Uncertainty.of(PLANT, 0.3, {"delay_voltage": (0.0, 0.25)})
     play = OnRig.of(box, CHIRP, 20, num_readings=5)
@@ -324,6 +328,7 @@ def test_a_gradient_through_the_rig_is_that_of_differences():
         np.testing.assert_allclose(slope[i], differences, rtol=0.02)
 
 
+@pytest.mark.science
 def test_the_worst_plant_on_the_rig_is_replayed_from_its_file(worst, tmp_path):
     found, path = worst
     assert found.certificate()["rig"] is True
@@ -343,6 +348,7 @@ def test_the_worst_plant_on_the_rig_is_replayed_from_its_file(worst, tmp_path):
     assert stages["ascents"] > stages["random plants"]
 
 
+@pytest.mark.science
 def test_a_case_behind_the_filter_stays_below_the_level():
     box, loud = Uncertainty.of(Aero2(), 0.3), Chirp(amplitude=20.0)
     case = Cases(jnp.array([1.0, 1.0, -1.0]), jnp.asarray(0))
@@ -353,6 +359,7 @@ def test_a_case_behind_the_filter_stays_below_the_level():
     assert near[1] < 1 < near[0], near
 
 
+@pytest.mark.science
 def test_what_was_searched_is_said(worst):
     found, _ = worst
     filtered = dataclasses.replace(

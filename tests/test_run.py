@@ -407,6 +407,7 @@ def test_a_filter_says_how_often_it_intervened(call):
     assert json.loads(out)["player"] == quiet
 
 
+@pytest.mark.science
 def test_a_position_loop_is_played_recorded_and_identified(call):
     words = ("--excitation", "loop-multisine", "--set", "amplitude=0.4,gain=16", "--seed", 5)
     code, out, err = call(*words, *FAST, "--steps", 160, "--json")

@@ -58,6 +58,7 @@ def without(record: Record, missing: np.ndarray) -> Record:
     return Record(record.time, record.inputs, outputs, record.metadata, record.source)
 
 
+@pytest.mark.science
 @pytest.mark.parametrize("linear", [False, True], ids=["held", "linear"])
 @pytest.mark.parametrize("time", [EVEN, UNEVEN], ids=["even", "uneven"])
 def test_the_plant_is_found_from_what_scipy_solved(time, linear):
@@ -77,6 +78,7 @@ def test_the_other_hold_is_named_where_it_fits_better(linear):
     )
 
 
+@pytest.mark.science
 def test_a_gap_begins_a_new_part_of_the_record():
     record = solved(EVEN, noise=1e-3)
     parts = [rows(record, slice(0, 80)), rows(record, slice(95, NUM_SAMPLES))]
@@ -87,6 +89,7 @@ def test_a_gap_begins_a_new_part_of_the_record():
     assert one.fitted[0].simulated.shape == with_gap.outputs.shape
 
 
+@pytest.mark.science
 def test_records_of_different_sampling_times_are_fitted_together():
     slow = rows(solved(np.linspace(0.0, 40.0, NUM_SAMPLES)), slice(None))
     found = identify([solved(EVEN), slow], PLANT, validate=[solved(UNEVEN)])

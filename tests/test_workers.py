@@ -261,6 +261,7 @@ def cluster(tmp_path, monkeypatch) -> Iterator[Cluster]:
     cluster.close()
 
 
+@pytest.mark.science
 def test_a_cluster_that_loses_a_worker_gives_what_the_local_engine_gives(cluster, tmp_path):
     tasks = {f"{i}": {"function": "add", "a": i, "b": 1, "seconds": 0.1} for i in range(24)}
     for kind in ("os", "two", "value"):

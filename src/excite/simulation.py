@@ -71,8 +71,8 @@ def step(
         k4 = plant.derivative(x + h * k3, last, params)
         return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4), None
 
-    # A few substeps are unrolled: an inner loop would cost more than they do.
-    return jax.lax.scan(substep, state, jnp.arange(n), unroll=min(n, 4))[0]
+    # Two are unrolled: a loop would cost more. Of more, the copies would take long to compile.
+    return jax.lax.scan(substep, state, jnp.arange(n), unroll=n if n < 3 else 1)[0]
 
 
 def delayed(
@@ -173,6 +173,7 @@ def measure(
     return sensed(plant, output, jax.random.normal(key, output.shape, float))
 
 
+@eqx.filter_jit
 def sensed(
     plant: AbstractPlant, output: Float[Array, " output"], noise: Float[Array, " output"]
 ) -> Float[Array, " output"]:
@@ -247,6 +248,7 @@ def run_episode(
     )
 
 
+@eqx.filter_jit
 def sensor_noise(
     plant: AbstractPlant, num_steps: int, key: PRNGKeyArray
 ) -> Float[Array, "sample output"]:

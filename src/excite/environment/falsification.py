@@ -29,6 +29,7 @@ _CHUNKS = 8, 64  # experiments of one call, where there are few and where there 
 _FIRST_STEP = 0.25  # of an ascent, in half widths of the box
 
 
+@eqx.filter_jit
 def nearness(plant: AbstractPlant, outputs: Float[Array, "time output"]) -> Float[Array, ""]:
     """Largest output over its critical level; infinite for an experiment that diverged."""
     watched, _, critical = watched_levels(plant.definition)

@@ -11,6 +11,7 @@ import enum
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar, TypeAlias
 
 import equinox as eqx
@@ -310,6 +311,7 @@ class _Bounds:
         return xp.where(self.positive, logarithm, values / self.scale)
 
 
+@partial(jax.jit, static_argnums=0)
 def to_search(description: PlantDescription, params: Params) -> Float[Array, " param"]:
     """Search coordinates: log of positive parameters, free ones over their scale.
 
@@ -334,6 +336,7 @@ def _inverse_ramp(value: Array) -> Array:
     return value + jnp.log(-jnp.expm1(-value))
 
 
+@partial(jax.jit, static_argnums=0)
 def from_search(description: PlantDescription, z: Float[Array, " param"]) -> Array:
     """Parameters, as a vector, at search coordinates `z`; the inverse of `to_search`."""
     b = _Bounds(description)

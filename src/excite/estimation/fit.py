@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import jax
 import numpy as np
@@ -205,7 +206,8 @@ def _starts_around(plant: AbstractPlant, start: Params, free: np.ndarray) -> lis
     d, z = plant.definition, to_search(plant.definition, start)
     width = np.where(free, [np.log(3) if p.positive else 2.0 for p in d.parameters], 0.0)
     unit = jax.random.uniform(jax.random.key(0), (_STARTS - 1, len(width)), float, -1.0, 1.0)
-    return [plant.Params(*from_search(d, z + width * row)) for row in unit]
+    points = jax.vmap(partial(from_search, d))(z[None] + width[None] * unit)
+    return [plant.Params(*row) for row in jax.device_get(points)]
 
 
 def is_noise(plant: AbstractPlant, experiments: Experiments, estimate: Estimate) -> bool:

@@ -107,6 +107,7 @@ class NLS(AbstractSearch):
         S = problem.sensitivity(estimate.params, estimate.initial_state)
         return S / sd[None, None, :, None], residual / sd[None, None]
 
+    @eqx.filter_jit
     def weights(
         self, plant: AbstractPlant, experiments: Experiments, estimate: Estimate
     ) -> Float[Array, " output"]:
@@ -114,6 +115,7 @@ class NLS(AbstractSearch):
         problem = Problem(plant, experiments, estimate.params, None)
         return self.scale(problem, estimate.residual) if self.finds_noise else problem.assumed_sd
 
+    @eqx.filter_jit
     def sum_of_squares(
         self, plant: AbstractPlant, experiments: Experiments, estimate: Estimate
     ) -> Float[Array, ""]:
@@ -122,6 +124,7 @@ class NLS(AbstractSearch):
         sd = self.weights(plant, experiments, estimate)
         return self._squares(problem, problem.start, estimate.residual, sd)
 
+    @eqx.filter_jit
     def prior_information(
         self,
         plant: AbstractPlant,

@@ -146,7 +146,8 @@ def way_to_state(word: str | float) -> str | float:
 def _outputs_give_state(plant: AbstractPlant) -> bool:
     """Whether the outputs at one time determine the state, at the initial state."""
     scales = np.array([s.scale for s in plant.definition.states])
-    slope = np.asarray(jax.jacfwd(plant.output)(plant.initial_state, plant.nominal)) * scales
+    derivative = jax.jit(jax.jacfwd(plant.output))
+    slope = np.asarray(derivative(plant.initial_state, plant.nominal)) * scales
     slope = slope / np.array([o.scale for o in plant.definition.outputs])[:, None]
     return bool(np.linalg.matrix_rank(slope, 1e-6) == len(scales))
 

@@ -140,22 +140,26 @@ def relative_size(plant: AbstractPlant, params: Params) -> Float[Array, " param"
     )
 
 
+@jax.jit
 def d_optimality(information: Information) -> Float[Array, ""]:
     """Log det M: minus twice the logarithm of the confidence ellipsoid's volume."""
     sign, value = jnp.linalg.slogdet(information)
     return jnp.where(sign > 0, value, -jnp.inf)
 
 
+@jax.jit
 def a_optimality(information: Information) -> Float[Array, ""]:
     """Trace M^-1: the sum of the parameters' smallest possible variances."""
     return jnp.sum(cramer_rao_bound(information) ** 2)
 
 
+@jax.jit
 def e_optimality(information: Information) -> Float[Array, ""]:
     """Smallest eigenvalue of M: the information in the least certain direction."""
     return jnp.linalg.eigvalsh(information)[0]
 
 
+@jax.jit
 def cramer_rao_bound(information: Information) -> Float[Array, " param"]:
     """Smallest possible standard deviation of each parameter; infinite where M is singular."""
     # Scaling to a unit diagonal first: parameters may differ by many orders of magnitude.

@@ -355,6 +355,7 @@ def as_number(name: str, value: object) -> float:
     raise wrong_type(name, value, "a number")
 
 
+@eqx.filter_jit
 def draw_params(
     plant: AbstractPlant, key: PRNGKeyArray, spread: float | Float[Array, ""]
 ) -> Params:

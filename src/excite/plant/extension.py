@@ -27,6 +27,7 @@ from jaxtyping import Array, Float
 
 from ..description import Parameter, PlantDescription, State, names_of, unknown
 from .contract import AbstractPlant, Params, with_nominal
+from .fields import floats
 
 _INPUT, _VELOCITY, _OUTPUT = (
     ("delay", "lag", "gain", "offset", "saturation", "dead_zone"),
@@ -103,10 +104,10 @@ def extended(plant: AbstractPlant, extensions: Sequence[str]) -> AbstractPlant:
             raise ValueError(f"plant {plant.definition.name!r} has {found[0]!r} already")
         chosen |= {found[0]}
     whole = _class_of(kind, tuple(e for e in possible if e.name in chosen))
-    start, states = whole().initial_state, names_of(whole.definition.states)
+    start, states = np.array(whole().initial_state), names_of(whole.definition.states)
     for name, value in zip(names_of(plant.definition.states), plant.initial_state, strict=True):
-        start = start.at[states.index(name)].set(value)
-    made = plant.as_class(whole, initial_state=start)
+        start[states.index(name)] = value
+    made = plant.as_class(whole, initial_state=floats(start))
     own = {p.name: p.nominal for p in plant.definition.parameters}
     is_changed = any(made.definition.parameter(name).nominal != own[name] for name in own)
     return with_nominal(made, own) if is_changed else made

@@ -109,6 +109,7 @@ class Uncertainty(eqx.Module):
             tuple(box.is_factor for box in boxes.values()),
         )
 
+    @eqx.filter_jit
     def values(self, point: Float[Array, " quantity"]) -> Float[Array, " quantity"]:
         """Of each quantity, in its unit."""
         share, is_factor = (point + 1) / 2, np.array(self.is_factor, bool)
@@ -132,10 +133,12 @@ class Uncertainty(eqx.Module):
         constants = {c.name: value[c.name] for c in d.constants if c.name in value}
         return plant.changed(initial_state=start, sensor=sensor, **constants), params
 
+    @eqx.filter_jit
     def draw(self, key: PRNGKeyArray) -> Float[Array, " quantity"]:
         """A point drawn at random."""
         return jax.random.uniform(key, (len(self.names),), float, -1.0, 1.0)
 
+    @eqx.filter_jit
     def corners(self, key: PRNGKeyArray, most: int) -> Float[Array, "corner quantity"]:
         """All corners of the box, or `most` of them drawn at random where there are more.
 
