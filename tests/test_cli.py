@@ -585,6 +585,7 @@ def test_foreign_names_and_units_are_mapped(run, here):
         assert other.json["params"][name]["estimate"] == pytest.approx(p["estimate"], rel=1e-9)
 
 
+@pytest.mark.science
 def test_a_log_of_another_program_gives_the_same_parameters(run, here):
     rows = list(csv.DictReader((here / "good.csv").read_text().splitlines()))
     lines = ["# a log; of 3 columns", "t;u;w", "[ms];[mV];[deg]"] + [

@@ -53,6 +53,7 @@ def test_the_criterion_counts_parameters_states_and_noise(compared):
     assert {p.num_unknowns for p in free.plants} == {4 + states, 5 + states}
 
 
+@pytest.mark.science
 def test_an_effect_that_is_not_there_gains_by_chance_only():
     record = ex.simulate("aero2", "multisine", seed=3)
     first, second = ex.compare_plants(record, ["aero2", "aero2+delay"]).plants

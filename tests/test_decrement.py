@@ -58,6 +58,7 @@ def test_a_linear_oscillator_is_recovered(factor):
     np.testing.assert_allclose(jnp.stack(estimate.params), jnp.stack(params), rtol=2e-3)
 
 
+@pytest.mark.science
 def test_the_covariance_covers_repeated_noise():
     plant = Oscillator()
     noisy = plant.changed(sensor=dataclasses.replace(plant.sensor, noise_sd=jnp.array([2e-3])))

@@ -321,6 +321,7 @@ def test_robust_standard_errors_hold_for_noise_that_remembers():
     assert np.all(true > 2 * white)  # what they repair
 
 
+@pytest.mark.science
 def test_robust_standard_errors_of_white_noise_are_the_usual_ones():
     true, found, white = regressions(0.0)
     np.testing.assert_allclose(found, white, rtol=0.02)

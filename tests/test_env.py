@@ -389,6 +389,7 @@ def row(tree: Any, i: int) -> Any:
     return jax.tree.map(lambda leaf: leaf[i], tree)
 
 
+@pytest.mark.science
 def test_an_episode_that_ended_is_followed_by_another():
     env = short(AERO2, 3)
     batch, observations = reset_batch(env, KEY, 4)

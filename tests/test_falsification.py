@@ -342,6 +342,7 @@ def diverged():
     return ex.falsify("chirp", Unstable(), steps=300, budget=100)
 
 
+@pytest.mark.science
 def test_a_search_that_diverges_has_a_result(diverged, tmp_path):
     assert diverged.nearness == np.inf
     assert not diverged.is_safe
@@ -355,6 +356,7 @@ def test_a_search_that_diverges_has_a_result(diverged, tmp_path):
         ex.simulate(str(tmp_path / "worst.json"), "chirp", steps=300)
 
 
+@pytest.mark.science
 def test_a_policy_that_diverges_is_certified_as_unsafe():
     policy = small_policy(Unstable(), steps=300)
     certified = ex.falsify(policy, Unstable(), budget=100).certified()
@@ -397,12 +399,14 @@ def test_a_policys_nearness_is_that_of_its_replay(tmp_path):
     assert float(nearness(plant, run.outputs)) == found.nearness
 
 
+@pytest.mark.science
 def test_a_record_is_played_at_its_own_sampling_time():
     record = ex.simulate(Oscillator().changed(dt=0.02), "chirp", steps=40)
     found = ex.falsify(record, Oscillator(), budget=100)
     np.testing.assert_allclose(found.record.dt, 0.02)
 
 
+@pytest.mark.science
 def test_a_plant_of_a_notebook_is_searched_and_cannot_be_saved(tmp_path):
     kind = type("Own", (Oscillator,), {"__module__": "a_notebook"})
     found = ex.falsify("chirp", kind(), steps=10, budget=100)

@@ -395,6 +395,7 @@ def test_noise_of_adversaries_is_searched_within_its_bound():
     np.testing.assert_array_equal(without.noise, 0.0)
 
 
+@pytest.mark.science
 def test_without_their_time_adversaries_stay_where_they_began():
     env = uncertain_env()
     now = Optimisation.start(Network(weights_of(env), env.layout), AGAINST, env)

@@ -401,6 +401,7 @@ def test_a_held_parameter_moves_the_others_as_told(name):
             assert told.split(f"{other} ")[-1].split(" % ")[1].startswith(words.split()[-1])
 
 
+@pytest.mark.science
 def test_a_parameter_that_only_the_data_hide_is_said_to_be():
     plant = CASES["all seen"][0].changed(initial_state=jnp.array([0.3, 0.0]))
     record = ex.simulate(plant, np.zeros((300, 1)), steps=300)

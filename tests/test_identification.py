@@ -214,6 +214,7 @@ def test_records_fitted_together_share_their_information(chirp, foreign):
     assert together.fit()["pitch"] > 99
 
 
+@pytest.mark.science
 def test_each_record_has_an_initial_state_of_its_own(foreign):
     result = identify([free_decay(), foreign], PLANT)
     assert result.held == ()
@@ -310,6 +311,7 @@ def test_a_coarse_integration_is_told():
     assert not any("too coarse" in s for s in identify([record], Finer()).verdict)
 
 
+@pytest.mark.science
 def test_a_finer_integration_is_advised_for_the_sampling_time_of_the_data():
     """The advised number of steps is in the definition's sampling time."""
 

@@ -71,6 +71,7 @@ def test_students_quantile_of_a_known_noise_is_196():
     assert student_95(1e7) == student_95(np.inf)
 
 
+@pytest.mark.science
 def test_degrees_of_freedom_are_values_less_unknowns():
     values = short_tank_records(1, 0.01)[0]
     known, free = (
@@ -274,6 +275,7 @@ def test_uncertain_constants_need_nls():
         identify(simulate("aero2", steps=60), estimator="arx-rls", uncertain={"m": "5%"})
 
 
+@pytest.mark.science
 def test_the_command_line_takes_uncertain_constants(tmp_path):
     simulate("aero2", steps=60).save(tmp_path / "r.csv")
     done = excite("identify", "r.csv", "--uncertain", "m=5%,g=0.01", cwd=tmp_path)

@@ -71,6 +71,7 @@ def test_the_command_of_an_experiment_makes_it_again(change: dict[str, Any], tmp
     assert_same(run, again(run, tmp_path))
 
 
+@pytest.mark.science
 def test_the_command_of_a_file_identifies_it_again(tmp_path: Path):
     source, page = tmp_path / "upload", tmp_path / "page"
     source.mkdir()

@@ -286,6 +286,7 @@ def test_the_errors_of_the_prediction_are_white_and_those_of_the_simulation_larg
         assert abs(result.params[name] - float(true)) < 4 * result.std_error[name]
 
 
+@pytest.mark.science
 def test_held_out_samples_lie_inside_the_band():
     (validated,) = identified().validation
     assert validated.predicted is not None
@@ -307,6 +308,7 @@ def test_prediction_and_simulation_are_told_apart():
     assert data["process_noise"].keys() == data["measurement_noise"].keys() == {"level"}
 
 
+@pytest.mark.science
 def test_the_run_folder_has_the_prediction(tmp_path):
     identified().save(tmp_path / "run")
     names = ("record", "simulated", "predicted", "predicted_sd", "residual")

@@ -38,6 +38,7 @@ def scipys(record: Record) -> tuple[np.ndarray, np.ndarray]:
     return found.x, student_95(degrees) * np.sqrt(np.diag(variance))
 
 
+@pytest.mark.science
 @pytest.mark.parametrize("plant", [Conversion, Product])
 def test_rate_constants_and_intervals_are_those_of_scipy(plant):
     record = measured(plant)

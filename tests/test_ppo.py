@@ -148,6 +148,7 @@ def test_training_twice_gives_the_same_weights(run):
     assert again.curve[1:] == run[0].curve[1:]
 
 
+@pytest.mark.science
 def test_another_seed_gives_other_weights(run):
     assert not same(train(aero2(), TINY, 4).weights, run[0].weights)
 

@@ -144,6 +144,7 @@ def test_the_search_begins_at_the_mean_of_a_prior():
     assert told.params.a == pytest.approx(7.0)
 
 
+@pytest.mark.science
 def test_the_only_parameter_may_end_at_its_bound():
     with pytest.raises(ValueError, match="no parameter is left to estimate: b ended at its bound"):
         identify(noisy(), Ramp, hold={"a": 0.8}, prior={"b": "uniform:0.1:0.25"})
@@ -196,6 +197,7 @@ def test_an_interval_does_not_leave_a_uniform_prior():
     assert found.std_error.b == pytest.approx(free.std_error.b, rel=1e-3)
 
 
+@pytest.mark.science
 def test_the_profile_of_a_linear_plant_with_a_prior_is_its_interval():
     prior = {"a": "normal:0.9:0.05", "b": "normal:0.25:10%"}
     linear, profile = (

@@ -52,6 +52,7 @@ def scipys_profile(record: Record) -> np.ndarray:
     return np.array(ends)
 
 
+@pytest.mark.science
 def test_profile_intervals_of_a_reaction_are_scipys():
     record = product(0.03)
     result = ex.identify(record, Product, initial_state="known", intervals="profile")

@@ -115,6 +115,7 @@ def test_a_record_of_the_very_plant_has_no_suspect():
         assert ex.identify(record, "aero2").suspects == ()
 
 
+@pytest.mark.science
 def test_coloured_noise_is_no_suspect():
     record, rng = ex.simulate("aero2", "multisine", noise={"pitch": 0.0}), np.random.default_rng(1)
     white, noise = 1e-3 * rng.normal(size=len(record.time)), np.zeros(len(record.time))
@@ -148,6 +149,7 @@ def test_outliers_are_counted_and_normal_noise_has_none():
     assert found.remedy.startswith("20 of 4000 values are more than 4 robust standard deviations")
 
 
+@pytest.mark.science
 def test_outliers_are_no_cause_of_a_residual_that_an_effect_explains():
     """What a plant leaves out has heavy tails, too."""
     quiet = unnamed(ex.simulate("aero2+delay", "square", noise={"pitch": 2e-5}, seed=2))
@@ -225,6 +227,7 @@ def test_parts_are_spread_and_taken_where_most_is_left():
         assert group * 4000 <= span.first < (group + 1) * 4000
 
 
+@pytest.mark.science
 def test_an_excerpt_has_the_states_and_the_residual_of_the_whole():
     record, plant = ex.simulate("aero2", "prbs", steps=3000, seed=2), plant_from("aero2")
     data = stack_experiments(plant, [record.inputs[:-1]], [record.outputs], True)

@@ -1061,6 +1061,7 @@ def test_a_file_that_was_there_is_kept_where_no_experiment_begins(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["a.csv"]
 
 
+@pytest.mark.science
 def test_the_lock_of_a_process_that_was_killed_is_gone(tmp_path):
     with experiment_under_way(tmp_path, 3) as process:
         with (
@@ -1113,6 +1114,7 @@ def experiment_under_way(folder: Path, num_needed: int) -> Iterator[subprocess.P
     pytest.fail("no experiment came so far")
 
 
+@pytest.mark.science
 def test_a_killed_process_leaves_a_record_that_identifies(tmp_path):
     plant, num_needed, path = IDEAL, 45, tmp_path / "r.csv"
     with experiment_under_way(tmp_path, num_needed):

@@ -88,6 +88,7 @@ def test_a_delay_acts_on_the_rig_as_in_an_episode():
         np.testing.assert_allclose(runs.measured[i], true, rtol=0, atol=1e-12)
 
 
+@pytest.mark.science
 def test_latency_and_delay_are_one_time():
     late = hardware(latency=0.03)
     both = hardware(effects={"delay_voltage": 0.02}, latency=0.01)

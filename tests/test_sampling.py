@@ -122,6 +122,7 @@ def test_missing_outputs_are_left_out_of_the_likelihood(missing):
         np.testing.assert_allclose(list(found.std_error.values()), sd, rtol=1e-3)
 
 
+@pytest.mark.science
 def test_an_output_may_be_measured_at_another_rate_than_the_others():
     plant = DCMotor()
     u = 5.0 * np.sign(np.sin(0.3 * np.arange(400.0)))[:, None]
