@@ -366,9 +366,51 @@ def test_a_damaged_guard_is_one_sentence(guarded_file, tmp_path):
         ex.run(policy=broken, plant="aero2", guard=True, fast=True, out=tmp_path / "r.csv")
 
 
-@pytest.mark.science
-def test_a_guard_of_another_version_is_refused(guarding):
-    whole, functions = guarding.guard(), guarding.model.functions()
+@functools.cache
+def uncalibrated() -> Guard:
+    """A guard without thresholds, which needs no experiments."""
+    model, rules = model_of("aero2")
+    return GuardFilter(model, rules).guard()
+
+
+def test_a_guard_is_read_as_it_was_written():
+    whole = uncalibrated()
+    again = Guard.from_dict(json.loads(json.dumps(whole.to_dict())))
+    assert again.to_dict() == whole.to_dict()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("mean", 3.0), ("depth", -1), ("rest", [1.0, 2.0, 3.0]), ("noise", "loud")]
+)
+def test_rules_of_another_form_are_damaged(name, value):
+    whole = uncalibrated().to_dict()
+    with pytest.raises(ValueError, match="the guard is damaged"):
+        Guard.from_dict({**whole, "rules": {**whole["rules"], name: value}})
+
+
+@pytest.mark.parametrize("size", [np.nan, np.inf, 1e12])
+def test_a_replay_that_cannot_be_computed_keeps_the_inferred_sign(size):
+    """A simulation may diverge for one of the plants beside the estimate, or for all."""
+    _, rules = model_of("aero2")
+    belief = guard.start(np, rules)._replace(sign=np.float64(-1.0), num_since=np.int64(9))
+
+    def output(points: np.ndarray) -> np.ndarray:
+        """Constant, but for the plants beside the estimate."""
+        values = np.zeros((len(points), len(rules.noise)))
+        values[-len(rules.mean) :] = size
+        return values
+
+    model = guard.Model(lambda points, _: points[:, : rules.num_states], output)
+    far = guard.Model(model.advance, lambda points: output(points) + np.nan)
+    for each in (model, far):
+        with np.errstate(all="ignore"):
+            state, sign = guard._replayed(np, rules, each, belief, np.zeros(len(rules.noise)))
+        assert sign == -1.0
+        assert np.isfinite(state).all()
+
+
+def test_a_guard_of_another_version_is_refused():
+    whole, functions = uncalibrated(), model_of("aero2")[0].functions()
     rules = whole.rules
     few = np.tile(rules.mean, (guard.num_points(rules) - 3, 1))
     past = np.zeros((len(few), rules.depth, len(rules.rest)))

@@ -196,7 +196,7 @@ def test_a_dry_run_writes_and_sends_nothing(call, tmp_path):
     assert told["num_steps"] == 29
     assert told["inputs"]["voltage"]["largest"] == pytest.approx(3.0, abs=0.05)
     assert call("--rig", "own.py:Absent", "--input", "u.csv", "--dry-run")[0] == 0
-    assert [p for p in sorted(tmp_path.iterdir()) if p.name != "__pycache__"] == before
+    assert sorted(tmp_path.iterdir()) == before
 
 
 def test_a_record_is_replaced_only_where_that_is_wanted(call, tmp_path):

@@ -1,6 +1,6 @@
 """The guard on plants that are not as declared: violations without it, with it, and at best.
 
-    python results/guard/scenarios.py aero2 --out results/guard/aero2.json
+    python results/guard/scenarios.py aero2 --declared 2000 --out results/guard/aero2.json
 
 Every scenario is played on simulated rigs with plants drawn from the declared uncertainty of the
 policy, on the same plants and noise without and with the guard of the policy's file. Where

@@ -9,7 +9,8 @@ response is one differentiable function of everything that enters it.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -25,6 +26,8 @@ from .files import json_ready
 from .plant import AbstractPlant, Params, params_from
 from .plant.catalogue import PlantLike, plant_from, with_sensor
 from .record import Record
+
+_State = TypeVar("_State")
 
 
 class Trajectory(eqx.Module):
@@ -71,8 +74,17 @@ def step(
         k4 = plant.derivative(x + h * k3, last, params)
         return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4), None
 
-    # Two are unrolled: a loop would cost more. Of more, the copies would take long to compile.
-    return jax.lax.scan(substep, state, jnp.arange(n), unroll=n if n < 3 else 1)[0]
+    return over_substeps(substep, state, n)
+
+
+def over_substeps(
+    substep: Callable[[_State, Array], tuple[_State, None]], start: _State, n: int
+) -> _State:
+    """What `n` substeps make of a state; a substep gets the state and its index.
+
+    Two are unrolled, because a loop would cost more. More copies take too long to compile.
+    """
+    return jax.lax.scan(substep, start, jnp.arange(n), unroll=n if n < 3 else 1)[0]
 
 
 def delayed(

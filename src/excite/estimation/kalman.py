@@ -23,7 +23,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ..plant import AbstractPlant, Params
-from ..simulation import acting, step
+from ..simulation import acting, over_substeps, step
 
 _NARROW = 1e-5  # least width of a difference, over a state's scale
 
@@ -140,4 +140,4 @@ def _predicted(
         B, _ = differentiated(half, middle, h / 2)
         return (after, A @ (P + Q) @ A.T + 4 * (B @ Q @ B.T) + Q), None
 
-    return jax.lax.scan(substep, (state, covariance), jnp.arange(n), unroll=min(n, 4))[0]
+    return over_substeps(substep, (state, covariance), n)

@@ -276,7 +276,10 @@ class _Found(NamedTuple):
 
 
 class Problem(eqx.Module):
-    """A plant, experiments, and which parameters are free."""
+    """A plant, experiments, and which parameters are free.
+
+    `start` and `usual` are search coordinates: of the search's start, and of the nominal values.
+    """
 
     plant: AbstractPlant
     experiments: Experiments

@@ -38,7 +38,7 @@ except ImportError:
 from .. import __version__
 from ..description import names_of
 from ..information import relative_size
-from .contract import Basis, residual_of, simulate_experiments, to_search
+from .contract import Basis, residual_of, simulate_experiments
 from .nls import FAR, NLS, Problem
 from .prior import unbounded, uniform_names
 
@@ -194,7 +194,7 @@ class Density(eqx.Module):
         flat = jnp.sum(jnp.log(jnp.where(problem.free, slope, 1.0)))
         d = problem.plant.definition
         searched = problem.free & jnp.asarray([p.positive for p in d.parameters])
-        is_far = searched & (jnp.abs(z - to_search(d, problem.plant.nominal)) > FAR)
+        is_far = searched & (jnp.abs(z - problem.usual) > FAR)
         of_constants = self.unpacked(x)[0][len(z) :]
         scores = jnp.concatenate([of_constants, problem.prior_residual(z)])
         return jnp.where(jnp.any(is_far), -jnp.inf, flat) - jnp.sum(scores**2) / 2

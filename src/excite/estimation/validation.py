@@ -6,9 +6,10 @@ import dataclasses
 import math
 from collections.abc import Sequence
 
+import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from ..description import HALF_95, PlantDescription, names_of
 from ..plant import AbstractPlant, Params
@@ -146,10 +147,15 @@ def way_to_state(word: str | float) -> str | float:
 def _outputs_give_state(plant: AbstractPlant) -> bool:
     """Whether the outputs at one time determine the state, at the initial state."""
     scales = np.array([s.scale for s in plant.definition.states])
-    derivative = jax.jit(jax.jacfwd(plant.output))
-    slope = np.asarray(derivative(plant.initial_state, plant.nominal)) * scales
+    slope = np.asarray(_slope(plant)) * scales
     slope = slope / np.array([o.scale for o in plant.definition.outputs])[:, None]
     return bool(np.linalg.matrix_rank(slope, 1e-6) == len(scales))
+
+
+@eqx.filter_jit
+def _slope(plant: AbstractPlant) -> Float[Array, "output state"]:
+    """Derivative of the outputs with respect to the states, at the initial state."""
+    return jax.jacfwd(plant.output)(plant.initial_state, plant.nominal)
 
 
 def validated(

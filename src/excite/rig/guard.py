@@ -49,7 +49,7 @@ _CAUSES = np.array(
 )
 """Factor of the actuator, the sample at which it began, and samples by which the input is late.
 
-The first is as declared. A fault of the last sample but one is not told from a late plant.
+The first is as declared. A fault of the newest input alone is not told from a late plant.
 """
 
 _SQUARE = 3.0  # of the distance of the filter's points, in standard deviations: that of a normal
@@ -57,9 +57,10 @@ _WIDE = 0.05  # after a trip, how far a state may move in one sample unexplained
 _QUIET = 0.25  # fraction of critical levels and input limits below which it is at rest
 _NUM_QUIET, _LONGEST = 5, 60  # samples of rest that end the brake; samples after which it ends
 _LOST = 2.0  # times the critical levels: what is beyond is not braked any more
-# Another sign must explain the last samples better by so much, in squares of standard deviations,
-# and leave less than this, or than this part.
+# Another sign must explain the last samples better by _BETTER, in squares of standard deviations,
+# and leave less than _EXPLAINED, or than the part _PART of what the present sign leaves.
 _BETTER, _EXPLAINED, _PART = 15.0, 50.0, 0.02
+_STEEPEST = 1e6  # largest change of an output that is counted, in standard deviations of its noise
 _BIAS = 300.0  # of a sensor, in standard deviations of its noise, as far as it may have jumped
 
 
@@ -161,26 +162,29 @@ class Guard:
             arrays = {name: np.array(value, float) for name, value in rules.items()}
             programs = (Program.from_text(data[name]) for name in _PROGRAMS)
             read = cls(GuardRules(depth=depth, watched=watched, **arrays), *programs)
+            count = num_points(read.rules)
+            points = np.tile(read.rules.mean, (count, 1))
+            past = np.broadcast_to(read.rules.rest, (count, depth, len(read.rules.lower)))
         except (KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"the guard is damaged ({error!r})") from None
-        if not read._has_its_points():
+        except ValueError as error:
+            raise ValueError(f"the guard is damaged: {error}") from None
+        if not read._computes(points, past):
             raise ValueError(
                 "the guard was made by another version of excite: make it again "
                 "(excite falsify POLICY --guard --certify FILE)"
             )
         return read
 
-    def _has_its_points(self) -> bool:
-        """Whether the programs are for as many points as the filter has."""
-        rules, count = self.rules, num_points(self.rules)
-        points = np.tile(rules.mean, (count, 1))
-        past = np.tile(rules.rest, (count, rules.depth, 1))
+    def _computes(self, points: np.ndarray, past: np.ndarray) -> bool:
+        """Whether the programs are for these points: as many as the filter has."""
         try:
             with np.errstate(all="ignore"):
                 states, outputs = self.advance(points, past), self.output(points)
         except (ValueError, IndexError):
             return False
-        return states.shape == (count, rules.num_states) and outputs.shape[:1] == (count,)
+        shape = len(points), self.rules.num_states
+        return states.shape == shape and outputs.shape[:1] == shape[:1]
 
 
 _PROGRAMS = "advance", "output"
@@ -442,7 +446,9 @@ def _replayed(
         outputs, is_seen = model.output(points), xp.isfinite(seen)[None]
         offs.append(xp.where(is_seen, (outputs[:count] - seen[None]) / noise[None], 0.0))
         slope = (outputs[count:] - outputs[:1]) / noise[None]
-        slopes.append(xp.where(is_seen, slope, 0.0))
+        # One that a simulation cannot give tells nothing; larger ones would be lost in rounding.
+        known = xp.clip(slope, -_STEEPEST, _STEEPEST)
+        slopes.append(xp.where(is_seen & xp.isfinite(slope), known, 0.0))
     off, slope = xp.concatenate(offs, axis=1), xp.concatenate(slopes, axis=1)
     covariance = xp.eye(off.shape[1]) + slope.T @ slope
     # A sensor that jumped at one of the samples: one more uncertain number.
@@ -455,18 +461,19 @@ def _replayed(
     error = xp.concatenate([as_declared, error[1:]])
     error = xp.where(xp.isfinite(error), error, xp.inf)
     signs = np.minimum(gain, 1.0)
-    # The first estimates after a fault are of a plant without it, and seem to acquit the actuator.
+    # The first estimates after a fault are of a plant without it, and would favour the usual sign.
     is_early = (belief.sign != 1.0) & (belief.num_since < NUM_REPLAYED)
     error = xp.where((signs == 1.0) & is_early, xp.inf, error)
     best, as_now = xp.argmin(error), xp.argmin(xp.where(signs == belief.sign, error, xp.inf))
     is_explained = error[best] < xp.maximum(_EXPLAINED, _PART * error[as_now])
     is_clear = is_explained & (error[as_now] - error[best] > _BETTER)
     best = xp.where(is_clear, best, as_now)
-    return points[best, :n], xp.asarray(signs)[best]
+    sign = xp.where(xp.isfinite(error[best]), xp.asarray(signs)[best], belief.sign)
+    return xp.where(xp.isfinite(points[best, :n]), points[best, :n], belief.mean[:n]), sign
 
 
 def _jumps(num_outputs: int) -> np.ndarray:
-    """A step of each output at each of the last samples: rows of [jump, sample and output]."""
+    """A step of each output at each of the last samples; columns are samples, then outputs."""
     since = np.tril(np.ones((NUM_REPLAYED, NUM_REPLAYED))).T
     return np.kron(since, np.eye(num_outputs))
 
