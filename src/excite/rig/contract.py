@@ -119,7 +119,7 @@ class AbstractRig(abc.ABC):
         return {}
 
     def alive(self) -> None:
-        """Tells the watchdog that the experiment goes on; RigError if it has ended."""
+        """Tells the watchdog that the experiment is running; RigError if it has ended."""
         if self._watching is not None and (sentence := self._watching.beat()):
             raise RigError(sentence)
 
