@@ -22,8 +22,9 @@ demo: .venv/core ## the baseline rows of the paper's Table 1, with three estimat
 test: lint ## style, types, unit and command-line tests
 	$(MAKE) --jobs=2 types units
 
+# The tests of a file share their compiled programs: one process runs the file.
 units: .venv/dev ## unit and command-line tests
-	$(QUICK) $(PYTEST)
+	$(QUICK) $(PYTEST) --dist loadfile
 
 test-pages: .venv/dev ## commands of the documentation, and the bench page in a browser
 	$(QUICK) $(PYTEST) tests/pages

@@ -230,6 +230,7 @@ def test_noise_free_data_of_a_linear_plant_give_its_parameters():
     assert np.abs(estimate.residual).max() < 1e-3
 
 
+@pytest.mark.science
 def test_the_covariance_of_the_estimate_is_that_of_many_estimates():
     # White noise on the equation, not on the output: the case for which ARX is right.
     rng = np.random.default_rng(4)
@@ -332,6 +333,7 @@ def test_a_plant_without_inverse_mapping_is_refused_in_a_sentence(name):
         ARX()(plant, data)
 
 
+@pytest.mark.science
 def test_the_settings_inferred_for_the_paper_give_its_baseline_rows():
     # Means of |error| of J_p, K_pu, D_p in percent over plants within 30 %, computed twice
     # with independent code. Three standard errors of 200 values, whose standard deviation

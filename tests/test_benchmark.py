@@ -425,6 +425,7 @@ def test_a_table_shows_itself_and_is_filtered_and_sorted(rows):
 # In a declared uncertainty
 
 
+@pytest.mark.science
 def test_bounds_of_shorter_experiments_are_of_plants_of_the_declared_uncertainty():
     box = {"parameters": "50%", "initial_pitch": [-0.1, 0.1]}
     study = tiny(uncertainty=box, num_steps=20, lengths=[20])

@@ -63,6 +63,7 @@ def test_the_margin_of_a_search_closes_at_its_end():
     assert float(_margin(CLAIRVOYANT, 2999, None)) == CLAIRVOYANT.margin
 
 
+@pytest.mark.science
 def test_a_search_gives_the_same_signal_again():
     env = signal_env(Amplifier(), 12, 0.3)
     few = dataclasses.replace(QUICK, num_updates=5)

@@ -344,6 +344,7 @@ def test_an_autoregression_is_found_with_its_covariance():
     assert np.all(spread > 2 * variance**2 / 4000)
 
 
+@pytest.mark.science
 @pytest.mark.parametrize("rho", [0.5, 0.9])
 def test_noise_is_found_without_what_the_fit_took_along(rho):
     """In short records with many unknowns the residual remembers less than the noise."""

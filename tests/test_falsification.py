@@ -247,6 +247,7 @@ def found():
     return ex.falsify("chirp", "aero2", steps=60, budget=200, uncertainty=ranges)
 
 
+@pytest.mark.science
 def test_the_worst_plant_is_replayed_from_its_file(found, tmp_path):
     path = tmp_path / "worst.json"
     found.save(path)
@@ -320,6 +321,7 @@ def test_the_plants_of_the_training_are_the_default():
     np.testing.assert_allclose(only["J_p"], [0.8 * nominal, 1.2 * nominal])
 
 
+@pytest.mark.science
 def test_a_policy_of_another_plant_is_warned_of():
     with pytest.warns(UserWarning, match="was trained on another 'aero2'"):
         ex.falsify(small_policy(Aero2()), Aero2(d_S=0.002), budget=100)

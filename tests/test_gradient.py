@@ -168,6 +168,7 @@ def test_a_sum_is_worth_the_sum_of_its_terms():
     assert abs(together[1] - jnp.mean(together[0])) > 1e-3
 
 
+@pytest.mark.science
 @pytest.mark.parametrize("name", [n if n == "D and errors" else LONG(n) for n in OBJECTIVES])
 def test_the_gradient_is_that_of_the_whole_experiment(name):
     env = env_of(OBJECTIVES[name])
@@ -206,6 +207,7 @@ def test_the_worth_is_the_criterion_of_the_information(criterion, expected):
     np.testing.assert_allclose(worth, expected(information) - expected(prior), rtol=1e-6)
 
 
+@pytest.mark.science
 def test_dense_and_terminal_information_are_worth_the_same():
     dense, terminal = (env_of(OBJECTIVES[name]) for name in ("D dense", "D"))
     weights = weights_of(dense)
@@ -304,6 +306,7 @@ class Runaway(AbstractPlant):
         return state
 
 
+@pytest.mark.science
 def test_a_plant_that_runs_away_ends_in_a_sentence():
     env = env_of(InformationGain((True,), prior_sd_of(0.3), dense=False), Runaway(), num_steps=200)
     with pytest.raises(ValueError, match="every simulation of this plant diverges"):

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import sympy
-from catalogue import PLANTS
+from catalogue import FEW_AND_ALL, PLANTS
 from documented import documented_words
 from kinetics import Conversion, Product
 
@@ -178,7 +178,7 @@ def test_a_gap_of_many_digits_separates_what_is_seen_from_what_is_not(name):
         assert np.all(values[result.rank :] < 1e-4 * UNDETERMINED)
 
 
-@pytest.mark.parametrize("name", PLANTS)
+@pytest.mark.parametrize("name", FEW_AND_ALL)
 @pytest.mark.parametrize("known", [True, False], ids=["known", "free"])
 def test_every_shipped_plant_is_identifiable(name, known):
     plant = PLANTS[name]

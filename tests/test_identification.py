@@ -76,6 +76,7 @@ def test_parameters_that_only_a_detour_hides_are_found():
 # A good record
 
 
+@pytest.mark.science
 def test_parameters_lie_within_their_standard_errors(result):
     assert result.status == "successful"
     assert result.is_usable
@@ -222,6 +223,7 @@ def test_each_record_has_an_initial_state_of_its_own(foreign):
     assert min(f.fit_percent["pitch"] for f in result.fitted) > 99
 
 
+@pytest.mark.science
 def test_one_record_from_elsewhere_frees_all_initial_states(chirp, foreign):
     assert not identify([chirp, foreign], PLANT).initial_state_known
 

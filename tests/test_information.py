@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from catalogue import PLANTS
+from catalogue import FEW_AND_ALL, PLANTS
 
 from excite.estimation import ARX, NLS, stack_experiments
 from excite.excitation import Multisine
@@ -66,7 +66,7 @@ def random_information(size: int) -> np.ndarray:
 # -------------------------------------------------------------------- sensitivities
 
 
-@names
+@pytest.mark.parametrize("name", FEW_AND_ALL)
 def test_sensitivities_agree_with_central_differences(name):
     response, count = response_of(name)
     exact = sensitivity_of(name)
@@ -120,7 +120,7 @@ def test_information_of_an_experiment_is_that_of_its_sensitivities(name, initial
     assert np.linalg.eigvalsh(ours)[0] > 0
 
 
-@names
+@pytest.mark.parametrize("name", FEW_AND_ALL)
 def test_running_information_grows_to_that_of_the_whole_experiment(name):
     plant, inputs = PLANTS[name], inputs_of(name)
     running = running_information(plant, plant.nominal, inputs)

@@ -97,6 +97,7 @@ def test_six_samples_are_enough_for_two_unknowns():
     result.plot()
 
 
+@pytest.mark.science
 def test_as_many_samples_as_unknowns_are_refused():
     record = dataclasses.replace(first_rows(tank_record(1.8), 3), metadata={})
     words = (

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from catalogue import FEW_AND_ALL, PLANTS, TwoMasses
+from catalogue import FEW_AND_ALL, LONG, PLANTS, TwoMasses
 
 from excite.description import Input, Output, Parameter, PlantDescription, State, names_of
 from excite.estimation import NLS, AbstractEstimator, Status, bound_reached, stack_experiments
@@ -58,6 +58,7 @@ def test_noise_free_data_give_the_parameters(name):
     assert np.all(np.abs(estimate.residual) < 1e-7 * scale)
 
 
+@pytest.mark.science
 @pytest.mark.parametrize("name", FEW_AND_ALL)
 def test_noise_free_data_give_the_initial_state_too(name):
     plant = PLANTS[name]
@@ -126,6 +127,7 @@ def test_padding_of_an_experiment_changes_nothing():
         np.testing.assert_array_equal(ours, theirs)
 
 
+@pytest.mark.science
 def test_every_start_within_thirty_percent_leads_to_the_same_estimate():
     plant = Aero2()
     factors = np.array(list(itertools.product((0.7, 1.3), repeat=3)))
@@ -252,6 +254,7 @@ class Tight(Bounded):
     )
 
 
+@pytest.mark.science
 def test_bounds_with_room_change_nothing():
     assert_recovered(Aero2(), aero2_fit(plant=Bounded()))
 
@@ -285,7 +288,7 @@ def test_the_covariance_is_that_of_the_bound(initial_state):
     np.testing.assert_allclose(estimate.information @ relative, np.eye(4), atol=0.05)
 
 
-@pytest.mark.parametrize("initial_state", ["known", "free"])
+@pytest.mark.parametrize("initial_state", ["known", LONG("free")])
 def test_sensitivity_and_residual_of_a_fit_are_those_behind_its_information(initial_state):
     plant, known = TwoMasses(), initial_state == "known"
     estimator = NLS(noise="estimated")
@@ -317,7 +320,7 @@ def test_outputs_can_be_weighted_by_the_noise_they_turn_out_to_have():
     np.testing.assert_allclose(wrong.covariance, right.covariance, rtol=0.05, atol=1e-9)
 
 
-@pytest.mark.parametrize("initial_state", ["known", "free"])
+@pytest.mark.parametrize("initial_state", ["known", LONG("free")])
 def test_the_covariance_allows_for_noise_that_was_declared_wrong(initial_state):
     known = initial_state == "known"
     declared = np.array([0.02, 0.0004])

@@ -56,6 +56,7 @@ def test_rate_constants_and_intervals_are_those_of_scipy(plant):
     result.plot()
 
 
+@pytest.mark.science
 def test_an_experiment_needs_no_excitation():
     record = ex.simulate(Conversion, steps=40, params=TRUTH, noise={"a": 0.0, "b": 0.0})
     assert record.inputs.shape == (41, 0)

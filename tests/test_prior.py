@@ -150,6 +150,7 @@ def test_the_only_parameter_may_end_at_its_bound():
         identify(noisy(), Ramp, hold={"a": 0.8}, prior={"b": "uniform:0.1:0.25"})
 
 
+@pytest.mark.science
 def test_a_uniform_prior_bounds_the_estimate():
     found = identify(noisy(), Ramp, prior={"b": "uniform:0.1:0.25"})
     assert found.params.b == pytest.approx(0.25, rel=1e-3)
@@ -294,6 +295,7 @@ def with_outliers(seed: int) -> Record:
     return record_with(noise + 5.0 * (rng.random(len(TIME)) < 0.1))
 
 
+@pytest.mark.science
 def test_students_estimate_is_the_likeliest_one():
     record = with_outliers(3)
 

@@ -103,6 +103,7 @@ def open_below() -> Record:
     return product(0.025, np.array([0.0, 0.4, 0.8, 1.2, 1.6, 2.0]), seed=1)
 
 
+@pytest.mark.science
 def test_a_side_that_does_not_close_is_told():
     result = ex.identify(open_below(), Product, initial_state="known", intervals="profile")
     low, high = result.ci95("k2")
@@ -119,6 +120,7 @@ def test_intervals_of_another_kind_are_refused():
         ex.identify(ex.simulate("aero2", steps=40), estimator="arx-rls", intervals="profile")
 
 
+@pytest.mark.science
 def test_the_command_line_has_profile_intervals(tmp_path):
     record = product(0.03)
     rows = np.column_stack([record.time, record.outputs])

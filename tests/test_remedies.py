@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from catalogue import LONG
 
 import excite as ex
 from excite.estimation import NLS, stack_experiments
@@ -75,7 +76,8 @@ def effects(plant: str) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    "effect", ["delay_voltage", "dead_zone_voltage", "bias_pitch", "drift_pitch", "outliers"]
+    "effect",
+    [LONG("delay_voltage"), LONG("dead_zone_voltage"), "bias_pitch", "drift_pitch", "outliers"],
 )
 def test_what_the_plant_leaves_out_is_named_first(effect):
     result = ex.identify(recorded("aero2", effect, seed=1), "aero2", initial_state="known")

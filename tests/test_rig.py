@@ -790,6 +790,7 @@ def test_the_filter_prevents_every_violation_and_only_these(many, safety):
     np.testing.assert_allclose(harmless.inputs[3], sequence, atol=1e-9)
 
 
+@pytest.mark.science
 def test_a_filtered_player_passes_on_what_is_harmless(safety):
     heard = []
 

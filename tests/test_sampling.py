@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import scipy.integrate
 import scipy.optimize
+from catalogue import LONG
 from experiments import spread_params
 
 from excite.estimation import ARX, NLS
@@ -67,7 +68,7 @@ def test_the_plant_is_found_from_what_scipy_solved(time, linear):
     np.testing.assert_allclose(list(found.params.values()), TRUE, rtol=3e-4)
 
 
-@pytest.mark.parametrize("linear", [False, True], ids=["held", "linear"])
+@pytest.mark.parametrize("linear", [LONG(False, id="held"), pytest.param(True, id="linear")])
 def test_the_other_hold_is_named_where_it_fits_better(linear):
     right, wrong = ("linear", "constant") if linear else ("constant", "linear")
     record = solved(EVEN, linear, noise=1e-3)

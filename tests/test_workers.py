@@ -283,6 +283,7 @@ def test_a_cluster_that_loses_a_worker_gives_what_the_local_engine_gives(cluster
     assert failures == {"value": "mistake: a user's mistake"}
 
 
+@pytest.mark.science
 def test_a_task_that_kills_the_workers_of_a_cluster_is_given_up(cluster):
     tasks: dict[str, Any] = {"always": {"function": "die"}}
     tasks |= {f"{i}": {"function": "add", "a": i, "b": 1, "seconds": 0.1} for i in range(9)}
