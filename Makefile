@@ -3,7 +3,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-PYTEST := $(BIN)/python -m pytest -n 2 --dist worksteal
+PYTEST := $(BIN)/python -m pytest -n 2
 # Thousands of small programs are compiled in the tests and run once: compiling is most of their time.
 # Long tests keep the optimisation level of users. The flags are of the jaxlib in constraints.txt.
 FEWER_PASSES := --xla_cpu_use_fusion_emitters=false
@@ -27,10 +27,10 @@ units: .venv/dev ## unit and command-line tests
 	$(QUICK) $(PYTEST) --dist loadfile
 
 test-pages: .venv/dev ## commands of the documentation, and the bench page in a browser
-	$(QUICK) $(PYTEST) tests/pages
+	$(QUICK) $(PYTEST) --dist worksteal tests/pages
 
 test-science: .venv/dev ## promises of the shipped policies, baselines, trainings from end to end, and what takes long
-	XLA_FLAGS="$(FEWER_PASSES)" $(PYTEST) -m science
+	XLA_FLAGS="$(FEWER_PASSES)" $(PYTEST) --dist worksteal -m science
 
 check-results: .venv/dev ## the committed results are what the documentation says of them
 	$(BIN)/python -m pytest tests/results
@@ -38,7 +38,7 @@ check-results: .venv/dev ## the committed results are what the documentation say
 test-all: test test-pages test-science check-results ## all tests
 
 coverage: .venv/dev ## lines of the package that no unit or command-line test runs
-	$(QUICK) $(PYTEST) --cov=excite --cov-report=term-missing:skip-covered
+	$(QUICK) $(PYTEST) --dist loadfile --cov=excite --cov-report=term-missing:skip-covered
 
 lint: .venv/dev ## style
 	$(BIN)/ruff check .

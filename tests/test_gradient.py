@@ -168,7 +168,6 @@ def test_a_sum_is_worth_the_sum_of_its_terms():
     assert abs(together[1] - jnp.mean(together[0])) > 1e-3
 
 
-@pytest.mark.science
 @pytest.mark.parametrize("name", [n if n == "D and errors" else LONG(n) for n in OBJECTIVES])
 def test_the_gradient_is_that_of_the_whole_experiment(name):
     env = env_of(OBJECTIVES[name])

@@ -59,7 +59,7 @@ def test_noise_free_data_give_the_parameters(name):
 
 
 @pytest.mark.science
-@pytest.mark.parametrize("name", FEW_AND_ALL)
+@pytest.mark.parametrize("name", PLANTS)
 def test_noise_free_data_give_the_initial_state_too(name):
     plant = PLANTS[name]
     inputs = Chirp().sequence(plant, NUM_STEPS, KEY)
