@@ -385,10 +385,11 @@ class MultipleShooting(eqx.Module):
         """
         n, z = self.num_states, start.z
         params = self.plant.Params(*self.params_at(z))
-        few = -(-2 * n // self.num_outputs) + 1
         here, _, segments = self._blocks(start)
+        few = min(-(-2 * n // self.num_outputs) + 1, segments.valid.shape[3])
+        count = here[..., 0].size
         parts = segments.steps, segments.measured, segments.valid
-        parts = jax.tree.map(lambda a: a[:, :, :, :few], parts)
+        parts = jax.tree.map(lambda a: a[:, :, :, :few].reshape(count, few, *a.shape[4:]), parts)
 
         def misfits(x: Array, parts: tuple[Steps, Array, Array]) -> Array:
             steps, measured, valid = parts
@@ -405,7 +406,8 @@ class MultipleShooting(eqx.Module):
             return x - jax.scipy.linalg.solve_triangular(R[:n, :n], R[:n, n]), jnp.sum(r**2)
 
         def improved(_: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:
-            moved, squares = jax.vmap(jax.vmap(jax.vmap(move)))(now[0], parts)
+            moved, squares = jax.vmap(move)(now[0].reshape(count, n), parts)
+            moved = moved.reshape(here.shape)
             if not self.first_is_free:
                 moved = moved.at[0, :, 0].set(now[0][0, :, 0])
             return moved, jnp.sum(squares)
@@ -615,9 +617,10 @@ class MultipleShooting(eqx.Module):
             more = jnp.where(is_too_long(found), 10 * found[0], found[0])
             return more, *self.newton_step(moves, triangle, damping, more)
 
-        ones = jnp.ones(len(self.largest))
-        first = ones, *self.newton_step(moves, triangle, damping, ones)
-        return jax.lax.while_loop(lambda found: jnp.any(is_too_long(found)), shorter, first)[1:]
+        # The loop begins with a step that is too long: `newton_step` is traced and compiled once.
+        endless = Point(jnp.full(len(self.largest), jnp.inf), jnp.zeros(moves.shape[:3]))
+        begin = jnp.full(len(self.largest), 0.1), endless, jnp.zeros(triangle.shape[:2])
+        return jax.lax.while_loop(lambda found: jnp.any(is_too_long(found)), shorter, begin)[1:]
 
     def solve(
         self,
