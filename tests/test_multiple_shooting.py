@@ -181,3 +181,17 @@ def test_plants_far_from_the_start_are_found(name, excitation, spread):
     # One EMPS does not tell its viscous friction: with a standard error of 63 times the value,
     # the search ends before its last digits settle.
     assert np.sum(np.asarray(status) != Status.SUCCESSFUL) <= 1
+
+
+@pytest.mark.science
+@pytest.mark.parametrize("factors", [(1.2344, 0.861, 0.979), (1.238, 0.81, 1.236)])
+def test_a_search_that_its_first_phase_led_astray_is_repeated(factors):
+    """K_pu was 45 to 50 % wrong, and the search called successful: one plant in ten."""
+    plant = PLANTS["aero2_detailed"]
+    params = plant.Params(*(f * v for f, v in zip(factors, plant.nominal, strict=True)))
+    played = excitation_and_origin("aero2_detailed", {}, plant)[0]
+    episode = run_episode(plant, params, played, 500, KEY)
+    data = stack_experiments(plant, [episode.inputs], [episode.measured], True)
+    estimate = NLS()(plant, data)
+    assert estimate.status == Status.SUCCESSFUL
+    np.testing.assert_allclose(estimate.params, params, rtol=3e-3)

@@ -29,10 +29,18 @@ from .contract import (
     simulate_experiments,
     to_search,
 )
-from .multiple_shooting import FREEDOM, MultipleShooting, Point, Segments, student_root
+from .multiple_shooting import (
+    FREEDOM,
+    MultipleShooting,
+    Point,
+    Segments,
+    student_root,
+    where_tree,
+)
 from .prior import Prior
 
 FAR = 30.0  # largest logarithm of a positive parameter over its nominal value
+_POOR = 4.0  # mean square of the residual over the assumed noise, beyond which a search is repeated
 _ROUNDS, _SCALE_STEPS = 3, 20  # searches with the noise found by the one before; of its scale
 Noise = Literal["declared", "known", "estimated"]
 Likelihood = Literal["normal", "student"]
@@ -40,6 +48,9 @@ Likelihood = Literal["normal", "student"]
 
 class NLS(AbstractSearch):
     """Output-error nonlinear least squares by multiple shooting.
+
+    A search that leaves much more than the declared noise is repeated without the first phase of
+    multiple shooting; the better end counts.
 
     Attributes:
         tolerance: the search ends before a step that would change the estimate by less than
@@ -229,9 +240,34 @@ class NLS(AbstractSearch):
             return search(found.point, sd, sd if self.likelihood == "student" else None)
 
         first = experiments.initial_state / problem.state_scales[None]
-        starts = jnp.tile(first[:, None], (1, segments.shape[1], 1))
-        sd = problem.assumed_sd
-        found = search(shooting().matched(Point(problem.start, starts), sd), sd)
+        begin = Point(problem.start, jnp.tile(first[:, None], (1, segments.shape[1], 1)))
+        sd, count = problem.assumed_sd, jnp.sum(experiments.valid)
+
+        def squares(found: _Found) -> Array:
+            prior = problem.prior_residual(found.point.z)
+            return jnp.sum((found.residual / sd[None, None]) ** 2) + jnp.sum(prior**2)
+
+        def attempt(state: tuple[_Found, Point, Array]) -> tuple[_Found, Point, Array]:
+            best, point, tries = state
+            found = search(point, sd)
+            return where_tree(squares(found) < squares(best), found, best), begin, tries + 1
+
+        # Where segments that fit and gaps that close have led astray: again, without their phase.
+        def goes_on(state: tuple[_Found, Point, Array]) -> Array:
+            best, _, tries = state
+            return (tries == 0) | ((tries == 1) & ~(squares(best) < _POOR * count))
+
+        width = begin.starts.shape[2] + len(begin.z) + 1
+        nothing = _Found(
+            begin,
+            jnp.asarray(False),
+            jnp.zeros((segments.shape[0], problem.num_outputs, width, width)),
+            jnp.full(experiments.measured.shape, jnp.inf),
+            sd,
+            jnp.asarray(0),
+        )
+        matched = shooting().matched(begin, sd)
+        found, *_ = jax.lax.while_loop(goes_on, attempt, (nothing, matched, jnp.asarray(0)))
         if self.likelihood == "student" or (self.prior is not None and self.finds_noise):
             return jax.lax.fori_loop(0, _ROUNDS, lambda _, found: again(found), found)
         if self.noise == "estimated" and problem.num_outputs > 1:
