@@ -209,14 +209,14 @@ def test_extensions_are_named_in_one_order_and_can_be_combined():
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("aero2+delay_thrust", "unknown extension of plant 'aero2' 'delay_thrust'; did you mean"),
-        ("aero2+", "unknown extension of plant 'aero2' ''"),
+        ("aero2+delay_thrust", "unknown extension of plant 'aero2': 'delay_thrust'; did you mean"),
+        ("aero2+", "unknown extension of plant 'aero2': ''"),
         ("aero2+delay+delay_voltage", "plant 'aero2' has 'delay_voltage' already"),
         ("dc_motor+drift", r"there is drift_speed, drift_current\)"),
         ("nothing+delay", "unknown plant 'nothing'"),
         ("aero2+linear_voltage", "'linear_voltage' .*, but the option --hold-input voltage=linear"),
         ("aero2+constant_voltage", "but the option --hold-input voltage=constant"),
-        ("aero2+linear_thrust", "unknown extension of plant 'aero2' 'linear_thrust'"),
+        ("aero2+linear_thrust", "unknown extension of plant 'aero2': 'linear_thrust'"),
         ("aero2+lag+outliers", "'outliers' is no extension .*the option --likelihood student"),
     ],
 )

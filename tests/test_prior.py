@@ -246,7 +246,7 @@ def test_a_lognormal_prior_is_one_of_the_logarithm():
         ([{"a": "normal:1:2"}, {"a": "uniform:0:2"}], "parameter 'a' has two priors; give one"),
         ([{"a": "normal:1:2"}, {"a": "normal:1:2"}], "parameter 'a' has two priors; give one"),
         ([{"a": "uniform:0:2"}, {"a": "uniform:0:3"}], "parameter 'a' has two priors; give one"),
-        ("nowhere", "nowhere: cannot be read"),
+        ("nowhere", "'nowhere' is no run folder and no file; it may be a dict by parameter"),
         (Prior.normal(["c"], [1.0], [[1.0]]), "unknown ramp parameter 'c'"),
     ],
 )  # fmt: skip

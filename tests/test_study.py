@@ -15,7 +15,7 @@ from excite.excitation.catalogue import EXCITATIONS, excitation_named
 from excite.plant import AbstractPlant, Aero2, CartPole, DCMotor
 from excite.plant.catalogue import PLANTS, plant_named, with_sensor
 from excite.policy import Layout, Policy
-from excite.study.catalogue import studies, study_path
+from excite.study.catalogue import shipped_studies, study_path
 from excite.study.objectives import rewards_of
 from excite.study.spec import Study, plant_tables, read_study
 
@@ -847,8 +847,8 @@ def test_an_agent_has_a_range_and_plants_of_its_own(tmp_path):
 
 
 def test_shipped_studies_are_found_by_name_and_an_unknown_one_names_the_nearest():
-    assert set(studies()) == {path.stem for path in STUDIES.glob("*.toml")}
-    assert study_path("table1") == studies()["table1"]
+    assert set(shipped_studies()) == {path.stem for path in STUDIES.glob("*.toml")}
+    assert study_path("table1") == shipped_studies()["table1"]
     assert study_path("no/such.toml") == Path("no/such.toml")  # refused where it is read
     with pytest.raises(ValueError, match=r"unknown study 'tabel1'; did you mean 'table1'\?"):
         study_path("tabel1")
@@ -857,7 +857,7 @@ def test_shipped_studies_are_found_by_name_and_an_unknown_one_names_the_nearest(
 def test_the_files_of_a_shipped_study_are_found_from_any_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     named = read_study(study_path("frontier")).methods["robust"].excitation
-    assert Path(named) == studies()["frontier"].with_name("frontier_robust.csv")
+    assert Path(named) == shipped_studies()["frontier"].with_name("frontier_robust.csv")
 
 
 # --------------------------------------------------- studies composed from names and objects

@@ -71,6 +71,13 @@ class _Verb(ModuleType):
         name = self.__name__.rpartition(".")[2]
         return getattr(import_module(f".{_PLACES[name]}", __name__), name)
 
+    @property
+    def __doc__(self) -> str | None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.__wrapped__.__doc__
+
+    def __repr__(self) -> str:
+        return repr(self.__wrapped__)
+
     def __call__(self, *args: object, **options: object) -> object:
         return self.__wrapped__(*args, **options)  # pyright: ignore[reportCallIssue]
 
@@ -84,12 +91,13 @@ class _Package(ModuleType):
         super().__setattr__(name, value)
 
 
-sys.modules[__name__].__class__ = _Package
+_package = sys.modules[__name__]
+_package.__class__ = _Package
 
 
 def __getattr__(name: str) -> object:
     if name not in _PLACES:
-        raise AttributeError(f"module 'excite' has no attribute {name!r}")
+        raise AttributeError(f"module 'excite' has no attribute {name!r}", name=name, obj=_package)
     found = getattr(import_module(f".{_PLACES[name]}", __name__), name)
     return globals().setdefault(name, found)
 

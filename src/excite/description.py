@@ -448,7 +448,8 @@ def display_unit(unit: str) -> tuple[str, float]:
 def unknown(kind: str, word: str, allowed: Iterable[str]) -> ValueError:
     """The error for an unknown word; it names the nearest known one."""
     allowed = list(allowed)
-    nearest = difflib.get_close_matches(word, allowed, n=1, cutoff=0.5)
+    same = [name for name in allowed if name.lower() == word.lower()]
+    nearest = same or difflib.get_close_matches(word, allowed, n=1, cutoff=0.5)
     hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
     return ValueError(f"unknown {kind} {word!r}{hint} (there is {', '.join(allowed)})")
 
@@ -459,6 +460,15 @@ def wrong_type(what: str, value: object, allowed: str) -> TypeError:
     shown = "" if text.startswith("<") or "\n" in text else f" {text}"
     kind = f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
     return TypeError(f"{what} must be {allowed}: got {kind}{shown * (not isinstance(value, type))}")
+
+
+def by_name(
+    what: str, given: Mapping[str, _T] | None, allowed: str = "a dict by name"
+) -> dict[str, _T]:
+    """A copy of values by name, empty for None; TypeError for anything else."""
+    if not isinstance(given, Mapping | None):
+        raise wrong_type(what, given, allowed)
+    return dict(given or {})
 
 
 LARGEST_SEED = 2**63 - 1

@@ -155,13 +155,12 @@ def show_comparison(found: StudyTable, out: Path | None = None, as_json: bool = 
 @json_option
 def list_studies(as_json: bool) -> None:
     """List the studies that come with the package."""
-    import tomllib
+    from ..study.catalogue import shipped_studies, studies
 
-    from ..study.catalogue import studies
-
+    files = shipped_studies()
     found = [
-        {"name": name, "title": tomllib.loads(path.read_text("utf-8"))["title"], "file": str(path)}
-        for name, path in studies().items()
+        {"name": name, "title": title, "file": str(files[name])}
+        for name, title in studies().items()
     ]
     if as_json:
         show_json({"studies": found})

@@ -30,7 +30,8 @@ def estimators() -> Listing:
     >>> "nls" in ex.estimators()
     True
     """
-    return Listing({name: first_line(type(chosen)) for name, chosen in ESTIMATORS.items()})
+    lines = {name: first_line(type(chosen)) for name, chosen in ESTIMATORS.items()}
+    return Listing(lines | {"arx-rls-wide": "As arx-rls, from a covariance of 1e8 times identity."})
 
 
 def estimator_from(

@@ -95,7 +95,7 @@ def compare_plants(
     Raises:
         ValueError: for fewer than two plants or different outputs, and as `identify` does.
     """
-    if isinstance(plants, str) or len(plants) < 2:
+    if isinstance(plants, str) or not isinstance(plants, Sequence) or len(plants) < 2:
         raise ValueError(f"a comparison needs at least two plants: got {plants!r}")
     if options.keys() & {"prior", "likelihood"}:
         raise ValueError("plants are compared by a normal likelihood, without priors")

@@ -12,7 +12,16 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from ..description import RARE, Named, PlantDescription, listed, names_of, unknown, wrong_type
+from ..description import (
+    RARE,
+    Named,
+    PlantDescription,
+    by_name,
+    listed,
+    names_of,
+    unknown,
+    wrong_type,
+)
 from ..files import json_ready
 from ..information.identifiability import UNSEEN_SD, identifiability
 from ..plant import AbstractPlant, Params, params_from
@@ -196,16 +205,13 @@ def identify(
     if initial_state not in get_args(InitialState):
         raise ValueError(f"initial state {initial_state!r} is not one of: known, free, auto")
     progress("reading", 0.0, 1.0)
-    read = partial(
-        _read,
-        plant.description,
-        scales=scales,
-        units=units,
-        set_inputs=set_inputs,
-        dt=dt,
-        rows=rows,
-    )
-    of_held_out = {**(columns or {}), **(validate_columns or {})}
+    of_files = {"scales": scales, "units": units, "set_inputs": set_inputs, "dt": dt, "rows": rows}
+    if all(isinstance(record, Record) for record in [*given, *held_out]):
+        for name, value in ({"columns": columns} | of_files).items():
+            if value not in (None, {}):
+                raise ValueError(f"{name} is for files, and the records are given as objects")
+    read = partial(_read, plant.description, **of_files)
+    of_held_out = by_name("columns", columns) | by_name("validate_columns", validate_columns)
     records = [read(record, columns=columns) for record in given]
     validation = [read(record, columns=of_held_out) for record in held_out]
     known = initial_state == "known" or (
@@ -363,10 +369,10 @@ def _chosen(
             raise ValueError(
                 f"{method.name} estimates all parameters at once and takes no {word} (--{word})"
             )
-    begin = params_from(plant, start)
+    begin = params_from(plant, start, "start")
     if not hold:
         return method, begin
-    held = params_from(plant, hold)
+    held = params_from(plant, hold, "hold")
     names = tuple(hold if isinstance(hold, Mapping) else begin._fields)
     begin = begin._replace(**{name: getattr(held, name) for name in names})
     return dataclasses.replace(method, known=names), begin

@@ -124,6 +124,8 @@ def _read(plant: AbstractPlant, path: Path) -> Prior:
     """A prior from a run folder, or from a file with mean and covariance."""
     if path.is_dir():
         return _from_run(plant, EstimateSummary.read(path / "estimate.json", _ADVICE), str(path))
+    if not path.exists():
+        raise ValueError(f"prior {str(path)!r} is no run folder and no file; it may be {_ALLOWED}")
     data = read_json(path, "mean", "covariance", advice=_ADVICE)
     if not isinstance(data["mean"], dict):
         raise ValueError(f"{path}: mean must be an object by parameter: got {data['mean']!r}")

@@ -210,7 +210,7 @@ class Identification:
             residuals = [f.record.outputs - f.model for f in self.fitted]
             return diagnosis_figure(self.plant, self.summary(), residuals)
         if what != "fit":
-            raise ValueError(f"a figure shows the fit or the diagnosis: got {what!r}")
+            raise ValueError(f"a figure shows 'fit' or 'diagnosis': got {what!r}")
         first = self.fitted[0]
         return identification_figure(self.plant, self.summary(), first.record, first.model)
 

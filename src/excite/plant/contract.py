@@ -141,11 +141,16 @@ class AbstractPlant(_Module):
             )
         values |= constants
         self.constants = _tuple_type("Constants", tuple(values))(*map(floats, values.values()))
+        if not isinstance(sensor, Sensor | None):
+            raise wrong_type("sensor", sensor, "an excite.plant.Sensor")
         self.sensor = sensor or Sensor(
             floats([o.noise_sd for o in d.outputs]), floats([o.resolution for o in d.outputs])
         )
         at_rest = [s.initial for s in d.states]
         self.initial_state = floats(at_rest if initial_state is None else initial_state)
+        if self.initial_state.shape != (len(d.states),):
+            allowed = f"{len(d.states)} numbers ({', '.join(names_of(d.states))})"
+            raise wrong_type("initial_state", initial_state, allowed)
         self.dt = floats(d.dt if dt is None else dt)
         # Without a given dt a plant can be built from traced numbers.
         self.substeps = (
@@ -270,7 +275,9 @@ class AbstractARXPlant(AbstractPlant):
         """Physical parameters of y'' + c_1 y' + c_0 y = d_0 u."""
 
 
-def params_from(plant: AbstractPlant, values: Mapping[str, float] | Params | None = None) -> Params:
+def params_from(
+    plant: AbstractPlant, values: Mapping[str, float] | Params | None = None, what: str = "params"
+) -> Params:
     """Nominal parameters, except those given by name or as the plant's named tuple.
 
     Raises:
@@ -280,7 +287,7 @@ def params_from(plant: AbstractPlant, values: Mapping[str, float] | Params | Non
     if isinstance(values, tuple) and hasattr(values, "_asdict"):
         values = values._asdict()
     if not isinstance(values, Mapping | None):
-        raise wrong_type("params", values, "a dict by name or the plant's named tuple")
+        raise wrong_type(what, values, "a dict by name or the plant's named tuple")
     return plant.nominal._replace(
         **{name: floats(_allowed(plant, name, value)) for name, value in (values or {}).items()}
     )

@@ -98,8 +98,9 @@ def extended(plant: AbstractPlant, extensions: Sequence[str]) -> AbstractPlant:
                     f"{word!r} is no extension of plant {kind.definition.name!r}, but the option "
                     f"{option}"
                 )
-            allowed = found or [e.name for e in possible]
-            raise unknown(f"extension of plant {kind.definition.name!r}", word, allowed)
+            kinds = [e.kind for e in possible]
+            short = [e.kind if kinds.count(e.kind) == 1 else e.name for e in possible]
+            raise unknown(f"extension of plant {kind.definition.name!r}:", word, found or short)
         if found[0] in chosen:
             raise ValueError(f"plant {plant.definition.name!r} has {found[0]!r} already")
         chosen |= {found[0]}

@@ -25,9 +25,15 @@ _Module = TypeVar("_Module", bound=eqx.Module)
 
 
 def floats(value: object) -> Array:
-    """An array in double precision, also from whole numbers; traced values stay traced."""
+    """An array in double precision, also from whole numbers; traced values stay traced.
+
+    Raises:
+        TypeError: for a text.
+    """
     if isinstance(value, jax.core.Tracer):
         return jnp.asarray(value, float)
+    if isinstance(value, str):
+        raise TypeError(f"expected a number or several: got str {value!r}")
     return jax.device_put(np.asarray(value, float))  # unlike jnp.asarray, compiles nothing
 
 

@@ -87,7 +87,7 @@ class Uncertainty(eqx.Module):
         for name in by_name:
             if name not in quantities:
                 known = dict.fromkeys([*quantities, *possible, *groups])
-                where = f"quantity in the uncertainty of {plant.definition.name!r}"
+                where = f"quantity in the uncertainty of {plant.definition.name!r}:"
                 raise unknown(where, name, known)
         boxes = {}
         for name, value in by_name.items():

@@ -47,10 +47,16 @@ def policies() -> Listing:
 
     >>> import excite as ex
     >>> ex.policies()["aero2"]
-    'for aero2, 500 steps'
+    'for aero2, 500 steps: gradient D of the study robust'
     """
     read = {name: read_policy(path) for name, path in shipped_policies().items()}
-    return Listing({n: f"for {p.plant.name}, {p.layout.num_steps} steps" for n, p in read.items()})
+    return Listing(
+        {
+            name: f"for {p.plant.name}, {p.layout.num_steps} steps: {p.provenance['agent']} of "
+            f"the study {p.provenance['study']}"
+            for name, p in read.items()
+        }
+    )
 
 
 def policy_path(name: str) -> Path | None:

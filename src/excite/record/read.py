@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from ..description import Input, Output, PlantDescription, names_of, path_from
+from ..description import Input, Output, PlantDescription, by_name, names_of, path_from, wrong_type
 from .bags import is_bag
 from .dates import seconds_of
 from .formats import columns_in
@@ -86,7 +86,10 @@ def read_record(
     """
     path, chosen = path_from("record", path), _slice_of(rows)
     description = described_in(path) if description is None else description
-    options = _Options(description, columns or {}, scales or {}, units or {}, set_inputs or {}, dt)
+    if not isinstance(description, PlantDescription):
+        raise wrong_type("description", description, "that of a plant (plant.description)")
+    given = {"columns": columns, "scales": scales, "units": units, "set_inputs": set_inputs}
+    options = _Options(description, **{n: by_name(n, v) for n, v in given.items()}, dt=dt)
     signals = (*description.inputs, *(() if inputs_only else description.outputs))
     cells, dt = _cells(path, options, names_of(signals))
     num_samples = _num_samples(path, cells)
@@ -126,6 +129,11 @@ class _Options:
     dt: float | None
 
     def __post_init__(self) -> None:
+        numbers = {f"scale of {name!r}": value for name, value in self.scales.items()}
+        numbers |= {f"value of input {n!r}": value for n, value in self.set_inputs.items()}
+        for what, value in (numbers | ({} if self.dt is None else {"dt": self.dt})).items():
+            if not hasattr(value, "__float__"):
+                raise wrong_type(what, value, "a number")
         for name in (*self.columns, *self.scales, *self.units):
             self._require_known(name, "column", self.description.columns)
         for name, factor in self.scales.items():

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..description import PlantDescription, display_unit, wrong_type
+from ..description import PlantDescription, display_unit, path_from, wrong_type
 from ..files import csv_text, require_new_file, require_unlocked, write_bytes, write_json
 from .table import data_frame
 
@@ -147,7 +147,7 @@ class Record:
             ValueError: for another ending, a folder that does not exist, a file that exists
                 and not `overwrite`, and a record without a plant.
         """
-        require_record_path(Path(path), overwrite)
+        require_record_path(path_from("path", path), overwrite)
         write_record(path, self, self.description)
 
     def plot(self) -> Figure:

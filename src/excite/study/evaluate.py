@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from ..description import wrong_type
+from ..description import by_name, wrong_type
 from ..plant import AbstractARXPlant
 from ..plant.catalogue import PlantLike
 from ..plant.uncertainty import Range
@@ -77,7 +77,7 @@ def evaluate(
             "num_steps": trained.layout.num_steps,
             "seed": seed,
             "spread": spread,
-            "uncertainty": dict(uncertainty or {}),
+            "uncertainty": by_name("uncertainty", uncertainty, "a dict of ranges by name"),
             "methods": {name: {"excitation": word}},
             "estimators": {kind: {"kind": kind} for kind in kinds},
             "rig": {"filter": filter} if rig else None,

@@ -22,6 +22,7 @@ from typing import Any, Literal
 import jax
 
 from .. import __version__
+from ..description import path_from, require_whole
 from ..files import (
     csv_text,
     json_ready,
@@ -131,7 +132,7 @@ def run_study(
         table = compared(chosen, progress)
         on_done("methods")
         return table
-    folder = Path(out)
+    folder = path_from("out", out)
     place: contextlib.AbstractContextManager[Path] = contextlib.nullcontext(folder)
     if overwrite:
         require_free_run_folder(folder, overwrite)
@@ -167,6 +168,8 @@ def _engine(
         return dask_engine(address, on_wait)
     if address is not None:
         raise ValueError("the address is for the engine 'dask'")
+    if workers is not None:
+        require_whole("workers", workers, 1)
     cache = jax.config.values["jax_compilation_cache_dir"]
     return local_engine(workers or num_cores(), Path(cache) if cache else None)
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import UnionType
 
+from ..description import by_name, path_from, wrong_type
 from ..plant import AbstractARXPlant
 from ..plant.catalogue import PlantLike
 from ..plant.uncertainty import Range
@@ -84,30 +86,39 @@ def train(
         raise ValueError(
             "ppo does not train against an uncertainty: leave it out, or take the method gradient"
         )
-    rewards = rewards_of(objective, goal or {})
+    rewards = rewards_of(objective, by_name("goal", goal, "a dict by parameter"))
     decision = {
         **decision_of(rewards.values()),
-        "output_scale": dict(output_scale or {}),
+        "output_scale": by_name("output_scale", output_scale, "a dict by output"),
         "window": window,
-        "clocks": list(clock) if isinstance(clock, Sequence) else [clock],
-        "uncertainty": dict(uncertainty or {}),
+        "clocks": _several("clock", clock, float | int, "a frequency in Hz, or several"),
+        "uncertainty": by_name("uncertainty", uncertainty, "a dict of ranges by name"),
     }
     agent = {
-        "targets": ([target] if isinstance(target, str) else list(target)) or None,
+        "targets": _several("target", target, str, "the name of a parameter, or several") or None,
         "method": method,
         "decision": {n: v for n, v in decision.items() if v not in (None, [], {})},
-        "training": dict(training or {}),
+        "training": by_name("training", training),
     }
     settings = {"episodes": episodes, "num_steps": steps, "spread": spread, "seeds": seeds}
     agents = {f"{method}({', '.join(rewards)})": agent}
     with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary if out is None else out)
-        study = _compared_with_a_chirp(plant, noise, folder.absolute().name, settings, agents)
+        folder = Path(temporary) if out is None else path_from("out", out)
+        name = "train" if out is None else folder.absolute().name
+        study = _compared_with_a_chirp(plant, noise, name, settings, agents)
         run_study(
             study, folder, workers=workers, progress=progress, on_done=on_done, command=command
         )
         ((name, seed),) = best_seeds(study, folder).items()
         return read_policy(seed_folder(folder, name, seed) / "policy.safetensors")
+
+
+def _several(what: str, given: object, kind: type | UnionType, allowed: str) -> list[object]:
+    """One value or several as a list."""
+    listed = [given] if isinstance(given, kind) else given
+    if not isinstance(listed, Sequence) or isinstance(listed, str):
+        raise wrong_type(what, given, allowed)
+    return list(listed)
 
 
 def _compared_with_a_chirp(
