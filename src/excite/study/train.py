@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
+from numbers import Real
 from pathlib import Path
-from types import UnionType
 
 from ..description import by_name, path_from, wrong_type
 from ..plant import AbstractARXPlant
@@ -91,7 +91,7 @@ def train(
         **decision_of(rewards.values()),
         "output_scale": by_name("output_scale", output_scale, "a dict by output"),
         "window": window,
-        "clocks": _several("clock", clock, float | int, "a frequency in Hz, or several"),
+        "clocks": _several("clock", clock, Real, "a frequency in Hz, or several"),
         "uncertainty": by_name("uncertainty", uncertainty, "a dict of ranges by name"),
     }
     agent = {
@@ -113,7 +113,7 @@ def train(
         return read_policy(seed_folder(folder, name, seed) / "policy.safetensors")
 
 
-def _several(what: str, given: object, kind: type | UnionType, allowed: str) -> list[object]:
+def _several(what: str, given: object, kind: type, allowed: str) -> list[object]:
     """One value or several as a list."""
     listed = [given] if isinstance(given, kind) else given
     if not isinstance(listed, Sequence) or isinstance(listed, str):
