@@ -34,9 +34,9 @@ def _printed(row: dict[str, Any]) -> Iterator[tuple[str, str]]:
         yield f"bound of {name}", f"{row['cramer_rao_percent'][name]:.3g}"
 
 
-def _again(folder: Path, agent: str, seed: int, keep: bool) -> int:
+def _again(folder: Path, agent: str, keep: bool) -> int:
     """How many printed numbers differ; `keep` replaces the rows."""
-    study, place = study_of(folder), seed_folder(folder, agent, seed)
+    study, place = study_of(folder), seed_folder(folder, agent, 0)
     policy = read_policy(place / "policy.safetensors")
     rows, _ = evaluate_method(study, study.build_plant(), agent, PolicyExcitation.of(policy))
     metrics = read_json(place / "metrics.json", "rows")
@@ -55,13 +55,14 @@ def main(arguments: list[str]) -> int:
     """Evaluates; the exit code says whether a number differs."""
     keep = "--write" in arguments
     chosen = [name for name in arguments if name != "--write"]
-    places = [_RESULTS / name for name in chosen] or sorted(_RESULTS.glob("*/seeds"))
+    with_agents = sorted(place.parent for place in _RESULTS.glob("*/seeds"))
+    folders = [_RESULTS / name for name in chosen] or with_agents
     differing = 0
-    for folder in (place if chosen else place.parent for place in places):
+    for folder in folders:
         agents = list(study_of(folder).agents)
         for agent in agents if chosen else agents[:1]:
             print(f"{folder.name}, {agent}, seed 0", flush=True)
-            differing += _again(folder, agent, 0, keep)
+            differing += _again(folder, agent, keep)
     print(f"{differing} numbers differ")
     return min(differing, 1)
 

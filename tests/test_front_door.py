@@ -16,6 +16,7 @@ from catalogue import LONG
 
 import excite as ex
 from excite.cli import cli
+from excite.study.catalogue import shipped_studies
 
 NAMES = [name for name in ex.__all__ if name != "__version__"]
 LONGEST = {"train", "design", "run_study", "compare_plants"}
@@ -109,8 +110,25 @@ def test_a_result_shows_itself(result):
     assert "K_pu" in result._repr_html_()
     assert "<table>" in ex.information("aero2", steps=200)._repr_html_()
     assert result.plot().axes
-    with pytest.raises(AttributeError, match="did you mean 'D_p'"):
-        result.params.Dp  # noqa: B018
+    for word in ("Dp", "d_p"):
+        with pytest.raises(AttributeError, match="did you mean 'D_p'"):
+            getattr(result.params, word)
+
+
+def test_a_verb_shows_its_documentation_and_a_wrong_name_has_a_hint():
+    assert (ex.information.__doc__ or "").startswith("Smallest possible standard deviation")
+    assert list(inspect.signature(ex.information).parameters)[:2] == ["plant", "excitation"]
+    assert repr(ex.information).startswith("<function information")
+    with pytest.raises(AttributeError) as missing:
+        ex.simulat  # noqa: B018
+    assert (missing.value.name, missing.value.obj) == ("simulat", ex)
+
+
+def test_names_are_listed_with_what_tells_them_apart():
+    assert set(ex.studies()) == set(shipped_studies())
+    for listing in (ex.estimators(), ex.studies()):
+        assert len(set(listing.values())) == len(listing)
+    assert ex.estimators()["arx-rls-wide"].endswith("With start_covariance = 1e+08.")
 
 
 def test_a_record_shows_the_same_as_text_and_as_html(record):

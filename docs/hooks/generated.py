@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from excite.cli import cli
-from excite.estimation.catalogue import ESTIMATORS
+from excite.estimation import catalogue
 from excite.excitation.catalogue import EXCITATIONS
 from excite.plant.catalogue import PLANTS, plant_named
 
@@ -86,8 +86,7 @@ def excitations() -> str:
 def estimators() -> str:
     """One row an estimator."""
     rows = ["| estimator | what it is |", "| --- | --- |"]
-    for name, estimator in ESTIMATORS.items():
-        rows.append(f"| `{name}` | {_sentence(type(estimator))} |")
+    rows += [f"| `{name}` | {line} |" for name, line in catalogue.estimators().items()]
     return "\n".join(rows)
 
 

@@ -10,6 +10,7 @@ All values are in SI units and radians.
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import hashlib
 import json
@@ -469,6 +470,15 @@ def by_name(
     if not isinstance(given, Mapping | None):
         raise wrong_type(what, given, allowed)
     return dict(given or {})
+
+
+def as_number(what: str, value: object) -> float:
+    """One number; TypeError for a text, a list or anything else."""
+    is_one = not getattr(value, "shape", ()) and not isinstance(value, str | bool)
+    if is_one and hasattr(value, "__float__"):
+        with contextlib.suppress(TypeError, ValueError):
+            return float(value)  # pyright: ignore[reportArgumentType]
+    raise wrong_type(what, value, "a number")
 
 
 LARGEST_SEED = 2**63 - 1

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from . import __version__
-from .description import names_of, wrong_type
+from .description import by_name, names_of, wrong_type
 from .excitation import AbstractExcitation, NoInput, PolicyExcitation, Replay
 from .excitation.catalogue import ExcitationLike, excitation_and_origin, name_of
 from .files import json_ready
@@ -317,8 +317,7 @@ class Experiment:
         chosen = with_sensor(plant_from(plant), noise, resolution)
         if isinstance(excitation, Record):
             chosen = chosen.changed(dt=excitation.dt)
-        if not isinstance(options, Mapping | None):
-            raise wrong_type("options", options, "a dict by name")
+        options = by_name("options", options)
         if excitation is None:
             excitation = "chirp" if chosen.definition.inputs else NoInput()
         elif not chosen.definition.inputs and not isinstance(excitation, Record):
@@ -326,7 +325,7 @@ class Experiment:
                 f"plant {chosen.definition.name!r} has no inputs: leave the excitation out"
             )
         name = excitation if isinstance(excitation, str) else name_of(excitation)
-        found, origin = excitation_and_origin(excitation, options or {}, chosen)
+        found, origin = excitation_and_origin(excitation, options, chosen)
         source = excitation.source if isinstance(excitation, Record) else ""
         num_steps = experiment_length(found, source or name, steps, isinstance(excitation, Record))
         values = params_from(chosen, params)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -30,8 +31,17 @@ def estimators() -> Listing:
     >>> "nls" in ex.estimators()
     True
     """
-    lines = {name: first_line(type(chosen)) for name, chosen in ESTIMATORS.items()}
-    return Listing(lines | {"arx-rls-wide": "As arx-rls, from a covariance of 1e8 times identity."})
+    return Listing({name: _line(chosen) for name, chosen in ESTIMATORS.items()})
+
+
+def _line(estimator: AbstractEstimator) -> str:
+    """What an estimator is, and its options that are not the usual ones."""
+    kind = type(estimator)
+    usual = kind()  # pyright: ignore[reportCallIssue] - finals have defaults
+    names = [field.name for field in dataclasses.fields(kind) if field.name != "name"]
+    own = {n: getattr(estimator, n) for n in names if getattr(estimator, n) != getattr(usual, n)}
+    options = ", ".join(f"{name} = {value:g}" for name, value in own.items())
+    return first_line(kind) + (f" With {options}." if own else "")
 
 
 def estimator_from(

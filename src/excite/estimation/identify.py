@@ -206,10 +206,7 @@ def identify(
         raise ValueError(f"initial state {initial_state!r} is not one of: known, free, auto")
     progress("reading", 0.0, 1.0)
     of_files = {"scales": scales, "units": units, "set_inputs": set_inputs, "dt": dt, "rows": rows}
-    if all(isinstance(record, Record) for record in [*given, *held_out]):
-        for name, value in ({"columns": columns} | of_files).items():
-            if value not in (None, {}):
-                raise ValueError(f"{name} is for files, and the records are given as objects")
+    _require_files([*given, *held_out], columns=columns, **of_files)
     read = partial(_read, plant.description, **of_files)
     of_held_out = by_name("columns", columns) | by_name("validate_columns", validate_columns)
     records = [read(record, columns=columns) for record in given]
@@ -342,6 +339,14 @@ def _plant_of(record: RecordLike) -> str:
     return name
 
 
+def _require_files(records: Sequence[RecordLike], **options: object) -> None:
+    """Raises ValueError for an option of files where no record is read from one."""
+    if all(isinstance(record, Record) for record in records):
+        for name, value in options.items():
+            if value not in (None, {}):
+                raise ValueError(f"{name} is for files, and the records are given as objects")
+
+
 def _read(description: PlantDescription, given: RecordLike, **options: Any) -> Record:
     """A record or that of a file; ValueError where it does not have the plant's columns."""
     if not isinstance(given, Record):
@@ -397,13 +402,12 @@ def _uncertain(
     plant: AbstractPlant, estimator: AbstractEstimator, given: Mapping[str, float | str] | None
 ) -> Float[np.ndarray, " constant"]:
     """Standard deviation of each known constant, zero where none is given."""
-    if not isinstance(given, Mapping | None):
-        raise wrong_type("uncertain", given, "a dict by constant")
+    given = by_name("uncertain", given, "a dict by constant")
     if given and not isinstance(estimator, NLS):
         raise ValueError(f"uncertain constants need the estimator nls: got {estimator.name}")
     values = {name: float(value) for name, value in plant.constants._asdict().items()}
     sd = dict.fromkeys(values, 0.0)
-    for name, spread in (given or {}).items():
+    for name, spread in given.items():
         if name not in values:
             raise unknown(f"{plant.definition.name} constant", name, values or ["none"])
         try:

@@ -13,14 +13,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..description import Listing, first_line, names_of, told, unknown, wrong_type
+from ..description import Listing, as_number, first_line, names_of, told, unknown, wrong_type
 from ..files import class_at, damaged, read_json
 from .aero2 import Aero2, Aero2Detailed, Aero2Lag
 from .cart_pole import CartPole
 from .contract import (
     AbstractPlant,
     Sensor,
-    as_number,
     require_double_precision,
     untuned,
     with_nominal,

@@ -12,7 +12,6 @@ in a constant, in sensor noise or in the initial state share one compilation.
 from __future__ import annotations
 
 import abc
-import contextlib
 import copy
 import dataclasses
 import math
@@ -27,7 +26,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from ..description import Parameter, PlantDescription, names_of, unknown, wrong_type
+from ..description import (
+    Parameter,
+    PlantDescription,
+    as_number,
+    by_name,
+    names_of,
+    unknown,
+    wrong_type,
+)
 from .fields import floats
 
 # Estimation and information need double precision. Every computation imports this module,
@@ -284,12 +291,12 @@ def params_from(
         ValueError: for an unknown name or a value outside the parameter's bounds.
         TypeError: for anything else.
     """
+    given: Any = values
     if isinstance(values, tuple) and hasattr(values, "_asdict"):
-        values = values._asdict()
-    if not isinstance(values, Mapping | None):
-        raise wrong_type(what, values, "a dict by name or the plant's named tuple")
+        given = values._asdict()
+    given = by_name(what, given, "a dict by name or the plant's named tuple")
     return plant.nominal._replace(
-        **{name: floats(_allowed(plant, name, value)) for name, value in (values or {}).items()}
+        **{name: floats(_allowed(plant, name, value)) for name, value in given.items()}
     )
 
 
@@ -352,14 +359,6 @@ def _tuned(kind: type[AbstractPlant], nominal: tuple[float, ...]) -> type[Abstra
     body = {"definition": definition, "__module__": kind.__module__, "__doc__": kind.__doc__}
     body[_UNTUNED] = untuned(kind)
     return type(kind.__name__, (kind,), body)
-
-
-def as_number(name: str, value: object) -> float:
-    """One number; TypeError for a text, a list or anything else."""
-    if np.ndim(value) == 0 and not isinstance(value, str | bool):  # pyright: ignore[reportArgumentType]
-        with contextlib.suppress(TypeError, ValueError):
-            return float(value)  # pyright: ignore[reportArgumentType]
-    raise wrong_type(name, value, "a number")
 
 
 @eqx.filter_jit

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from ..description import names_of, require_spread, unknown, wrong_type
+from ..description import by_name, names_of, require_spread, unknown
 from .contract import AbstractPlant, Params, Sensor
 from .extension import extended, extensions_of, plain_kind
 from .fields import floats
@@ -70,10 +70,9 @@ class Uncertainty(eqx.Module):
             ValueError: for an unknown name, or a range that is empty, not finite, or beyond the
                 bounds of a parameter.
         """
-        if not isinstance(ranges, Mapping | None):
-            raise wrong_type("uncertainty", ranges, "a dict of ranges by name")
+        ranges = by_name("uncertainty", ranges, "a dict of ranges by name")
         require_spread(spread)
-        given = {_PARAMETERS: f"{100 * spread}%", **(ranges or {})}
+        given = {_PARAMETERS: f"{100 * spread}%", **ranges}
         possible = extensions_of(plant)
         added = [name for name in given if name in possible]
         whole = extended(plant, added) if added else plant
@@ -81,21 +80,21 @@ class Uncertainty(eqx.Module):
             _PARAMETERS: names_of(plant.definition.parameters),
             _STATES: tuple(_START + name for name in names_of(plain_kind(plant).definition.states)),
         }
-        by_name = {n: given[word] for word, names in groups.items() if word in given for n in names}
-        by_name |= {word: value for word, value in given.items() if word not in groups}
+        each = {n: given[word] for word, names in groups.items() if word in given for n in names}
+        each |= {word: value for word, value in given.items() if word not in groups}
         quantities = _quantities(whole, groups[_STATES])
-        for name in by_name:
+        for name in each:
             if name not in quantities:
                 known = dict.fromkeys([*quantities, *possible, *groups])
                 where = f"quantity in the uncertainty of {plant.definition.name!r}:"
                 raise unknown(where, name, known)
         boxes = {}
-        for name, value in by_name.items():
+        for name, value in each.items():
             try:
                 boxes[name] = _interval(name, value, quantities[name])
             except ValueError as error:
-                by_spread = _PARAMETERS not in (ranges or {}) and name in groups[_PARAMETERS]
-                if name in (ranges or {}) or not by_spread:
+                by_spread = _PARAMETERS not in ranges and name in groups[_PARAMETERS]
+                if name in ranges or not by_spread:
                     raise
                 advice = (
                     f"a smaller --spread, or a range of its own (--uncertainty {name}=LOW:HIGH)"

@@ -20,7 +20,16 @@ from typing import Any
 
 import numpy as np
 
-from ..description import Input, Output, PlantDescription, by_name, names_of, path_from, wrong_type
+from ..description import (
+    Input,
+    Output,
+    PlantDescription,
+    as_number,
+    by_name,
+    names_of,
+    path_from,
+    wrong_type,
+)
 from .bags import is_bag
 from .dates import seconds_of
 from .formats import columns_in
@@ -129,14 +138,10 @@ class _Options:
     dt: float | None
 
     def __post_init__(self) -> None:
-        numbers = {f"scale of {name!r}": value for name, value in self.scales.items()}
-        numbers |= {f"value of input {n!r}": value for n, value in self.set_inputs.items()}
-        for what, value in (numbers | ({} if self.dt is None else {"dt": self.dt})).items():
-            if not hasattr(value, "__float__"):
-                raise wrong_type(what, value, "a number")
         for name in (*self.columns, *self.scales, *self.units):
             self._require_known(name, "column", self.description.columns)
         for name, factor in self.scales.items():
+            as_number(f"scale of {name!r}", factor)
             if not (np.isfinite(factor) and factor != 0):
                 raise ValueError(
                     f"scale {factor:g} of {name!r} is not allowed: finite and not zero"
@@ -145,15 +150,19 @@ class _Options:
             self.factor(name)
         for name, value in self.set_inputs.items():
             self._require_known(name, "input", names_of(self.description.inputs))
+            as_number(f"value of input {name!r}", value)
             if not np.isfinite(value):
                 raise ValueError(
                     f"value {value:g} of input {name!r} is not allowed: a finite number"
                 )
             if name in self.columns:
                 raise ValueError(f"input {name!r} is a column or a set value; give one of them")
-        if self.dt is not None and not (np.isfinite(self.dt) and self.dt > 0):
+        if self.dt is None:
+            return
+        as_number("dt", self.dt)
+        if not (np.isfinite(self.dt) and self.dt > 0):
             raise ValueError(f"sampling time {self.dt:g} s is not allowed: finite and positive")
-        if self.dt is not None and "time" in {*self.columns, *self.scales, *self.units}:
+        if "time" in {*self.columns, *self.scales, *self.units}:
             raise ValueError(
                 "--dt is the sampling time in seconds of a file without time; give it, or column, "
                 "unit and scale of 'time'"

@@ -104,8 +104,8 @@ def train(
     agents = {f"{method}({', '.join(rewards)})": agent}
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) if out is None else path_from("out", out)
-        name = "train" if out is None else folder.absolute().name
-        study = _compared_with_a_chirp(plant, noise, name, settings, agents)
+        title = "train" if out is None else folder.absolute().name
+        study = _compared_with_a_chirp(plant, noise, title, settings, agents)
         run_study(
             study, folder, workers=workers, progress=progress, on_done=on_done, command=command
         )
