@@ -63,12 +63,14 @@ def timed_gradient(goal: float, rate: float) -> tuple[float, float, float]:
     env, settings = process(False), gradient.GradientSettings(num_updates=1000)
     course, keys = gradient.started(env, settings, [0])
     start = time.perf_counter()
-    jax.block_until_ready(gradient.update_all(env, settings, course.now, keys(0)))
+    jax.block_until_ready(gradient.update_all(env, settings, course.now, keys(0), False, None))
     print(f"gradient, compilation and first update: {time.perf_counter() - start:.1f} s")
     now, seconds = course.now, 0.0
     for i in range(settings.num_updates):
         start = time.perf_counter()
-        now = jax.block_until_ready(gradient.update_all(env, settings, now, keys(i))[0])
+        now, _ = jax.block_until_ready(
+            gradient.update_all(env, settings, now, keys(i), False, None)
+        )
         seconds += time.perf_counter() - start
         if (i + 1) % 10 == 0:
             worth, violations = judged(env, jax.tree.map(lambda leaf: leaf[0], now.player))

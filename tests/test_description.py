@@ -16,6 +16,7 @@ from excite.description import (
     Output,
     Parameter,
     PlantDescription,
+    Spread,
     State,
     names_of,
     told,
@@ -225,3 +226,35 @@ def test_data_that_is_no_description_is_refused_in_a_sentence(change, sentence):
     change(data)
     with pytest.raises(ValueError, match=sentence):
         PlantDescription.from_dict(data)
+
+
+INERTIA = Parameter("J_p", "kg m²", 0.02)
+OFFSET = Parameter("offset", "N", -3.0, scale=2.0, positive=False)
+
+
+@pytest.mark.parametrize(
+    ("given", "parameter", "lower", "upper"),
+    [
+        (0.3, INERTIA, 0.014, 0.026),
+        (0.3, OFFSET, -3.6, -2.4),
+        ("factor:2", INERTIA, 0.01, 0.04),
+        ("factor:2", OFFSET, -3 - 2 * math.log(2), -3 + 2 * math.log(2)),
+        ("factor:1", INERTIA, 0.02, 0.02),
+    ],
+)
+def test_a_spread_reaches_from_its_lower_to_its_upper_end(given, parameter, lower, upper):
+    spread = Spread.of(given)
+    ends = [spread.value(parameter, parameter.nominal, unit) for unit in (-1, 1)]
+    assert ends == pytest.approx([lower, upper], rel=1e-12)
+    assert Spread.of(spread.setting) == spread
+    assert Spread.of(spread) is spread
+
+
+@pytest.mark.parametrize(
+    "given",
+    [1.0, -0.1, math.nan, math.inf, True, None, [0.3], "0.3", "factor", "factor:", "factor:0.5",
+     "factor:nan", "factor:1001", "factor:1e400", "Factor:3"],
+)  # fmt: skip
+def test_a_spread_that_is_not_allowed_is_one_sentence(given):
+    with pytest.raises(ValueError, match=r"^spread must lie in \[0, 1\), or be a factor from 1 to"):
+        Spread.of(given)

@@ -203,7 +203,10 @@ def test_a_design_is_saved_shown_and_played(tmp_path):
         ({"kind": "chirp", "starts": 3}, "a tuning has trials (--trials)"),
         ({"trials": 3}, "a robust design has updates (--updates)"),
         ({"steps": 1}, "steps must be a whole number from 2 to 10000000: got 1"),
-        ({"spread": 1.0}, "spread must lie in [0, 1): got 1.0"),
+        (
+            {"spread": 1.0},
+            "such as factor:3: got 1.0",
+        ),
         ({"criterion": "F"}, "criterion must be D, A or E: got 'F'"),
         ({"noise": {"yaw": 1.0}}, "unknown aero2 output 'yaw'"),
         ({"out": "signal.txt"}, "experiment files end in .csv or .mat"),

@@ -12,11 +12,11 @@ from commands import excite
 
 import excite as ex
 from excite.description import Input, Output, Parameter, PlantDescription, State
-from excite.environment import Env
+from excite.environment import Env, run_episodes
 from excite.environment.falsification import Cases, Effort, OnPlant, nearness, search
-from excite.excitation import PositionLoop, Replay, Square
+from excite.excitation import Coast, PositionLoop, Replay, Square
 from excite.files import json_text, write_json
-from excite.plant import AbstractPlant, Aero2
+from excite.plant import EMPS, AbstractPlant, Aero2, params_within
 from excite.plant.catalogue import plant_from, plant_in_file, plant_named, with_sensor, word_of
 from excite.plant.contract import with_nominal
 from excite.plant.extension import extended
@@ -84,6 +84,17 @@ def test_a_range_is_read_as_it_is_written(given, lower, upper):
     is_factor = given == "factor:2"
     expected = np.sqrt(lower * upper) if is_factor else (lower + upper) / 2
     np.testing.assert_allclose(middle, expected, rtol=1e-12)
+
+
+def test_a_factor_of_parameters_is_that_of_their_spread():
+    plant = EMPS()
+    box = Uncertainty.of(plant, "factor:2")
+    whole = Uncertainty.of(plant, 0.1, {"parameters": "factor:2"})
+    assert box.ranges() == whole.ranges()
+    for corner in (-1.0, 1.0):
+        expected = params_within(plant, "factor:2", corner * jnp.ones(len(box.names)))
+        _, params = box.at(corner * jnp.ones(len(box.names)))
+        np.testing.assert_allclose(params, expected, rtol=1e-12)
 
 
 def test_a_point_of_the_box_is_the_plant_with_these_numbers():
@@ -222,6 +233,47 @@ def test_a_case_is_the_episode_of_its_plant_and_seed():
     noise = play.noise(Cases(point, jnp.asarray(7)))
     given = play(Cases(point, jnp.asarray(7), noise))
     np.testing.assert_allclose(given, expected, rtol=1e-12)
+
+
+KICK, AFTER = 4, 40
+"""Samples of an input at its limit, and of the free motion after it, which swings farther."""
+
+
+def test_the_free_motion_after_the_end_counts_for_safety_alone():
+    plant, keys = Aero2(), jax.random.split(jax.random.key(3), 2)
+    kick = Replay(12 * jnp.ones((KICK, 1)))
+    short = run_episodes(plant, kick, KICK, "factor:3", keys)
+    long = run_episodes(plant, kick, KICK, "factor:3", keys, None, AFTER)
+    np.testing.assert_array_equal(short.trajectory.inputs, long.trajectory.inputs)
+    np.testing.assert_allclose(short.information, long.information, rtol=1e-12)
+    inputs = jnp.concatenate([kick.inputs, jnp.zeros((AFTER, 1))])
+    for i in range(2):
+        params = plant.Params(*(float(column[i]) for column in short.params))
+        whole = np.abs(response(plant, params, inputs)).max()
+        assert whole > 1.5 * float(short.max_abs_output[i, 0])
+        np.testing.assert_allclose(long.max_abs_output[i, 0], whole, rtol=1e-9)
+    box = Uncertainty.of(plant, "factor:3")
+    play = OnPlant(box, *Coast.after(kick, KICK, AFTER))
+    _, params = box.at(-jnp.ones(3))
+    expected = np.abs(response(plant, params, inputs)).max() / critical_levels(plant.definition)[0]
+    np.testing.assert_allclose(play(Cases(-jnp.ones(3), jnp.asarray(0))), expected, rtol=1e-9)
+
+
+def test_a_search_goes_on_after_the_end_and_is_replayed():
+    kick = 12 * jnp.ones((KICK, 1))
+    short, long = (
+        ex.falsify(Replay(kick), "aero2", steps=KICK, coast=coast, budget=100)
+        for coast in (0, AFTER)
+    )
+    assert long.nearness > 1.5 * short.nearness
+    assert long.certificate()["coast"] == AFTER
+    assert f"{KICK} steps and {AFTER} after them" in repr(long)
+    replay = ex.simulate(
+        long.worst_plant, Replay(kick), steps=KICK, coast=AFTER, seed=long.worst_seed
+    )
+    np.testing.assert_allclose(replay.outputs, long.record.outputs, atol=1e-9)
+    with pytest.raises(ValueError, match="leave coast out"):
+        ex.falsify("aero2", rig=True, coast=5)
 
 
 def test_a_search_gives_the_same_answer_again():

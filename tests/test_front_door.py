@@ -19,7 +19,7 @@ from excite.cli import cli
 from excite.study.catalogue import shipped_studies
 
 NAMES = [name for name in ex.__all__ if name != "__version__"]
-LONGEST = {"train", "design", "run_study", "compare_plants"}
+LONGEST = {"train", "campaign", "design", "run_study", "compare_plants"}
 
 
 @pytest.mark.parametrize("name", [LONG(name) if name in LONGEST else name for name in NAMES])
@@ -144,6 +144,17 @@ def test_a_record_is_replayed_and_its_inputs_are_a_signal(record):
 
 
 MISTAKES = {
+    "ex.Campaign('aero2', 'D_p=1%')": "target must be a dict by parameter: got str 'D_p=1%'",
+    "ex.Campaign('aero2', {'D_p': None})": "target of D_p must be a number: got NoneType None",
+    "ex.Campaign('aero2', {'D_p': True})": "target of D_p must be a number: got bool True",
+    "ex.Campaign('aero2', {'D_p': '1%'}, spread='3')": "such as factor:3: got '3'",
+    "ex.Campaign('aero2', {'D_p': '1%'}, rounds=2.5)": "rounds must be a whole number from 1",
+    "ex.campaign('aero2', {'D_p': '1%'}, out=3)": "out must be a path: got int 3",
+    "ex.campaign('aero2', {'D_p': '1%'}, out='x', pause='5')": "pause must be a number: got str",
+    "ex.campaign('aero2', {'D_p': '1%'}, out='x', pause=-1)": "pause must be a number of seconds",
+    "ex.campaign('aero2', {'D_p': '1%'}, 'simulatd', out='x')": "did you mean 'simulated'",
+    "ex.simulate('aero2', coast=-1)": "coast must be a whole number from 0",
+    "ex.train('aero2', spread='factor:0')": "such as factor:3: got 'factor:0'",
     "ex.simulate('aero')": "unknown plant 'aero'; did you mean 'aero2'",
     "ex.simulate(3)": "plant must be a name, path/to/file.py:ClassName, a plant or its class: "
     "got int 3",

@@ -229,6 +229,23 @@ def test_excess_counts_from_the_margin_to_the_critical_level():
     np.testing.assert_allclose(batch.nearness[0], outputs.max() / critical, rtol=1e-6)
 
 
+def test_the_coast_is_penalised_and_not_rewarded():
+    env = env_of(OBJECTIVES["D"], num_steps=8)
+    network = Network(weights_of(env), env.layout)
+    longer = dataclasses.replace(env, coast=30)
+    short, long = (experiments(e, network, KEYS, 1e-3) for e in (env, longer))
+    np.testing.assert_array_equal(short.worth, long.worth)
+    assert np.all(np.asarray(long.excess) > np.asarray(short.excess))
+    critical = env.plant.definition.outputs[0].critical_level or 0.0
+    for i, key in enumerate(KEYS):
+        state, inputs = run(env, network.weights, key)
+        whole = jnp.concatenate([inputs, jnp.zeros((30, 1))])
+        outputs = np.abs(response(env.plant, state.params, whole)[1:, 0]) / critical
+        np.testing.assert_allclose(long.nearness[i], outputs.max(), rtol=1e-6)
+        over = np.maximum(outputs - 1e-3, 0) / (1 - 1e-3)
+        np.testing.assert_allclose(long.excess[i], np.sum(over**2) / 8, rtol=1e-6)
+
+
 @pytest.mark.science
 def test_training_learns_and_one_seed_gives_one_policy():
     env = env_of(OBJECTIVES["D"])

@@ -272,9 +272,9 @@ def test_a_bad_option_is_one_sentence_and_exit_code_2(call, tmp_path, name):
 
 
 @pytest.mark.parametrize(("numbers", "sentence"), [
-    ({"spread": math.nan}, "spread must lie in [0, 1): got nan"),
-    ({"spread": math.inf}, "spread must lie in [0, 1): got inf"),
-    ({"spread": -0.1}, "spread must lie in [0, 1): got -0.1"),
+    ({"spread": math.nan}, "such as factor:3: got nan"),
+    ({"spread": math.inf}, "such as factor:3: got inf"),
+    ({"spread": -0.1}, "such as factor:3: got -0.1"),
     ({"seed": -1}, "seed must be a whole number from 0 to 9223372036854775807: got -1"),
     ({"seed": 10**30}, "seed must be a whole number"),
     ({"steps": 0}, "steps must be a whole number from 2 to 10000000: got 0"),

@@ -247,10 +247,19 @@ BAD_STUDIES: dict[str, tuple[str, tuple[str, ...]]] = {
     ),
     "negative seed": (inserted("seed = -1"), ("seed", "got -1")),
     "seed beyond what a key can hold": (inserted(f"seed = {10**20}"), ("seed", f"{10**20}")),
-    "spread of an agent of one": (inserted("spread = 1.0"), ("spread", "less than 1", "got 1.0")),
-    "spread as text": (inserted('spread = "0.3"'), ("spread", 'got "0.3"')),
+    "spread of an agent of one": (
+        inserted("spread = 1.0"), ("spread must lie in [0, 1), or be a factor", "got 1.0"),
+    ),
+    "spread as text": (inserted('spread = "0.3"'), ("spread must lie", "got '0.3'")),
     "spread that is no number": (inserted("spread = nan"), ("spread", "got nan")),
     "date for a seed": (inserted("seed = 2026-01-01"), ("seed must be a whole number",)),
+    "coast of ppo": (
+        inserted("coast = 5") + '[agents.a]\n', ("ppo does not train on the coast",),
+    ),
+    "coast on a rig": (
+        inserted("coast = 5") + "[rig]\n", ("on a rig end with the last sample",),
+    ),
+    "negative coast": (inserted("coast = -1"), ("coast", "got -1")),
     "plant as number": (MINIMAL.replace('"aero2"', "2"), ("plant must be a string, got 2",)),
     "method as number": (
         MINIMAL.replace('[methods.chirp]\nexcitation = "chirp"', "[methods]\nchirp = 3"),
@@ -840,7 +849,7 @@ def test_an_agent_has_a_range_and_plants_of_its_own(tmp_path):
     study = study_of(MINIMAL + text, tmp_path)
     env = study.agent("a").env(study.build_plant(), study.spread, study.num_steps)
     assert env.layout.input_half == (7.2,)
-    assert env.spread == 0.1
+    assert float(env.spread.reach) == 0.1
 
 
 # Shipped studies

@@ -137,7 +137,7 @@ class Play:
 
     def __init__(self, policy, seed) -> None:
         self.plant = plant_from(policy.plant.name)
-        self.spread, self.ranges = trained_in(policy, self.plant)
+        self.spread, self.ranges, _ = trained_in(policy, self.plant)
         self.excitation, _ = excitation_and_origin(policy, {}, self.plant)
         self.num_readings, self.seed = readings_per_sample(self.plant), seed
         self.rules = Supervision.of(self.plant.description)

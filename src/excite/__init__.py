@@ -36,6 +36,7 @@ _PLACES = {
     "run_study": "study.run",
     "report": "report.html",
     "run": "rig.session",
+    "campaign": "study.campaign",
     # nouns
     "Record": "record.record",
     "read_record": "record.read",
@@ -51,6 +52,7 @@ _PLACES = {
     "Study": "study.spec",
     "read_study": "study.spec",
     "Identification": "estimation.result",
+    "Campaign": "study.campaign",
     # what there is
     "plants": "plant.catalogue",
     "excitations": "excitation.catalogue",
@@ -129,6 +131,8 @@ if TYPE_CHECKING:
     from .report.html import report as report
     from .rig.session import run as run
     from .simulation import simulate as simulate
+    from .study.campaign import Campaign as Campaign
+    from .study.campaign import campaign as campaign
     from .study.catalogue import studies as studies
     from .study.evaluate import evaluate as evaluate
     from .study.falsify import falsify as falsify

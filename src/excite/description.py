@@ -22,7 +22,7 @@ import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 FORMAT = 1
 """Version of the canonical JSON below; it enters every hash."""
@@ -493,10 +493,63 @@ def require_whole(what: str, value: Any, least: int, most: int = 10_000_000) -> 
         )
 
 
-def require_spread(value: Any) -> None:
-    """Raises ValueError for a spread of plants that is not allowed."""
-    if not (hasattr(value, "__float__") and 0 <= float(value) < 1):  # also NaN
-        raise ValueError(f"spread must lie in [0, 1): got {reprlib.repr(value)}")
+@dataclass(frozen=True)
+class Spread:
+    """How far the parameters of plants lie from their nominal values.
+
+        >>> Spread.of("factor:3").value(Parameter("J_p", "kg m²", 0.03), 0.03, 1.0)
+        0.09
+
+    Attributes:
+        reach: a fraction of each parameter's scale, or a factor.
+        relative: half the width in relative parameters: the fraction, or the factor's logarithm.
+        is_factor: whether it is a factor. Positive parameters then lie between the nominal value
+            over the factor and the nominal value times the factor, uniform in their logarithm;
+            the others within the factor's logarithm times their scale.
+
+    The numbers may be arrays.
+    """
+
+    reach: Any
+    relative: Any
+    is_factor: bool = False
+
+    @classmethod
+    def of(cls, given: SpreadLike) -> Spread:
+        """From a fraction such as 0.3, or a text such as `factor:3`; ValueError otherwise."""
+        if isinstance(given, Spread):
+            return given
+        word, _, number = given.partition(":") if isinstance(given, str) else ("", "", "")
+        with contextlib.suppress(TypeError, ValueError, OverflowError):
+            if word == "factor" and 1 <= float(number) <= LARGEST_FACTOR:
+                return cls(float(number), math.log(float(number)), is_factor=True)
+            if not isinstance(given, str | bool) and 0 <= float(given) < 1:
+                return cls(float(given), float(given))
+        raise ValueError(
+            "spread must lie in [0, 1), or be a factor from 1 to "
+            f"{LARGEST_FACTOR:g} such as factor:3: got {reprlib.repr(given)}"
+        )
+
+    def value(self, parameter: Parameter, nominal: Any, unit: Any) -> Any:
+        """The parameter at a coordinate in [-1, 1], for numbers or arrays."""
+        if self.is_factor and parameter.positive:
+            return nominal * self.reach**unit
+        return nominal + self.relative * parameter.scale * unit
+
+    @property
+    def setting(self) -> float | str:
+        """As it is given and saved."""
+        return f"factor:{self.reach:.12g}" if self.is_factor else self.reach
+
+    def __str__(self) -> str:
+        """As it is given on the command line."""
+        return str(self.setting) if self.is_factor else f"{self.reach:g}"
+
+
+SpreadLike: TypeAlias = float | str | Spread
+"""A fraction of each parameter's scale, or a factor such as `factor:3`."""
+
+LARGEST_FACTOR = 1000.0
 
 
 def told(error: BaseException) -> str:

@@ -19,8 +19,8 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from . import __version__
-from .description import by_name, names_of, wrong_type
-from .excitation import AbstractExcitation, NoInput, PolicyExcitation, Replay
+from .description import by_name, names_of, require_whole, wrong_type
+from .excitation import AbstractExcitation, Coast, NoInput, PolicyExcitation, Replay
 from .excitation.catalogue import ExcitationLike, excitation_and_origin, name_of
 from .files import json_ready
 from .plant import AbstractPlant, Params, params_from
@@ -307,6 +307,7 @@ class Experiment:
         noise: Mapping[str, float] | None = None,
         resolution: Mapping[str, float] | None = None,
         seed: int | PRNGKeyArray = 0,
+        coast: int = 0,
     ) -> Experiment:
         """The experiment that `simulate` runs, with the same arguments.
 
@@ -328,6 +329,8 @@ class Experiment:
         found, origin = excitation_and_origin(excitation, options, chosen)
         source = excitation.source if isinstance(excitation, Record) else ""
         num_steps = experiment_length(found, source or name, steps, isinstance(excitation, Record))
+        require_whole("coast", coast, 0)
+        found, num_steps = Coast.after(found, num_steps, coast)
         values = params_from(chosen, params)
         _require_causal(chosen, values)
         return cls(chosen, values, found, name, origin, num_steps, _checked(seed))
@@ -431,6 +434,7 @@ def simulate(
     noise: Mapping[str, float] | None = None,
     resolution: Mapping[str, float] | None = None,
     seed: int | PRNGKeyArray = 0,
+    coast: int = 0,
 ) -> Record:
     """The record of one simulated experiment, with the measurements of the plant's sensor.
 
@@ -453,6 +457,7 @@ def simulate(
         noise: standard deviation of an output's noise, by name [output unit].
         resolution: step of an output's encoder, by name [output unit].
         seed: of excitation and noise; a whole number or a JAX key.
+        coast: samples after the excitation's end, under the input that ends an experiment.
 
     Raises:
         ValueError: for a name, an option or a value that is not allowed; `DivergedError`
@@ -461,6 +466,6 @@ def simulate(
     """
     experiment = Experiment.of(
         plant, excitation, options=options, steps=steps, params=params, noise=noise,
-        resolution=resolution, seed=seed,
+        resolution=resolution, seed=seed, coast=coast,
     )  # fmt: skip
     return experiment.record(experiment.run())

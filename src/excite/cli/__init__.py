@@ -17,6 +17,7 @@ import click
 from .. import __version__
 from ..description import told
 from .benchmark import benchmark
+from .campaign import campaign
 from .compare_plants import compare_plants
 from .completion import complete_names
 from .design import design
@@ -55,6 +56,7 @@ _SECTIONS: dict[str, dict[click.Command, str]] = {
     },
     "Experiment on a rig": {
         run: "excite run --policy aero2 --fast --out experiment.csv",
+        campaign: "excite campaign aero2 --target D_p=1%,J_p=0.5% --fast --out runs/known",
     },
     "Compare": {
         compare_plants: "excite compare-plants aero2 aero2+coulomb --record record.csv",

@@ -9,10 +9,11 @@ import click
 
 from .completion import signals
 from .options import (
-    FRACTION,
     NUMBERS,
     OUT_FILE,
+    SPREAD,
     WholeNumber,
+    coast_option,
     computing,
     json_option,
     merged,
@@ -53,9 +54,14 @@ from .options import (
     help="Length in samples.",
 )
 @click.option(
-    "--spread", type=FRACTION, default=0.3, show_default=True, help="Spread of the plants."
+    "--spread",
+    type=SPREAD,
+    default=0.3,
+    show_default=True,
+    help="Spread of the plants (0.3, factor:3).",
 )
 @uncertainty_option("What else may differ: a robust design is made safe there too.")
+@coast_option
 @click.option("--noise", type=NUMBERS, multiple=True, help="Noise sd of an output, in its unit.")
 @click.option(
     "--seed",

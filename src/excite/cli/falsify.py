@@ -9,10 +9,10 @@ from typing import Any
 import click
 
 from .options import (
-    FRACTION,
     NUMBERS,
     OUT_FILE,
     SEED,
+    SPREAD,
     VALUES,
     WholeNumber,
     computing,
@@ -38,10 +38,16 @@ from .options import (
 )
 @click.option(
     "--spread",
-    type=FRACTION,
-    help="Spread of the parameters; default that of the policy's training, or 0.3.",
+    type=SPREAD,
+    help="Spread of the parameters (0.3, factor:3); default that of the policy's training, or 0.3.",
 )
 @uncertainty_option("What else may differ; default that of the policy's training.")
+@click.option(
+    "--coast",
+    type=WholeNumber(0, 100_000),
+    metavar="N",
+    help="Samples after the end that are searched too; default that of the training, or 0.",
+)
 @click.option("--noise", type=NUMBERS, multiple=True, help="Noise sd of an output, in its unit.")
 @click.option(
     "--steps",
@@ -121,14 +127,15 @@ def falsify(
             chosen = "".join(
                 f" --set {name}={json.dumps(value)}" for name, value in settings.items()
             )
+            coast = f" --coast {found.coast}" * bool(found.coast)
             replay = f"excite simulate {out}"
             if found.rig:
                 known = "" if options["plant"] is None else f" --plant {options['plant']}"
-                filtered = f" --filter --spread {found.spread:g}" if found.filter else ""
+                filtered = f" --filter --spread {found.spread}" if found.filter else ""
                 replay = f"excite run --rig {out}{known}{filtered} --fast --out replay.csv"
             click.echo(
                 f"worst plant: {out}\nreplay: {replay} --excitation {excitation}"
-                f"{chosen} --steps {found.num_steps} --seed {found.worst_seed}"
+                f"{chosen} --steps {found.num_steps}{coast} --seed {found.worst_seed}"
             )
     if certify is not None:
         found.certified().save(certify, overwrite)

@@ -22,6 +22,8 @@ from typing import Any, Generic, ParamSpec, Self, TypeVar
 
 import click
 
+from ..description import Spread
+
 Callback = TypeVar("Callback", bound=Callable[..., object])
 P = ParamSpec("P")
 Result = TypeVar("Result")
@@ -118,7 +120,24 @@ class Number(click.FloatRange):
         return number
 
 
-FRACTION = Number(0, 1, max_open=True)
+class _Spread(click.ParamType):
+    """A fraction below one, or a factor."""
+
+    name = "spread"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float | str:
+        """As it is given; a number as such."""
+        try:
+            spread = Spread.of(value if str(value).startswith("factor") else float(value))
+        except ValueError as error:
+            allowed = str(error).removeprefix("spread ").partition(": got")[0]
+            self.fail(f"{value!r} is not allowed: it {allowed}", param, ctx)
+        return spread.setting
+
+
+SPREAD = _Spread()
 
 
 def _option_value(text: str) -> bool | float | list[object]:
@@ -132,6 +151,14 @@ def _option_value(text: str) -> bool | float | list[object]:
     return value
 
 
+coast_option = click.option(
+    "--coast",
+    type=WholeNumber(0, 100_000),
+    default=0,
+    show_default=True,
+    metavar="N",
+    help="Samples after the end, under the input that ends an experiment, that must be safe too.",
+)
 NUMBERS = Assignments(float, "a number")
 NAMES = Assignments(str, "a name")
 VALUES = Assignments(_option_value, "a number, true, false or a list of numbers")

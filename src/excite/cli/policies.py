@@ -10,10 +10,11 @@ from typing import Any
 import click
 
 from .options import (
-    FRACTION,
     NUMBERS,
     SEED,
+    SPREAD,
     WholeNumber,
+    coast_option,
     computing,
     json_option,
     merged,
@@ -89,9 +90,14 @@ def _worst(certificate: Mapping[str, Any] | None) -> str:
 )
 @click.option("--seed", type=SEED, default=0, show_default=True, help="Seed of the plants.")
 @click.option(
-    "--spread", type=FRACTION, default=0.3, show_default=True, help="Spread of the plants."
+    "--spread",
+    type=SPREAD,
+    default=0.3,
+    show_default=True,
+    help="Spread of the plants (0.3, factor:3).",
 )
 @uncertainty_option("What else may differ, as in 'excite falsify'.")
+@coast_option
 @click.option("--noise", type=NUMBERS, multiple=True, help="Noise sd of an output, in its unit.")
 @click.option("--estimators", metavar="NAME,...", help="Default nls, and arx-rls if possible.")
 @click.option("--rig", "on_rig", is_flag=True, help="Use the plant's simulated rig.")

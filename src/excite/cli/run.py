@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from .options import (
-    FRACTION,
     NUMBERS,
     OUT_FILE,
     SEED,
+    SPREAD,
     VALUES,
     Number,
     RunFailedError,
@@ -76,10 +76,10 @@ def _options(command: Callable[..., int]) -> Callable[..., int]:
         click.option("--seed", type=SEED, default=0, show_default=True,
                      help="Seed of a simulated rig's hidden parameters, noise and jitter, and of "
                      "random signals."),
-        click.option("--spread", type=FRACTION, default=0.3,
+        click.option("--spread", type=SPREAD, default=0.3,
                      show_default=True,
-                     help="Spread of these parameters and of the filter's prior, as a fraction of "
-                     "their scales."),
+                     help="Spread of these parameters and of the filter's prior: a fraction of "
+                     "their scales, or factor:3."),
         click.option("--fault", "faults", type=NUMBERS, multiple=True,
                      help="Faults of a simulated rig: latency, jitter [s], dropout (probability "
                      "of a lost reading); sensor_frozen, actuator_stuck, actuator_dead, "

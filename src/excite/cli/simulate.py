@@ -17,6 +17,7 @@ from .options import (
     VALUES,
     RunFailedError,
     WholeNumber,
+    coast_option,
     computing,
     json_option,
     merged,
@@ -92,6 +93,7 @@ def show_warnings(warnings: Iterable[str]) -> None:
 @click.argument("plant")
 @click.argument("input_file", required=False, type=OUT_FILE)
 @excitation_options
+@coast_option
 @click.option("--out", type=OUT_FILE, metavar="FILE", help="Write the record (.csv, .mat).")
 @click.option("--overwrite", is_flag=True, help="Replace the record if it exists.")
 @plot_option
@@ -112,7 +114,9 @@ def simulate(
 
     if out is not None:
         require_record_path(out, options["overwrite"])
-    experiment = Experiment.of(**given_experiment(plant, input_file, options))
+    experiment = Experiment.of(
+        **given_experiment(plant, input_file, options), coast=options["coast"]
+    )
     show_warnings(experiment.warnings)
     with progress_bar("simulating"):
         try:

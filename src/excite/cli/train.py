@@ -8,12 +8,13 @@ from typing import Any
 import click
 
 from .options import (
-    FRACTION,
     NUMBERS,
     OUT_FILE,
+    SPREAD,
     VALUES,
     Number,
     WholeNumber,
+    coast_option,
     computing,
     json_option,
     merged,
@@ -46,10 +47,12 @@ def _options(command: Any) -> Any:
                          help="Hyper-parameters of the method, for instance num_updates=300."),
             click.option("--seeds", type=WholeNumber(1, 1000), default=1, show_default=True,
                          help="Number of independent trainings."),
-            click.option("--spread", type=FRACTION, default=0.3,
+            click.option("--spread", type=SPREAD, default=0.3,
                          show_default=True,
-                         help="Plants are drawn from nominal values ± this fraction."),
+                         help="Plants are drawn from nominal values ± this fraction, or within a "
+                         "factor (factor:3)."),
             uncertainty_option("What else may differ: the policy is made safe there too."),
+            coast_option,
             click.option("--steps", type=WholeNumber(2, 1_000_000), default=500,
                          show_default=True, metavar="T", help="Length of an experiment."),
             click.option("--noise", type=NUMBERS, multiple=True,

@@ -11,7 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PRNGKeyArray
 
-from ..excitation import AbstractExcitation
+from ..description import SpreadLike
+from ..excitation import AbstractExcitation, Coast
 from ..information import cramer_rao_bound, experiment_information, relative_size
 from ..plant import AbstractPlant, Params, draw_params
 from ..plant.uncertainty import Uncertainty
@@ -44,9 +45,10 @@ def run_episodes(
     plant: AbstractPlant,
     excitation: AbstractExcitation,
     num_steps: int,
-    spread: float,
+    spread: SpreadLike,
     keys: Key[Array, " episode"],
     uncertainty: Uncertainty | None = None,
+    coast: int = 0,
 ) -> Episodes:
     """One episode per key. Plant and noise of a key are the same for any excitation.
 
@@ -54,10 +56,13 @@ def run_episodes(
         plant: as identification knows it.
         excitation: proposes the inputs.
         num_steps: of an episode.
-        spread: parameters are uniform in nominal value ± spread times their scale.
+        spread: of the parameters around their nominal values.
         keys: of the episodes.
         uncertainty: in place of the spread, the box from which plants are drawn.
+        coast: samples after the episode, under the input that ends it, whose outputs count as
+            those of the episode; nothing is measured there.
     """
+    whole, length = Coast.after(excitation, num_steps, coast)
 
     def episode(key: PRNGKeyArray) -> Episodes:
         params_key, episode_key = jax.random.split(key)
@@ -65,22 +70,30 @@ def run_episodes(
             true, own = plant, draw_params(plant, params_key, spread)
         else:
             true, own = uncertainty.at(uncertainty.draw(params_key))
-        run = run_episode(true, own, excitation, num_steps, episode_key)
+        run = run_episode(true, own, whole, length, episode_key)
         known = plant.Params(*(getattr(own, name) for name in plant.nominal._fields))
-        return scored(plant, known, run)
+        return scored(plant, known, run, coast)
 
     return jax.vmap(episode)(keys)
 
 
-def scored(plant: AbstractPlant, params: Params, trajectory: Trajectory) -> Episodes:
-    """One experiment with its information and its largest outputs."""
+def scored(plant: AbstractPlant, params: Params, run: Trajectory, coast: int = 0) -> Episodes:
+    """One experiment with its information and its largest outputs.
+
+    Args:
+        coast: samples at the end of the run that are not part of the experiment.
+    """
+    end = len(run.inputs) - coast
+    rows = run.time, run.measured, run.outputs
+    time, measured, outputs = (x[: end + 1] for x in rows)
+    trajectory = Trajectory(time, run.inputs[:end], measured, outputs)
     information = experiment_information(plant, params, trajectory.inputs)
     relative = relative_size(plant, params) / jnp.abs(jnp.stack(params))
     return Episodes(
         params=params,
         trajectory=trajectory,
-        is_violation=is_violation(trajectory.outputs, critical_levels(plant.definition)),
-        max_abs_output=max_abs_output(trajectory.outputs),
+        is_violation=is_violation(run.outputs, critical_levels(plant.definition)),
+        max_abs_output=max_abs_output(run.outputs),
         information=information,
         bound=cramer_rao_bound(information) * relative,
     )

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
-from ..description import PlantDescription, names_of
+from ..description import PlantDescription, Spread, SpreadLike, names_of
 from ..information import relative_size
 from ..plant import AbstractPlant, Params
 from ..plant.fields import floats, optional_floats
@@ -225,7 +225,7 @@ def target_mask(description: PlantDescription, targets: Sequence[str] | None) ->
     return tuple(name in targets for name in names)
 
 
-def prior_sd_of(spread: float) -> float:
-    """Standard deviation of a relative parameter that is uniform within ± `spread`."""
+def prior_sd_of(spread: SpreadLike) -> float:
+    """Standard deviation of a relative parameter, uniform within the spread."""
     # Without a spread, the prior standard deviation is one percent.
-    return max(spread, 0.01) / 3**0.5
+    return max(Spread.of(spread).relative, 0.01) / 3**0.5

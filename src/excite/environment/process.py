@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
 
+from ..description import Spread, SpreadLike
 from ..plant import AbstractARXPlant, AbstractPlant, Params, draw_params
 from ..plant.fields import floats
 from ..plant.uncertainty import Uncertainty
@@ -30,11 +31,16 @@ from ..policy import (
     with_input,
     with_measurement,
 )
-from ..safety import critical_levels, penalty, watched_levels
+from ..safety import critical_levels, penalty, safe_input, watched_levels
 from ..simulation import measure, step
 from .errors import EstimationError
 from .information_gain import InformationGain
 from .objective import AbstractObjective, StepData, prior_sd_of, target_mask
+
+
+def _spread(given: SpreadLike) -> Spread:
+    """The spread, its numbers as arrays."""
+    return jax.tree.map(floats, Spread.of(given))
 
 
 class EnvState(eqx.Module):
@@ -88,21 +94,24 @@ class Env(eqx.Module):
         plant: its constants and sensor; its parameters are drawn for every episode.
         objective: what the experiment is rewarded for.
         layout: what is observed, and T.
-        spread: parameters are uniform in nominal value ± spread times their scale.
+        spread: of the parameters around their nominal values.
         penalty_weight: factor of the safety penalty; 1 / T normalises it by length.
         constants: lowest and highest constants of the plant; they are drawn for every
             episode, so that a policy is robust against errors of constants that
             identification takes as known. Default the plant's constants.
         uncertainty: box of the plants on which a policy is also made safe, without reward.
+        coast: samples after the experiment, under the input that ends it, in which the plant must
+            be safe too. Training by gradient penalises them; a step of the process has none.
     """
 
     plant: AbstractPlant
     objective: AbstractObjective
     layout: Layout = eqx.field(static=True)
-    spread: Float[Array, ""] = eqx.field(converter=floats, default=0.3)
+    spread: Spread = eqx.field(converter=_spread, default=0.3)
     penalty_weight: Float[Array, ""] = eqx.field(converter=floats, default=1.0)
     constants: tuple[PyTree, PyTree] | None = None
     uncertainty: Uncertainty | None = None
+    coast: int = eqx.field(static=True, default=0)
 
     @classmethod
     def of(
@@ -111,20 +120,22 @@ class Env(eqx.Module):
         *,
         objective: AbstractObjective | None = None,
         layout: Layout | None = None,
-        spread: float | Float[Array, ""] = 0.3,
+        spread: SpreadLike = 0.3,
         penalty_weight: float | Float[Array, ""] = 1.0,
         constants: tuple[PyTree, PyTree] | None = None,
         uncertainty: Uncertainty | None = None,
+        coast: int = 0,
     ) -> Env:
         """The paper's process for a plant, except for the given choices."""
         return cls(
             plant,
-            default_objective(plant, float(spread)) if objective is None else objective,
+            default_objective(plant, spread) if objective is None else objective,
             Layout.of(plant.description) if layout is None else layout,
             spread,
             penalty_weight,
             constants,
             uncertainty,
+            coast,
         )
 
     def reset(self, key: PRNGKeyArray) -> tuple[EnvState, Float[Array, " observation"]]:
@@ -183,6 +194,17 @@ class Env(eqx.Module):
         )
         return new, output, jnp.where(is_finite, gain, 0.0)
 
+    def coasting(self, state: EnvState) -> Float[Array, "sample output"]:
+        """True outputs after the experiment, under the input that ends it."""
+        plant = self.plant.changed(**state.constants._asdict())
+        rest = jnp.asarray(safe_input(plant.definition))
+
+        def advance(own: Array, _: None) -> tuple[Array, Array]:
+            own = step(plant, own, rest, state.params)
+            return own, plant.true_output(own, state.params)
+
+        return jax.lax.scan(advance, state.plant_state, None, length=self.coast)[1]
+
     def _draw_constants(self, key: PRNGKeyArray) -> PyTree:
         """Constants of one episode's plant, each uniform in its range."""
         if self.constants is None:
@@ -220,7 +242,7 @@ class Env(eqx.Module):
         )
 
 
-def default_objective(plant: AbstractPlant, spread: float) -> AbstractObjective:
+def default_objective(plant: AbstractPlant, spread: SpreadLike) -> AbstractObjective:
     """The paper's objective for a plant with a mapping from ARX, else the information gained."""
     targets = target_mask(plant.definition, None)
     if isinstance(plant, AbstractARXPlant):

@@ -4,6 +4,7 @@ from .contract import AbstractExcitation as AbstractExcitation
 from .contract import AbstractShape as AbstractShape
 from .contract import AbstractSignal as AbstractSignal
 from .contract import crest_factor as crest_factor
+from .feedback import Coast as Coast
 from .feedback import PolicyExcitation as PolicyExcitation
 from .feedback import PositionLoop as PositionLoop
 from .signals import PRBS as PRBS

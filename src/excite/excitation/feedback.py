@@ -1,4 +1,4 @@
-"""Excitations that use the measurements: a position loop, and learned policies."""
+"""Excitations that use the measurements: a position loop, learned policies, and a coast."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from ..plant import AbstractPlant
 from ..plant.fields import floats, optional_floats
 from ..policy import Layout, Policy, Window, empty_window, respond, with_input
-from ..safety import watched_output
+from ..safety import safe_input, watched_output
 from .contract import AbstractExcitation, AbstractShape
 
 
@@ -133,3 +133,56 @@ class PolicyExcitation(AbstractExcitation):
         window, k = state
         newest = with_input(jnp, self.layout, window, input).inputs[-1]
         return window._replace(inputs=window.inputs.at[-1].set(newest)), k
+
+
+class CoastState(NamedTuple):
+    """State of a `Coast`.
+
+    Attributes:
+        own: of the excitation.
+        rest: input after its end [input unit].
+        k: index of the next sample.
+    """
+
+    own: PyTree
+    rest: Float[Array, " input"]
+    k: Int[Array, ""]
+
+
+class Coast(AbstractExcitation):
+    """An excitation, and after its end the input that ends an experiment.
+
+    What the plant then does is part of an experiment's safety (`Env.coast`).
+
+    Attributes:
+        excitation: plays first.
+        num_steps: for so many samples.
+    """
+
+    excitation: AbstractExcitation
+    num_steps: int = eqx.field(static=True)
+
+    @classmethod
+    def after(
+        cls, excitation: AbstractExcitation, num_steps: int, coast: int
+    ) -> tuple[AbstractExcitation, int]:
+        """An excitation with `coast` samples after its end, and the whole length."""
+        return (cls(excitation, num_steps) if coast else excitation), num_steps + coast
+
+    def init(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> CoastState:
+        """The state of the excitation."""
+        del num_steps
+        start = self.excitation.init(plant, self.num_steps, key)
+        return CoastState(start, jnp.asarray(safe_input(plant.definition)), jnp.asarray(0))
+
+    def __call__(
+        self, state: CoastState, measurement: Float[Array, " output"]
+    ) -> tuple[CoastState, Float[Array, " input"]]:
+        """The excitation's input, or the one that ends the experiment."""
+        own, input = self.excitation(state.own, measurement)
+        input = jnp.where(state.k < self.num_steps, input, state.rest)
+        return state._replace(own=own, k=state.k + 1), input
+
+    def applied(self, state: CoastState, input: Float[Array, " input"]) -> CoastState:
+        """The state after an input was applied that may not be the proposed one."""
+        return state._replace(own=self.excitation.applied(state.own, input))

@@ -13,6 +13,7 @@ from .contract import Params as Params
 from .contract import Sensor as Sensor
 from .contract import draw_params as draw_params
 from .contract import params_from as params_from
+from .contract import params_within as params_within
 from .contract import require_double_precision as require_double_precision
 from .dc_motor import DCMotor as DCMotor
 from .emps import EMPS as EMPS

@@ -29,6 +29,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from ..description import (
     Parameter,
     PlantDescription,
+    Spread,
+    SpreadLike,
     as_number,
     by_name,
     names_of,
@@ -361,13 +363,19 @@ def _tuned(kind: type[AbstractPlant], nominal: tuple[float, ...]) -> type[Abstra
     return type(kind.__name__, (kind,), body)
 
 
+# Its numbers are leaves: another spread does not compile again.
+jax.tree_util.register_dataclass(Spread, ["reach", "relative"], ["is_factor"])
+
+
 @eqx.filter_jit
-def draw_params(
-    plant: AbstractPlant, key: PRNGKeyArray, spread: float | Float[Array, ""]
-) -> Params:
-    """Random parameters, each uniform in its nominal value ± `spread` times its scale."""
+def draw_params(plant: AbstractPlant, key: PRNGKeyArray, spread: SpreadLike) -> Params:
+    """Random parameters, each uniform within the `Spread` around its nominal value."""
     unit = jax.random.uniform(key, (len(plant.nominal),), float, -1.0, 1.0)
-    scales = [p.scale for p in plant.definition.parameters]
-    return plant.Params(
-        *(n + spread * s * u for n, s, u in zip(plant.nominal, scales, unit, strict=True))
-    )
+    return params_within(plant, spread, unit)
+
+
+def params_within(plant: AbstractPlant, spread: SpreadLike, unit: Float[Array, " param"]) -> Params:
+    """The parameters at coordinates in [-1, 1]."""
+    reach, parameters = Spread.of(spread), plant.definition.parameters
+    triples = zip(parameters, plant.nominal, unit, strict=True)
+    return plant.Params(*(reach.value(p, nominal, u) for p, nominal, u in triples))

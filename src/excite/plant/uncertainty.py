@@ -7,7 +7,8 @@
     noise                           factor of the sensor's standard deviations
 
 A range is (low, high), or a text: `0:0.1`, `10%` of the nominal value (of a parameter's or a
-state's scale), or `factor:3` for a third to three times the nominal value.
+state's scale), or `factor:3` for a third to three times the nominal value (for a parameter of
+either sign, log 3 times its scale to both sides).
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from ..description import by_name, names_of, require_spread, unknown
+from ..description import Spread, SpreadLike, by_name, names_of, unknown
 from .contract import AbstractPlant, Params, Sensor
 from .extension import extended, extensions_of, plain_kind
 from .fields import floats
@@ -57,13 +58,13 @@ class Uncertainty(eqx.Module):
     def of(
         cls,
         plant: AbstractPlant,
-        spread: float = 0.3,
+        spread: SpreadLike = 0.3,
         ranges: Mapping[str, Any] | None = None,
     ) -> Uncertainty:
         """The box around a plant.
 
         Args:
-            spread: of parameters without a range: nominal value ± spread times the scale.
+            spread: of parameters without a range.
             ranges: by name, each a `Range`; see the module.
 
         Raises:
@@ -71,8 +72,9 @@ class Uncertainty(eqx.Module):
                 bounds of a parameter.
         """
         ranges = by_name("uncertainty", ranges, "a dict of ranges by name")
-        require_spread(spread)
-        given = {_PARAMETERS: f"{100 * spread}%", **ranges}
+        reach = Spread.of(spread)
+        usual = str(reach) if reach.is_factor else f"{100 * reach.reach}%"
+        given = {_PARAMETERS: usual, **ranges}
         possible = extensions_of(plant)
         added = [name for name in given if name in possible]
         whole = extended(plant, added) if added else plant
@@ -162,7 +164,12 @@ class Uncertainty(eqx.Module):
 
 @dataclass(frozen=True)
 class _Quantity:
-    """What may differ: nominal value, what a percentage refers to, and bounds."""
+    """What may differ: nominal value, what a percentage refers to, and bounds.
+
+    Attributes:
+        is_positive: whether it is a parameter estimated by its logarithm.
+        is_signed: whether it is a parameter of either sign.
+    """
 
     nominal: float
     size: float
@@ -170,6 +177,7 @@ class _Quantity:
     lower: float = -math.inf
     upper: float = math.inf
     is_positive: bool = False
+    is_signed: bool = False
 
 
 @dataclass(frozen=True)
@@ -183,7 +191,8 @@ def _quantities(plant: AbstractPlant, starts: Sequence[str]) -> dict[str, _Quant
     """All quantities of a plant that may differ, by name; `starts` are those of its states."""
     d = plant.description
     found = {
-        p.name: _Quantity(p.nominal, p.scale, p.unit, *p.support, p.positive) for p in d.parameters
+        p.name: _Quantity(p.nominal, p.scale, p.unit, *p.support, p.positive, not p.positive)
+        for p in d.parameters
     }
     for name in d.name.split("+")[1:]:  # what a percentage of an effect would be is not plain
         if not name.startswith(("gain_", "saturation_")):
@@ -233,6 +242,9 @@ def _read(name: str, given: Any, about: _Quantity) -> _Interval:
     first, colon, second = text.partition(":")
     if first == "factor":
         factor = _as_number(name, second, given)
+        if about.is_signed:
+            reach = math.log(factor) * about.size if factor >= 1 else math.nan
+            return _Interval(about.nominal - reach, about.nominal + reach)
         if not (factor >= 1 and about.nominal > 0):
             raise ValueError(
                 f"range of {name}: a factor is 1 or more, for a quantity with a positive nominal "

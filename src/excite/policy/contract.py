@@ -22,7 +22,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ..description import Input, Output, PlantDescription
+from ..description import Input, Output, PlantDescription, Spread, SpreadLike
 from ..files import (
     checksum_of,
     require_new_file,
@@ -274,6 +274,7 @@ class Policy:
         plants = f"plants {c['plant']}" if "plant" in c else "plants"
         where = " on the simulated rig" if c.get("rig") else ""
         where += " behind the safety filter" if c.get("filter") else ""
+        where += f" and {c['coast']} samples after each" if c.get("coast") else ""
         return (
             f"largest output found in {c['experiments']:,} experiments{where}: {largest}, "
             f"{with_noise} with noise searched within {c['noise_bound']:g} sd; {plants}: {box}; "
@@ -385,7 +386,11 @@ _MOST_SHOWN = 1000
 def _check_certificate(certificate: Any) -> None:
     """Raises an error for a certificate without its numbers."""
     ranges = [tuple(ends) for ends in certificate["uncertainty"].values()]
-    whole = [certificate["experiments"], certificate.get("num_steps", 0)]
+    whole = [
+        certificate["experiments"],
+        certificate.get("num_steps", 0),
+        certificate.get("coast", 0),
+    ]
     sizes = [certificate[name] for name in ("nearness", "noise_nearness")]  # None for infinity
     numbers = [
         *itertools.chain(*ranges),
@@ -447,7 +452,7 @@ def mismatch(policy: Policy, plant: PlantDescription) -> str | None:
 
 
 def require_certified(
-    policy: Policy, plant: PlantDescription, spread: float, filtered: bool = False
+    policy: Policy, plant: PlantDescription, spread: SpreadLike, filtered: bool = False
 ) -> None:
     """Raises ValueError where no certificate says that a search found the policy safe.
 
@@ -478,12 +483,12 @@ def require_certified(
         )
     for p in plant.parameters:
         low, high = certificate["uncertainty"].get(p.name, (p.nominal, p.nominal))
-        reach = spread * p.scale * (1 - 1e-9)
-        if not low <= p.nominal - reach <= p.nominal + reach <= high:
+        least, most = (Spread.of(spread).value(p, p.nominal, u) for u in (-1, 1))
+        slack = 1e-9 * p.scale
+        if not (low <= least + slack and most - slack <= high):
             raise ValueError(
                 f"the policy's certificate is for another uncertainty: {p.name} {low:g} to "
-                f"{high:g} {p.unit}, and a spread of {spread:g} is {p.nominal - reach:g} to "
-                f"{p.nominal + reach:g}"
+                f"{high:g} {p.unit}, and a spread of {spread} is {least:g} to {most:g}"
             )
 
 

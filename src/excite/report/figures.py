@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 import matplotlib.axes
 import matplotlib.figure
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ..description import HALF_95, PlantDescription, display_unit
 from ..record import Record
@@ -78,6 +78,34 @@ def _draw_intervals(axis: matplotlib.axes.Axes, params: Mapping[str, EstimatedPa
         axis.annotate(text, (0, i), (0, 7), textcoords="offset points", ha="center", fontsize=8)
     axis.set_yticks(range(len(params)), params)
     axis.set(ylim=(len(params) - 0.4, -0.9), xlabel="95 % interval [% of the estimate]")
+
+
+def knowledge_figure(
+    title: str,
+    samples: Int[np.ndarray, " sample"],
+    shares: Mapping[str, Float[np.ndarray, " sample"]],
+    ends: Sequence[int],
+) -> matplotlib.figure.Figure:
+    """Half of the 95 % intervals over those asked for, after every sample of a campaign.
+
+    Args:
+        title: of the figure.
+        samples: counted from the first of the campaign.
+        shares: by parameter; its target is reached at one.
+        ends: of the rounds, in samples.
+    """
+    figure, axes = new_figure(1)
+    axis = axes[0, 0]
+    for i, (name, share) in enumerate(shares.items()):
+        shown = np.where(np.isfinite(share), share, np.nan)
+        axis.plot(samples, shown, color=colour_of(i), lw=1.4, label=name)
+    axis.axhline(1, color="black", lw=0.8, ls="--", label="asked for")
+    for end in ends[:-1]:
+        axis.axvline(end, color=GREY, lw=0.8, ls=":")
+    axis.set(yscale="log", xlabel="samples", ylabel="95 % interval over the target")
+    add_legend(figure, axis)
+    add_title(figure, title)
+    return figure
 
 
 def autocorrelation_figure(

@@ -244,8 +244,9 @@ class StudyFacts(Saved):
     episodes: int
     num_steps: int
     seed: int
-    spread: float
+    spread: float | str
     uncertainty: Options = {}
+    coast: int = 0
     sensor: dict[str, Options] = {}
     methods: dict[str, Options] = {}
     estimators: dict[str, Options]

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Self
 
 from pydantic import Field, ValidationError
 
-from ..description import unknown
+from ..description import Spread, unknown
 from ..files import csv_text, damaged, read_json
 from ..record.table import data_frame
 from .numbers import mean_sd, number
@@ -341,15 +341,18 @@ def footnotes(study: StudyFacts) -> list[str]:
 
 def violations_note(study: StudyFacts) -> str:
     """What the violations of a table were counted on, in words."""
-    declared = f"parameters within ± {100 * study.spread:g} %"
+    spread = Spread.of(study.spread)
+    within = f"a factor of {spread.reach:g}" if spread.is_factor else f"± {100 * spread.reach:g} %"
+    declared = f"parameters within {within}"
     if study.uncertainty:
         ranges = ", ".join(f"{name} {_range(value)}" for name, value in study.uncertainty.items())
         declared += f", in addition {ranges}"
     else:
         where = "on its simulated rig" if study.rig else "in the plant's description"
         declared += f", all else as {where}"
+    coast = f" or in the {study.coast} samples after them" * bool(study.coast)
     note = (
-        f"Violations: experiments that reached a critical level, on plants drawn at random "
+        f"Violations: experiments that reached a critical level{coast}, on plants drawn at random "
         f"({declared}). They are sampled: 'excite falsify' searches for the worst plant."
     )
     if study.agents and study.seeds > 1 and study.safety_episodes is None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..description import PlantDescription, names_of, unknown
+from ..description import PlantDescription, SpreadLike, names_of, unknown
 from ..files import class_at
 from .contract import AbstractRig
 from .fmu import FMURig
@@ -45,17 +45,19 @@ class RigOptions:
         address: board identifier of the Quanser rig.
         fast: whether a simulated rig or an FMU runs as fast as it can, not in real time.
         seed: of a simulated rig's hidden parameters, noise and jitter.
-        spread: of these parameters, as a fraction of their scales.
+        spread: of these parameters.
         fault: of a simulated rig: latency [s], jitter [s] and dropout (probability); those of
             `faults.Faults`, a bias as `sensor_bias_pitch`; and effects of its true plant
             (`plant.extension`) that its known plant has not, such as `gain_voltage`.
+        experiment: of a simulated rig, how many were made before; each has its own noise.
     """
 
     address: str = "0"
     fast: bool = False
     seed: int = 0
-    spread: float = 0.3
+    spread: SpreadLike = 0.3
     fault: Mapping[str, float] = field(default_factory=dict)
+    experiment: int = 0
 
 
 def _simulated(
@@ -68,14 +70,14 @@ def _simulated(
 
 
 def _rig_of(
-    plant: AbstractPlant, true: AbstractPlant, spread: float, options: RigOptions
+    plant: AbstractPlant, true: AbstractPlant, spread: SpreadLike, options: RigOptions
 ) -> AbstractRig:
     """A simulated rig of a plant; its true one is another where its description differs."""
     numbers, faults, effects = _faults(true, options.fault)
     num_readings, key = readings_per_sample(plant), jax.random.key(options.seed)
     hardware = Hardware.draw(
         true, num_readings, spread, key, effects=effects, faults=faults, **numbers
-    )
+    ).repeated(options.experiment)
     return SimulatedRig(plant, hardware, num_readings, is_real_time=not options.fast)
 
 

@@ -26,7 +26,8 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from ..plant import AbstractPlant, Params
+from ..description import SpreadLike
+from ..plant import AbstractPlant, Params, params_within
 from ..safety import Supervision, critical_levels, safe_input
 from ..simulation import step
 from .player import AbstractPlayer
@@ -103,8 +104,8 @@ class SafetyFilter(AbstractFilter):
     num_candidates: int = eqx.field(static=True, default=3)
 
     @classmethod
-    def of(cls, plant: AbstractPlant, spread: float, slew: float = math.inf) -> SafetyFilter:
-        """A filter for parameters within ± `spread` times their scale.
+    def of(cls, plant: AbstractPlant, spread: SpreadLike, slew: float = math.inf) -> SafetyFilter:
+        """A filter for parameters within a spread around their nominal values.
 
         Args:
             plant: as identification knows it.
@@ -180,16 +181,15 @@ class SafetyFilter(AbstractFilter):
         return jnp.max(jnp.where(jnp.isfinite(sizes), sizes, jnp.inf))
 
 
-def _corners(plant: AbstractPlant, spread: float) -> Params:
+def _corners(plant: AbstractPlant, spread: SpreadLike) -> Params:
     """Centre and corners of the prior; the leading axis is the plant."""
-    middle = np.array([float(value) for value in plant.nominal])
-    reach = spread * np.array([p.scale for p in plant.definition.parameters])
-    if 2 ** len(reach) > MAX_CORNERS:
-        signs = np.random.default_rng(0).choice((-1, 1), (MAX_CORNERS, len(reach)))
+    count = len(plant.nominal)
+    if 2**count > MAX_CORNERS:
+        signs = np.random.default_rng(0).choice((-1.0, 1.0), (MAX_CORNERS, count))
     else:
-        signs = np.array(list(itertools.product((-1, 1), repeat=len(reach))))
-    every = np.vstack([middle, middle + signs * reach])
-    return plant.Params(*(jnp.asarray(column) for column in every.T))
+        signs = np.array(list(itertools.product((-1.0, 1.0), repeat=count)))
+    points = np.vstack([np.zeros(count), signs])
+    return jax.vmap(lambda point: params_within(plant, spread, point))(points)
 
 
 def linear_model(plant: AbstractPlant) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -17,6 +17,7 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Array, Bool, Float, Int
 
+from ..description import SpreadLike
 from ..environment.falsification import Cases
 from ..excitation import AbstractExcitation
 from ..plant import AbstractPlant, Params
@@ -62,7 +63,7 @@ class GuardModel(eqx.Module):
 
     @classmethod
     def for_rig(
-        cls, plant: AbstractPlant, spread: float, ranges: Mapping[str, Range]
+        cls, plant: AbstractPlant, spread: SpreadLike, ranges: Mapping[str, Range]
     ) -> GuardModel:
         """The model for a declared uncertainty, and for a rig.
 
@@ -236,7 +237,7 @@ def _linear(model: GuardModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def guard_for(
     plant: AbstractPlant,
     excitation: AbstractExcitation,
-    spread: float,
+    spread: SpreadLike,
     ranges: Mapping[str, Range],
     *,
     num_steps: int = 500,

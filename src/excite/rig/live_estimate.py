@@ -26,7 +26,15 @@ _FIRST = 40  # samples before the first estimate
 class LiveEstimate:
     """Estimates during one experiment."""
 
-    def __init__(self, plant: AbstractPlant, num_steps: int, starts_at_rest: bool) -> None:
+    def __init__(
+        self,
+        plant: AbstractPlant,
+        num_steps: int,
+        starts_at_rest: bool,
+        estimator: NLS | None = None,
+        first: int = _FIRST,
+        waits: bool = False,
+    ) -> None:
         """Compiles the estimator before the experiment; this takes seconds.
 
         Args:
@@ -34,7 +42,11 @@ class LiveEstimate:
             num_steps: length of the experiment.
             starts_at_rest: whether the initial state is the plant's; otherwise it is
                 estimated too.
+            estimator: default nonlinear least squares without a prior.
+            first: samples before the first estimate.
+            waits: whether a call waits for the estimate from its sample.
         """
+        self._estimator, self._first, self._waits = estimator or NLS(), first, waits
         self._plant, self._starts_at_rest, self._count = plant, starts_at_rest, 0
         self._inputs = np.zeros((num_steps, len(plant.definition.inputs)))
         self._measured = np.zeros((num_steps + 1, len(plant.definition.outputs)))
@@ -46,9 +58,12 @@ class LiveEstimate:
         """Takes one more sample, and starts the next fit if none is running."""
         self._inputs[sample.k], self._measured[sample.k] = sample.input, sample.measured
         self._count = sample.k + 1
-        if self._fit.done():
+        if self._waits:
+            if self._count >= self._first:
+                self._keep(self._estimate(self._count))
+        elif self._fit.done():
             self._keep(self._fit.result())
-            if self._count >= _FIRST:
+            if self._count >= self._first:
                 self._fit = self._pool.submit(self._estimate, self._count)
 
     @property
@@ -60,7 +75,7 @@ class LiveEstimate:
         """Waits for the running fit, then estimates from all samples."""
         self._pool.shutdown()
         self._keep(self._fit.result())
-        if self._count >= _FIRST:
+        if self._count >= self._first:
             self._keep(self._estimate(self._count))
 
     def _keep(self, estimate: Estimate) -> None:
@@ -82,4 +97,4 @@ class LiveEstimate:
             initial_state_known=self._starts_at_rest,
         )
         # Otherwise the loop would wait for the result when it reads it.
-        return jax.block_until_ready(NLS()(self._plant, experiments))
+        return jax.block_until_ready(self._estimator(self._plant, experiments))

@@ -21,9 +21,10 @@ from .. import __version__
 from ..description import (
     LARGEST_SEED,
     PlantDescription,
+    Spread,
+    SpreadLike,
     display_unit,
     path_from,
-    require_spread,
     require_whole,
     wrong_type,
 )
@@ -219,11 +220,12 @@ def run(
     fast: bool = False,
     dry_run: bool = False,
     seed: int = 0,
-    spread: float = 0.3,
+    spread: SpreadLike = 0.3,
     fault: Mapping[str, float] | None = None,
     on_sample: OnSample = lambda _: None,
     on_warning: Callable[[str], None] = lambda _: None,
     stop: Stop | None = None,
+    live_estimate: bool = True,
 ) -> RunResult | DryRun:
     """One experiment on a rig: supervised, recorded as it happens, ended by the safe input.
 
@@ -242,7 +244,7 @@ def run(
         overwrite: replaces an existing record.
         steps: number of samples; by default all of a policy or signal, else 500.
         slew: largest change of an input in one second, in its unit.
-        filter: adds a predictive safety filter for parameters within ± `spread`.
+        filter: adds a predictive safety filter for parameters within the `spread`.
         guard: watches whether a declared plant explains the measurements, and brakes where none
             does; for a policy with a guard in its file (`excite falsify --guard`).
         require_certificate: refuses a policy without a certificate that a search on this plant,
@@ -251,7 +253,8 @@ def run(
         fast: runs a simulated rig or an FMU as fast as it can, not in real time.
         dry_run: computes the inputs for a plant at rest; nothing is sent or written.
         seed: of a simulated rig's hidden parameters, noise and jitter, and of random signals.
-        spread: of these parameters and of the filter's prior, as a fraction of their scales.
+        spread: of these parameters and of the filter's prior: a fraction of their scales, or a
+            factor (`factor:3`).
         fault: of a simulated rig, by name: latency [s], jitter [s], dropout (probability);
             `sensor_frozen`, `actuator_dead` and others from a time on [s], see
             `rig.faults.Faults`; `gain_voltage`, `delay_voltage` and other effects of which
@@ -261,6 +264,7 @@ def run(
             on another plant.
         stop: a request to end, which a program can make at any time; without it, signals
             (Ctrl-C) end the experiment.
+        live_estimate: whether parameters are estimated while the experiment runs.
 
     Returns:
         How it ended, with the path of the record; for a dry run, its inputs. An experiment
@@ -278,7 +282,7 @@ def run(
         (500, 1)
     """
     require_whole("seed", seed, 0, LARGEST_SEED)
-    require_spread(spread)
+    Spread.of(spread)
     if steps is not None:
         require_whole("steps", steps, 2)
     path = None if out is None else path_from("out", out)
@@ -327,7 +331,7 @@ def run(
 
     rules = Supervision.of(description, slew)
     rules = rules if watching is None else beside(rules)
-    session = _Session(opened, known, source.name, make_player, rules)
+    session = _Session(opened, known, source.name, make_player, rules, live_estimate)
     if path is None or dry_run:
         return DryRun(description, source.name, session.dry_run(), warnings)
     asked = {
@@ -336,7 +340,7 @@ def run(
         "slew": slew,
         "filtered": filter,
         "guarded": guard,
-        "spread": spread,
+        "spread": Spread.of(spread).setting,
         "seed": seed,
         "fault": [dict(fault)] if fault else [],
         **({"options": dict(options)} if options else {}),
@@ -365,7 +369,9 @@ class _Source:
             raise ValueError(f"{self.name}: {error}") from None
         return [] if warning is None else [f"{self.name}: {warning}"]
 
-    def check_certificate(self, plant: PlantDescription, spread: float, filtered: bool) -> None:
+    def check_certificate(
+        self, plant: PlantDescription, spread: SpreadLike, filtered: bool
+    ) -> None:
         """Raises ValueError for what is played without a certificate of its safety."""
         if self.policy is None:
             raise ValueError(f"{self.name} is no policy: only policies have certificates")
@@ -493,8 +499,9 @@ class _Session:
         played: str,
         make_player: Callable[[], AbstractPlayer],
         rules: Supervision,
+        estimates: bool,
     ) -> None:
-        self._rig, self._plant, self._played = rig, plant, played
+        self._rig, self._plant, self._played, self._estimates = rig, plant, played, estimates
         self._make_player, self._player, self._rules = make_player, make_player(), rules
 
     def dry_run(self) -> np.ndarray:
@@ -558,7 +565,7 @@ class _Session:
         return outcome
 
     def _live_estimate(self) -> LiveEstimate | None:
-        if self._plant is None:
+        if self._plant is None or not self._estimates:
             return None
         return LiveEstimate(self._plant, self._player.num_steps, self._rig.starts_at_rest)
 

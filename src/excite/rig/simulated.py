@@ -18,10 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
 
-from ..description import names_of
+from ..description import SpreadLike, names_of
 from ..environment import Episodes, scored
 from ..excitation import AbstractExcitation
-from ..plant import AbstractPlant, Params, draw_params, params_from
+from ..plant import AbstractPlant, Params, draw_params, params_from, params_within
 from ..plant.extension import extended
 from ..safety import (
     Supervision,
@@ -92,7 +92,7 @@ class Hardware(eqx.Module):
         cls,
         plant: AbstractPlant,
         num_readings: int,
-        spread: float,
+        spread: SpreadLike,
         key: PRNGKeyArray,
         *,
         effects: Mapping[str, float] | None = None,
@@ -104,7 +104,7 @@ class Hardware(eqx.Module):
         Args:
             plant: sampled as experiments are.
             num_readings: in one sampling time.
-            spread: of the parameters, as a fraction of their scales.
+            spread: of the parameters around their nominal values.
             key: of the parameters, and of noise, jitter and dropouts.
             effects: values of extensions that the true plant has and `plant` has not, by name:
                 `gain_voltage`, `delay_voltage`, ...
@@ -116,21 +116,19 @@ class Hardware(eqx.Module):
         dt, given = float(plant.dt), effects or {}
         whole = extended(plant, list(given)) if given else plant
         own = draw_params(plant, params_key, spread)
-        middle = jnp.asarray(plant.nominal)
-        scales = np.array([p.scale for p in plant.definition.parameters])
 
         def true(own: Params) -> Params:
             return params_from(whole, given)._replace(**own._asdict())
 
         def delay(point: Array) -> Array | None:
-            return whole.delay(true(plant.Params(*(middle + spread * scales * point))))
+            return whole.delay(true(params_within(plant, spread, point)))
 
         return cls(
             plant=at_interval(whole, num_readings),
             params=true(own),
             key=rig_key,
             faults=faults,
-            num_written=num_written(delay, len(scales), dt),
+            num_written=num_written(delay, len(own), dt),
             **usual_numbers(dt, numbers),
         )
 
@@ -228,6 +226,12 @@ class Hardware(eqx.Module):
         )
         moved = step(self.plant, plant_state, from_input, self.params, duration, to_input)
         return moved, last
+
+    def repeated(self, experiment: int) -> Hardware:
+        """The same hardware after some experiments, with noise that it did not have before."""
+        # Readings take the small numbers.
+        key = jax.random.fold_in(self.key, 2**32 - experiment) if experiment else self.key
+        return eqx.tree_at(lambda own: own.key, self, key)
 
     def reading_noise(self, num_readings: int) -> Float[Array, "reading output"]:
         """The noise of the first readings, in standard deviations of the sensor."""
@@ -481,7 +485,7 @@ def one_run(
 def drawn_hardware(
     plant: AbstractPlant,
     num_readings: int,
-    spread: float,
+    spread: SpreadLike,
     keys: Key[Array, " run"],
     **options: Any,
 ) -> Hardware:

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 from jaxtyping import PyTree
 from pydantic import Field
 
-from ..description import names_of, unknown
+from ..description import SpreadLike, names_of, unknown
 from ..environment import (
     MAX_SENSITIVITY,
     AbstractObjective,
@@ -30,7 +30,7 @@ from ..plant.uncertainty import Range, Uncertainty
 from ..policy import Layout
 from ..safety import watched_levels
 from ..training.settings import AGAINST_UNCERTAINTY, GradientSettings, PPOSettings
-from .settings import Count, EstimatorSettings, Positive, Settings, checked
+from .settings import Count, EstimatorSettings, Positive, Settings, SpreadSetting, checked
 
 METHODS = {"ppo": PPOSettings, "gradient": GradientSettings}
 """Trainers, and their hyper-parameters."""
@@ -87,7 +87,7 @@ class DecisionSettings(RewardSettings):
     clocks: list[Positive] = []
     output_scale: dict[str, Positive] = {}
     input_amplitude: dict[str, Positive] = {}
-    spread: Annotated[float, Field(ge=0, lt=1, strict=True, allow_inf_nan=False)] | None = None
+    spread: SpreadSetting | None = None
     constants: dict[str, tuple[float, float]] = {}
     uncertainty: dict[str, Any] = {}
     normalise_penalty: Annotated[bool, Field(strict=True)] = False
@@ -157,9 +157,10 @@ class Agent:
     def env(
         self,
         plant: AbstractPlant,
-        spread: float,
+        spread: SpreadLike,
         num_steps: int,
         ranges: Mapping[str, Range] = MappingProxyType({}),
+        coast: int = 0,
     ) -> Env:
         """The decision process of this agent.
 
@@ -168,6 +169,7 @@ class Agent:
             spread: of the study.
             num_steps: of an experiment.
             ranges: declared uncertainty of the study.
+            coast: of the study.
 
         Raises:
             ValueError: for a target, output or input that does not exist, an amplitude
@@ -181,6 +183,8 @@ class Agent:
             raise ValueError(
                 f"plant {plant.definition.name!r} has no critical level: leave uncertainty out"
             )
+        if coast and self.method == "ppo":
+            raise ValueError("ppo does not train on the coast: take the method gradient")
         return Env.of(
             plant,
             objective=self._objective(plant, own),
@@ -189,6 +193,7 @@ class Agent:
             penalty_weight=1 / num_steps if decision.normalise_penalty else 1.0,
             constants=_ends(plant, decision.constants),
             uncertainty=Uncertainty.of(plant, own, ranges) if ranges else None,
+            coast=coast,
         )
 
     def ranges(self, of_study: Mapping[str, Range]) -> Mapping[str, Range]:
@@ -216,12 +221,12 @@ class Agent:
             clocks=_cycles(decision.clocks, float(plant.dt)),
         )
 
-    def _objective(self, plant: AbstractPlant, spread: float) -> AbstractObjective:
+    def _objective(self, plant: AbstractPlant, spread: SpreadLike) -> AbstractObjective:
         terms = [self._term(reward, plant, spread) for reward in self.decision.terms]
         return WeightedSum(terms) if terms else self._term(self.decision, plant, spread)
 
     def _term(
-        self, chosen: RewardSettings, plant: AbstractPlant, spread: float
+        self, chosen: RewardSettings, plant: AbstractPlant, spread: SpreadLike
     ) -> AbstractObjective:
         has_mapping = isinstance(plant, AbstractARXPlant)
         form = chosen.reward or ("relative" if has_mapping else "information")

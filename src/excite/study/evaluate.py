@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from ..description import by_name, wrong_type
+from ..description import SpreadLike, by_name, wrong_type
 from ..plant import AbstractARXPlant
 from ..plant.catalogue import PlantLike
 from ..plant.uncertainty import Range
@@ -24,8 +24,9 @@ def evaluate(
     *,
     episodes: int = 1000,
     seed: int = 0,
-    spread: float = 0.3,
+    spread: SpreadLike = 0.3,
     uncertainty: Mapping[str, Range] | None = None,
+    coast: int = 0,
     noise: Mapping[str, float] | None = None,
     estimators: str | Sequence[str] | None = None,
     rig: bool = False,
@@ -45,9 +46,12 @@ def evaluate(
             policy's plant.
         episodes: number of experiments, each on another plant.
         seed: of the plants, the noise and the excitations.
-        spread: parameters are uniform in nominal value ± spread times their scale.
+        spread: parameters are uniform in nominal value ± spread times their scale, or within a
+            factor (`factor:3`).
         uncertainty: what else may differ, as in `falsify`: plants are drawn from it, and
             estimated as if nothing did.
+        coast: samples after an experiment, under the input that ends it, whose outputs count for
+            its safety too.
         noise: standard deviation by output, in its unit, where it differs from the plant's.
         estimators: names, default `nls`, and `arx-rls` where the plant has a mapping from ARX.
         rig: whether experiments are made on the plant's simulated rig.
@@ -78,6 +82,7 @@ def evaluate(
             "seed": seed,
             "spread": spread,
             "uncertainty": by_name("uncertainty", uncertainty, "a dict of ranges by name"),
+            "coast": coast,
             "methods": {name: {"excitation": word}},
             "estimators": {kind: {"kind": kind} for kind in kinds},
             "rig": {"filter": filter} if rig else None,

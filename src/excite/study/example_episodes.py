@@ -44,7 +44,8 @@ def example_episodes(
     box = study.build_uncertainty(plant)
     keys = episode_keys(study)[:CHUNK]  # as for the table: no new compilation
     for name, seed, excitation in _excitations(study, plant, folder, seeds):
-        batch = run_episodes(plant, excitation, study.num_steps, study.spread, keys, box)
+        choices = study.num_steps, study.spread, keys, box, study.coast
+        batch = run_episodes(plant, excitation, *choices)
         run, params = jax.tree.map(lambda leaf: leaf[0], (batch.trajectory, batch.params))
         estimator, estimates = _running(study, plant, run.inputs, run.measured)
         about = {"estimator": estimator, **({} if seed is None else {"seed": seed})}

@@ -15,8 +15,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .. import __version__
-from ..description import LARGEST_SEED, PlantDescription, names_of, require_whole
+from ..description import LARGEST_SEED, PlantDescription, SpreadLike, names_of, require_whole
 from ..environment.falsification import Cases, Effort, OnPlant, Stage, nearness, search
+from ..excitation import Coast
 from ..excitation.catalogue import (
     EXCITATIONS,
     LOOP,
@@ -88,6 +89,7 @@ class Falsification:
         rig: whether experiments were made on the plant's simulated rig.
         filter: whether they were made there behind the predictive safety filter.
         spread: of parameters without a range, and of the filter's prior.
+        coast: samples after the experiment that were searched too.
     """
 
     plant: PlantDescription
@@ -110,7 +112,8 @@ class Falsification:
     guard: Guard | None = None
     rig: bool = False
     filter: bool = False
-    spread: float = 0.3
+    spread: SpreadLike = 0.3
+    coast: int = 0
 
     @property
     def is_safe(self) -> bool:
@@ -129,6 +132,7 @@ class Falsification:
                 for o in self.plant.outputs
             },
             "num_steps": self.num_steps,
+            "coast": self.coast,
             "uncertainty": {name: list(ends) for name, ends in self.ranges.items()},
             "rig": self.rig,
             "filter": self.filter,
@@ -208,10 +212,11 @@ class Falsification:
             else f"UNSAFE: {sum(s.violations for s in self.stages):,} of {total:,} experiments "
             "reach a critical level"
         )
+        after = f" and {self.coast} after them" * bool(self.coast)
         bound = f"noise searched within {self.noise_bound:g} sd"
         return [
             found,
-            f"searched: {box}; {self.num_steps} steps",
+            f"searched: {box}; {self.num_steps} steps{after}",
             f"worst plant ({_told(self.nearness)}, noise of seed {self.worst_seed}): "
             f"{_values(self.worst)}",
             f"worst plant with {bound} ({_told(self.noise_nearness)}): {_values(self.noise_worst)}",
@@ -263,8 +268,9 @@ def falsify(
     plant: PlantLike | None = None,
     *,
     options: Mapping[str, object] | None = None,
-    spread: float | None = None,
+    spread: SpreadLike | None = None,
     uncertainty: Mapping[str, Range] | None = None,
+    coast: int | None = None,
     noise: Mapping[str, float] | None = None,
     steps: int | None = None,
     budget: int = 10_000,
@@ -285,11 +291,13 @@ def falsify(
         excitation: a policy, its name or file; any other excitation, as in `simulate`.
         plant: as in `simulate`; default the policy's plant.
         options: of the excitation, by name.
-        spread: of parameters without a range: nominal value ± spread times the scale; default
+        spread: of parameters without a range, a fraction of the scale or a factor; default
             that of the policy's training, or 0.3.
         uncertainty: ranges by name, such as `{"delay_voltage": (0, 0.1), "d_S": "10%",
             "initial_state": "2%"}`; default that of the policy's training, and the constants that
             were drawn there.
+        coast: samples after the experiment, under the input that ends it, that are searched too;
+            default that of the policy's training, or 0.
         noise: standard deviation of an output's noise, by name [output unit].
         steps: length [samples]; default 500, or that of a policy or a signal.
         budget: number of simulated experiments, about.
@@ -339,11 +347,17 @@ def falsify(
     if "warning" in origin:
         warnings.warn(f"{name}: {origin['warning']}", stacklevel=2)
     num_steps = experiment_length(found, name, steps, isinstance(excitation, Record))
-    usual_spread, usual = trained_in(policy, chosen)
+    usual_spread, usual, usual_coast = trained_in(policy, chosen)
     reach = usual_spread if spread is None else spread
     ranges = usual if uncertainty is None else uncertainty
     box = Uncertainty.of(chosen, reach, ranges)
-    effort, play = Effort.of(budget), OnPlant(box, found, num_steps)
+    if coast is None:
+        coast = 0 if rig else usual_coast
+    require_whole("coast", coast, 0)
+    if rig and coast:
+        raise ValueError("experiments on a rig end with the last sample: leave coast out (--coast)")
+    whole, length = Coast.after(found, num_steps, coast)
+    effort, play = Effort.of(budget), OnPlant(box, whole, length)
     if rig:
         safety_filter = SafetyFilter.of(chosen, reach) if filter else NO_FILTER
         play = OnRig.of(box, found, num_steps, safety_filter)
@@ -357,11 +371,11 @@ def falsify(
         """
         own = jax.tree.map(lambda leaf: leaf[0], case)
         (worst, params), key = box.at(own.point), int(own.seed)
-        experiment = Experiment(worst, params, found, name, origin, num_steps, key)
+        experiment = Experiment(worst, params, whole, name, origin, length, key)
         if isinstance(play, OnRig):
             run, size = play.replayed(own)
         else:
-            run = run_episode(worst, params, found, num_steps, experiment.key, own.noise)
+            run = run_episode(worst, params, whole, length, experiment.key, own.noise)
             size = float(nearness(worst, run.outputs))
         values = dict(zip(box.names, box.values(own.point).tolist(), strict=True))
         tuned = with_nominal(worst, {n: float(x) for n, x in params._asdict().items()})
@@ -396,6 +410,7 @@ def falsify(
         rig=rig,
         filter=filter,
         spread=reach,
+        coast=coast,
     )
 
 
@@ -416,15 +431,18 @@ def _is_plant(word: str) -> bool:
     return word.split("+")[0] in PLANTS or ".py:" in word or word.endswith(PLANT_ENDING)
 
 
-def trained_in(policy: Policy | None, plant: AbstractPlant) -> tuple[float, Mapping[str, Range]]:
-    """Spread and ranges of the plants that a policy was trained for."""
+def trained_in(
+    policy: Policy | None, plant: AbstractPlant
+) -> tuple[SpreadLike, Mapping[str, Range], int]:
+    """Spread and ranges of the plants that a policy was trained for, and its coast."""
     made = {} if policy is None else policy.provenance
     decision = made.get("decision") or {}
     spread = decision.get("spread")
     drawn, known = decision.get("constants") or {}, names_of(plant.definition.constants)
     constants = {name: tuple(ends) for name, ends in drawn.items() if name in known}
     ranges = {**constants, **(made.get("uncertainty") or {})}
-    return made.get("spread", 0.3) if spread is None else spread, ranges
+    spread = made.get("spread", 0.3) if spread is None else spread
+    return spread, ranges, made.get("coast", 0)
 
 
 def _until_diverged(run: Trajectory) -> Trajectory:

@@ -24,7 +24,8 @@ def seed_folder(folder: Path, agent: str, seed: int) -> Path:
 def agent_settings(study: Study, plant: AbstractPlant, agent: str) -> dict[str, object]:
     """All settings, except the plant, that determine the result of a seed, JSON-ready."""
     own = study.agent(agent).settings(plant, study.uncertainty)
-    return {**own, "spread": study.spread, "num_steps": study.num_steps}
+    coast = {"coast": study.coast} if study.coast else {}  # earlier fingerprints stay valid
+    return {**own, "spread": study.spread, "num_steps": study.num_steps, **coast}
 
 
 def fingerprint(study: Study, plant: AbstractPlant, agent: str) -> str:

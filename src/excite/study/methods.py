@@ -72,7 +72,7 @@ def player_of(study: Study, plant: AbstractPlant) -> Play:
     if study.rig is None:
         box = study.build_uncertainty(plant)
         return lambda excitation, keys: (
-            run_episodes(plant, excitation, study.num_steps, study.spread, keys, box),
+            run_episodes(plant, excitation, study.num_steps, study.spread, keys, box, study.coast),
             {},
         )
     rules, numbers = Supervision.of(plant.description), study.rig.numbers()

@@ -13,7 +13,7 @@ from typing import Annotated, TypeVar
 import pydantic
 from pydantic import BaseModel, ConfigDict, Field
 
-from ..description import unknown
+from ..description import Spread, unknown
 
 _T = TypeVar("_T")
 
@@ -38,6 +38,14 @@ class Choice(Settings):
 Count = Annotated[int, Field(gt=0, strict=True)]
 Magnitude = Annotated[float, Field(ge=0, strict=True, allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, strict=True, allow_inf_nan=False)]
+
+
+def _spread(value: object) -> object:
+    """The value, where it is allowed; ValueError otherwise."""
+    return Spread.of(value).setting  # pyright: ignore[reportArgumentType]
+
+
+SpreadSetting = Annotated[float | str, pydantic.BeforeValidator(_spread)]
 
 
 class EstimatorSettings(Choice):
@@ -97,7 +105,8 @@ def sentence(
     if first["type"] == "missing":
         return f"the key {location!r} is missing"
     if first["type"] == "value_error" and "ctx" in first:  # a message of this package
-        return f"{location}: " * bool(location) + str(first["ctx"]["error"])
+        text = str(first["ctx"]["error"])
+        return text if text.startswith(location) else f"{location}: {text}"
     got = json.dumps(first["input"], default=str)
     if isinstance(first["input"], float) and not math.isfinite(first["input"]):
         got = str(first["input"])

@@ -14,7 +14,7 @@ import tomlkit.exceptions
 from pydantic import Field
 
 from ..description import names_of, unknown, wrong_type
-from ..environment import InformationGain
+from ..environment import Env, InformationGain
 from ..estimation import ARX, AbstractEstimator, Decrement
 from ..estimation.catalogue import ESTIMATORS, estimator_named
 from ..excitation import AbstractExcitation
@@ -37,7 +37,16 @@ from ..training.settings import GradientSettings, PPOSettings
 from ..training.signals import CLAIRVOYANT, CLAIRVOYANT_STARTS
 from .agent import REWARD_TABLES, Agent, AgentSettings, DecisionSettings
 from .catalogue import study_path
-from .settings import Choice, Count, EstimatorSettings, Magnitude, Settings, checked, sentence
+from .settings import (
+    Choice,
+    Count,
+    EstimatorSettings,
+    Magnitude,
+    Settings,
+    SpreadSetting,
+    checked,
+    sentence,
+)
 
 
 class SensorSettings(Settings):
@@ -109,9 +118,11 @@ class Study(Settings):
         num_steps: T, steps of an episode.
         seed: of plants, noise and excitations.
         spread: parameters are uniform in nominal value ± spread times their scale (by
-            default the nominal value itself).
+            default the nominal value itself), or within a factor such as "factor:3".
         uncertainty: what else may differ, see `Uncertainty`: all are evaluated on plants drawn
             from it; agents by gradient are trained to be safe in it, and falsified.
+        coast: samples after an experiment, under the input that ends it, in which it must be safe
+            too; nothing is measured there.
         sensor: by output, where it differs from the plant's.
         methods, estimators: by the name that tables show.
         agents: to be trained, by the name that tables show.
@@ -137,8 +148,9 @@ class Study(Settings):
     episodes: Count = 100
     num_steps: Count = 500
     seed: Annotated[int, Field(ge=0, lt=2**63, strict=True)] = 0
-    spread: Annotated[float, Field(ge=0, lt=1, strict=True, allow_inf_nan=False)] = 0.3
+    spread: SpreadSetting = 0.3
     uncertainty: dict[str, Any] = {}
+    coast: Annotated[int, Field(ge=0, le=100_000, strict=True)] = 0
     sensor: dict[str, SensorSettings] = {}
     methods: dict[str, MethodSettings] = {}
     estimators: dict[str, EstimatorSettings]
@@ -235,12 +247,15 @@ class Study(Settings):
         shared = {"ppo": self.training, "gradient": self.gradient}[own.method]
         return Agent.of(own, self.decision, shared, self.estimators)
 
+    def env(self, agent: str, plant: AbstractPlant) -> Env:
+        """The decision process of an agent."""
+        own = self.agent(agent)
+        return own.env(plant, self.spread, self.num_steps, self.uncertainty, self.coast)
+
     def bound_curves(self) -> list[str]:
         """Agents whose learning curves hold the Cramér-Rao bound instead of errors."""
         plant = self.build_plant()
-        envs = {
-            name: self.agent(name).env(plant, self.spread, self.num_steps) for name in self.agents
-        }
+        envs = {name: self.env(name, plant) for name in self.agents}
         return [n for n, env in envs.items() if isinstance(env.objective, InformationGain)]
 
     def checked(self, where: str) -> Study:
@@ -248,6 +263,8 @@ class Study(Settings):
         try:
             plant = self.build_plant()
             self.build_uncertainty(plant)
+            if self.coast and self.rig is not None:
+                raise ValueError("experiments on a rig end with the last sample: leave coast out")
             self.build_methods(plant)
             self.build_estimators(plant)
             self.check_agents(plant)
@@ -272,7 +289,7 @@ class Study(Settings):
                     + (f"; {other!r} has the same" if other != name else "")
                 )
             try:
-                self.agent(name).env(plant, self.spread, self.num_steps, self.uncertainty)
+                self.env(name, plant)
             except ValueError as error:
                 raise ValueError(f"agents.{name}: {error}") from None
         if self.agents:

@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from .. import __version__
+from ..description import SpreadLike
 from ..environment import Env, Episodes, run_episodes
 from ..excitation import PolicyExcitation, Replay
 from ..files import write_bytes
@@ -103,7 +104,7 @@ def seed_task(
         mark, own = fingerprint(chosen, built, agent), chosen.agent(agent)
         place = Path(folder) if folder and Path(folder).is_dir() else None
         keeper = _Keeper(place, mark, checkpoint_seconds)
-        env = own.env(built, chosen.spread, chosen.num_steps, chosen.uncertainty)
+        env = chosen.env(agent, built)
         trained = _trained(env, own, seed, keeper)
         seconds = keeper.seconds()
         provenance = {
@@ -237,7 +238,7 @@ def clairvoyant_task(study: Mapping[str, object], plant: Mapping[str, str | None
 def _played(
     plant: AbstractPlant,
     inputs: Float[Array, "episode time input"],
-    spread: float,
+    spread: SpreadLike,
     keys: Key[Array, " episode"],
 ) -> Episodes:
     """Each signal on the plant for which it was designed."""

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from numbers import Real
 from pathlib import Path
 
-from ..description import by_name, path_from, wrong_type
+from ..description import SpreadLike, by_name, path_from, wrong_type
 from ..plant import AbstractARXPlant
 from ..plant.catalogue import PlantLike
 from ..plant.uncertainty import Range
@@ -32,8 +32,9 @@ def train(
     clock: float | Sequence[float] = (),
     training: Mapping[str, object] | None = None,
     seeds: int = 1,
-    spread: float = 0.3,
+    spread: SpreadLike = 0.3,
     uncertainty: Mapping[str, Range] | None = None,
+    coast: int = 0,
     steps: int = 500,
     noise: Mapping[str, float] | None = None,
     episodes: int = 100,
@@ -66,9 +67,12 @@ def train(
         clock: frequencies [Hz] whose sine and cosine are observed too.
         training: hyper-parameters of the method (`excite.training.settings`).
         seeds: independent trainings; the best policy is returned.
-        spread: plants are drawn from nominal values ± this fraction.
+        spread: plants are drawn from nominal values ± this fraction, or within a factor
+            (`factor:3`).
         uncertainty: what else may differ, as in `falsify`: the policy is trained to be safe
             there too (by gradient), and its file says what a search found.
+        coast: samples after an experiment, under the input that ends it, in which it must be safe
+            too (by gradient).
         steps: samples of an experiment.
         noise: standard deviation by output, in its unit, where it differs from the plant's.
         episodes: experiments on which the policies are evaluated.
@@ -101,6 +105,7 @@ def train(
         "training": by_name("training", training),
     }
     settings = {"episodes": episodes, "num_steps": steps, "spread": spread, "seeds": seeds}
+    settings["coast"] = coast
     agents = {f"{method}({', '.join(rewards)})": agent}
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) if out is None else path_from("out", out)

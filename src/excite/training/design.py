@@ -21,7 +21,8 @@ from .. import __version__
 from ..description import (
     LARGEST_SEED,
     PlantDescription,
-    require_spread,
+    Spread,
+    SpreadLike,
     require_whole,
     unknown,
     wrong_type,
@@ -144,8 +145,9 @@ def design(
     *,
     criterion: str = "D",
     steps: int = 500,
-    spread: float = 0.3,
+    spread: SpreadLike = 0.3,
     uncertainty: Mapping[str, Range] | None = None,
+    coast: int = 0,
     noise: Mapping[str, float] | None = None,
     seed: int = 0,
     starts: int | None = None,
@@ -171,9 +173,12 @@ def design(
         criterion: of the Fisher information: its determinant (`D`), the trace of its inverse
             (`A`), or its smallest eigenvalue (`E`).
         steps: samples of the experiment.
-        spread: parameters are uniform in nominal value ± spread times their scale.
+        spread: parameters are uniform in nominal value ± spread times their scale, or within a
+            factor (`factor:3`).
         uncertainty: what else may differ, as in `falsify`: a robust input is made safe there
             too, and tested on plants drawn from it.
+        coast: samples after the experiment, under the input that ends it, in which it must be
+            safe too.
         noise: standard deviation by output, in its unit, where it differs from the plant's.
         seed: of the search, and of the plants on which the input is tested.
         starts: of a search by gradient, default 4 (robust) or 8 (clairvoyant).
@@ -188,7 +193,7 @@ def design(
     """
     if not isinstance(kind, str):
         raise wrong_type("kind", kind, "the name of a kind of design")
-    _check(steps, spread, seed, starts, updates, trials)
+    _check(steps, spread, coast, seed, starts, updates, trials)
     if out is not None:
         require_record_path(Path(out), overwrite)
     chosen = with_sensor(plant_from(plant), noise)
@@ -197,7 +202,7 @@ def design(
     if uncertainty and kind != "robust":
         raise ValueError(f"only a robust design takes an uncertainty (--uncertainty); got {kind!r}")
     box = Uncertainty.of(chosen, spread, uncertainty) if uncertainty else None
-    env = signal_env(chosen, steps, spread, criterion, box)
+    env = signal_env(chosen, steps, spread, criterion, box, coast)
     worth_by_start: tuple[float, ...] = ()
     tuned = None
     if kind in BY_GRADIENT:
@@ -213,7 +218,7 @@ def design(
         inputs, tuned = _tuned(env, kind, criterion, seed, trials, progress)
     count = 1 if kind == "clairvoyant" else NUM_FRESH
     keys = jax.random.split(jax.random.key(seed + 1), count)
-    judged = run_episodes(chosen, Replay(inputs), steps, float(env.spread), keys, box)
+    judged = run_episodes(chosen, Replay(inputs), steps, env.spread, keys, box, coast)
     found = _found(kind, criterion, seed, worth_by_start, tuned)
     made = Design(
         plant=chosen.description,
@@ -234,8 +239,8 @@ def design(
 
 
 def _check(
-    steps: int, spread: float, seed: int, starts: int | None, updates: int | None,
-    trials: int | None,
+    steps: int, spread: SpreadLike, coast: int, seed: int, starts: int | None,
+    updates: int | None, trials: int | None,
 ) -> None:  # fmt: skip
     """Raises ValueError for a number that is not allowed."""
     counts = {"steps": (steps, 2), "starts": (starts, 1)}
@@ -243,8 +248,9 @@ def _check(
     for name, (value, least) in counts.items():
         if value is not None:
             require_whole(name, value, least)
+    require_whole("coast", coast, 0)
     require_whole("seed", seed, 0, LARGEST_SEED - 1)  # the next one judges the signal
-    require_spread(spread)
+    Spread.of(spread)
 
 
 def _searched(

@@ -25,7 +25,8 @@ from jaxtyping import Array, Float, Key, PRNGKeyArray, PyTree
 
 from ..environment import Env, EnvState
 from ..environment.falsification import Cases, Effort, OnPlant, climbed, nearness, search
-from ..excitation import PolicyExcitation
+from ..excitation import Coast, PolicyExcitation
+from ..plant.uncertainty import Uncertainty
 from ..policy import Layout, Weights, act
 from ..safety import watched_levels
 from .checkpoint import Checkpoint, OnBoundary, Trained
@@ -83,12 +84,15 @@ def experiments(
     """
     watched, _, critical = watched_levels(env.plant.definition)
 
+    def beyond(output: Array) -> tuple[Array, Array]:
+        size = jnp.abs(output[np.array(watched, int)]) / critical
+        over = jnp.maximum(size - margin, 0.0) / (1 - margin)
+        return jnp.sum(over**2), jnp.max(size, initial=0.0)
+
     @jax.checkpoint
     def advance(state: EnvState, _: None) -> tuple[EnvState, tuple]:
         state, output, gain = env.advance(state, act(state))
-        size = jnp.abs(output[np.array(watched, int)]) / critical
-        over = jnp.maximum(size - margin, 0.0) / (1 - margin)
-        return state, (gain, jnp.sum(over**2), jnp.max(size, initial=0.0))
+        return state, (gain, *beyond(output))
 
     def experiment(key: PRNGKeyArray) -> Scores:
         start, _ = env.reset(key)
@@ -98,8 +102,10 @@ def experiments(
         final = env.objective.final(env.plant, state.memory, state.params)
         worth = jnp.sum(gains) + final
         outcome = env.objective.outcome(env.plant, state.memory, state.params, worth)
-        nearness = jnp.where(state.is_finite, jnp.max(sizes), jnp.inf)
-        return Scores(worth, outcome, jnp.mean(excess), nearness)
+        after = jax.vmap(beyond)(env.coasting(state))
+        nearness = jnp.maximum(jnp.max(sizes), jnp.max(after[1], initial=0.0))
+        nearness = jnp.where(state.is_finite & jnp.isfinite(nearness), nearness, jnp.inf)
+        return Scores(worth, outcome, jnp.mean(excess) + jnp.sum(after[0]) / len(excess), nearness)
 
     return jax.vmap(experiment)(keys)
 
@@ -126,7 +132,8 @@ class Optimisation(eqx.Module):
         weight, count = jnp.asarray(settings.penalty_weight, float), settings.num_adversaries
         if (box := env.uncertainty) is None:
             return cls(player, adam, weight)
-        noise = jnp.zeros((count, env.layout.num_steps + 1, len(env.plant.definition.outputs)))
+        length = env.layout.num_steps + env.coast + 1
+        noise = jnp.zeros((count, length, len(env.plant.definition.outputs)))
         middle = Cases(jnp.zeros((count, len(box.names))), jnp.zeros(count, int), noise)
         return cls(player, adam, weight, middle)
 
@@ -152,7 +159,7 @@ def update(
     start = settings.margin if margin is None else margin
     box, adversaries = env.uncertainty, now.adversaries
     if is_adversarial and box is not None and adversaries is not None:
-        play = OnPlant(box, now.player.excitation(env.layout), env.layout.num_steps)
+        play = _on_plants(env, box, now.player)
         key = jax.random.fold_in(keys[0], 1)
         adversaries = _adversaries(play, settings, adversaries, key)
 
@@ -160,7 +167,7 @@ def update(
         batch = experiments(env, player, keys, start)
         excess, nearest = jnp.mean(batch.excess), batch.nearness
         if is_adversarial and box is not None and adversaries is not None:
-            play = OnPlant(box, player.excitation(env.layout), env.layout.num_steps)
+            play = _on_plants(env, box, player)
             more, size = _excess(play, adversaries, settings.adversary_margin)
             excess, nearest = excess + jnp.mean(more), jnp.concatenate([nearest, size])
         worth = env.objective.of_batch(batch.outcome)
@@ -174,6 +181,12 @@ def update(
     player = eqx.apply_updates(now.player, step)
     weight = jnp.maximum(now.penalty_weight * jnp.exp(change), settings.penalty_weight)
     return Optimisation(player, adam, weight, adversaries), batch
+
+
+def _on_plants(env: Env, box: Uncertainty, player: PyTree) -> OnPlant:
+    """Experiments of what is being trained, coast included."""
+    own = player.excitation(env.layout)
+    return OnPlant(box, *Coast.after(own, env.layout.num_steps, env.coast))
 
 
 def _adversaries(
@@ -350,7 +363,7 @@ def _looked(
         seen = look(env, own.player.weights, settings.watch_episodes)
         judged = _judged(env, own.player, validation_keys(settings.watch_episodes))
         judged |= _falsified(env, own.player)
-        curve.append({"steps": steps, **judged, **seen, **_state(own)})
+        curve.append({"steps": steps, **seen, **judged, **_state(own)})
         own_rank = rank(settings, curve[-1])
         if own_rank > tuple(course.rank[s]):
             course.rank[s] = own_rank
@@ -367,6 +380,7 @@ def _judged(env: Env, player: Network, keys: Key[Array, " plant"]) -> dict[str, 
     return {
         "worth": float(env.objective.of_batch(batch.outcome)),
         "nearness": float(jnp.max(batch.nearness)),
+        "violation_rate": float(jnp.mean(batch.nearness >= 1)),
         "not_computable": float(jnp.mean(jnp.isinf(batch.nearness))),
     }
 
@@ -375,7 +389,7 @@ def _falsified(env: Env, player: Network) -> dict[str, float]:
     """The largest nearness that a short search in the declared uncertainty finds."""
     if env.uncertainty is None:
         return {}
-    play = OnPlant(env.uncertainty, player.excitation(env.layout), env.layout.num_steps)
+    play = _on_plants(env, env.uncertainty, player)
     found = search(play, _LOOK, VALIDATION_SEED)
     return {"worst_nearness": max(stage.nearness for stage in found.stages)}
 

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, PRNGKeyArray
 
+from ..description import SpreadLike
 from ..environment import Env, EnvState, InformationGain, prior_sd_of
 from ..environment.falsification import Cases, OnPlant
 from ..excitation import Multisine, Replay
@@ -33,9 +34,10 @@ from .gradient import GradientSettings, Optimisation, Scores, experiments, updat
 def signal_env(
     plant: AbstractPlant,
     num_steps: int,
-    spread: float,
+    spread: SpreadLike,
     criterion: str = "D",
     uncertainty: Uncertainty | None = None,
+    coast: int = 0,
 ) -> Env:
     """The decision process for signals that do not use the measurements.
 
@@ -44,7 +46,14 @@ def signal_env(
     every = (True,) * len(plant.definition.parameters)
     objective = InformationGain(every, prior_sd_of(spread), criterion=criterion, dense=False)
     layout = Layout.of(plant.description, window=1, num_steps=num_steps)
-    return Env.of(plant, objective=objective, layout=layout, spread=spread, uncertainty=uncertainty)
+    return Env.of(
+        plant,
+        objective=objective,
+        layout=layout,
+        spread=spread,
+        uncertainty=uncertainty,
+        coast=coast,
+    )
 
 
 CLAIRVOYANT = GradientSettings(num_updates=3000, learning_rate=0.1, margin=0.97, near=0.99975)

@@ -98,7 +98,7 @@ def tuned_signal(
 
     def scored(options: Options, keys: Key[Array, " episode"], limit: float) -> tuple[float, int]:
         built = excitation_named(excitation, options, plant)
-        episodes = run_episodes(plant, built, num_steps, float(env.spread), keys)
+        episodes = run_episodes(plant, built, num_steps, env.spread, keys, None, env.coast)
         values = np.asarray(jax.vmap(_CRITERIA[criterion])(episodes.information))
         nearness = episodes.max_abs_output / critical_levels(plant.definition)[None]
         return float(np.mean(values)), int(np.sum(~np.all(nearness < limit, axis=1)))

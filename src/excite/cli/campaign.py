@@ -1,0 +1,131 @@
+"""`excite campaign`: rounds of experiments on a rig until the parameters are known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from .options import (
+    NUMBERS,
+    OUT_FILE,
+    SEED,
+    SPREAD,
+    Assignments,
+    Number,
+    WholeNumber,
+    computing,
+    json_option,
+    merged,
+    plot_option,
+    progress_bar,
+    show_json,
+)
+
+_TARGETS = Assignments(str, "a percentage such as 1% or a number")
+
+
+@click.command()
+@click.argument("plant")
+@click.option(
+    "--target",
+    "targets",
+    type=_TARGETS,
+    multiple=True,
+    required=True,
+    help="Half of the 95 % interval to be reached, such as D_p=1%,J_p=0.5%, or a number in the "
+    "parameter's unit.",
+)
+@click.option(
+    "--rig",
+    default="simulated",
+    show_default=True,
+    metavar="NAME",
+    help="As for excite run: simulated, quanser, FILE.fmu, FILE.json, path/to/file.py:ClassName.",
+)
+@click.option(
+    "--policy",
+    metavar="NAME",
+    help="Shipped, or a file; default the plant's policy for a spread by a factor, or its usual "
+    "one.",
+)
+@click.option(
+    "--out",
+    type=OUT_FILE,
+    required=True,
+    metavar="FOLDER",
+    help="Records and decisions; rerun the same command to resume.",
+)
+@click.option(
+    "--spread",
+    type=SPREAD,
+    help="Spread of the parameters (0.3, factor:3); default that of the policy's training.",
+)
+@click.option("--rounds", type=WholeNumber(1, 1000), default=10, show_default=True, help="At most.")
+@click.option(
+    "--coast",
+    type=WholeNumber(0, 100_000),
+    metavar="N",
+    help="Samples after a round's end in which the plant must be safe; default that of the "
+    "policy's training, or 100.",
+)
+@click.option("--pause", type=Number(0), default=0.0, help="Before the next round [s].")
+@click.option("--filter", is_flag=True, help="Predictive safety filter for this spread.")
+@click.option("--guard", is_flag=True, help="Brake where no declared plant explains a round.")
+@click.option("--address", default="0", show_default=True, help="Board of the Quanser rig.")
+@click.option("--fast", is_flag=True, help="Run a simulated rig or an FMU as fast as it can.")
+@click.option(
+    "--seed",
+    type=SEED,
+    default=0,
+    show_default=True,
+    help="Seed of a simulated rig's hidden parameters, noise and jitter.",
+)
+@click.option(
+    "--fault", "faults", type=NUMBERS, multiple=True, help="Of a simulated rig, see excite run."
+)
+@plot_option
+@json_option
+@computing
+def campaign(
+    plant: str,
+    targets: tuple[dict[str, str], ...],
+    faults: tuple[dict[str, float], ...],
+    plot: Path | None,
+    as_json: bool,
+    **options: Any,
+) -> None:
+    """Play rounds of experiments on PLANT until its parameters are known as asked.
+
+    A round plays the policy from rest and ends as soon as enough is known. Exit code 1 where
+    the campaign ends without every target.
+    """
+    from ..files import require_new_file
+    from ..study.campaign import REACHED
+    from ..study.campaign import campaign as campaigned
+
+    if plot is not None:
+        require_new_file(plot, overwrite=False)
+    with progress_bar(f"campaign on {plant}") as progress:
+        made = campaigned(
+            plant,
+            merged(targets),
+            fault=merged(faults),
+            progress=progress,
+            on_warning=lambda sentence: click.echo(f"warning: {sentence}", err=True),
+            **options,
+        )
+    if as_json:
+        show_json(made.to_dict())
+    else:
+        click.echo(made)
+        if made.interrupted:
+            click.echo(f"{made.interrupted}: rerun the same command to resume", err=True)
+    if plot is not None and made.result is not None:
+        from ..record.figure import save
+
+        save(made.plot(), plot)
+    is_interrupted = made.interrupted == "interrupted by SIGINT"
+    code = 130 if is_interrupted else 0 if made.reason == REACHED else 1
+    click.get_current_context().exit(code)

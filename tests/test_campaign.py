@@ -1,0 +1,301 @@
+"""Campaigns: rounds that end when enough is known, resumed and judged alike."""
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from commands import excite
+
+import excite as ex
+from excite.description import HALF_95
+from excite.information import experiment_information
+from excite.plant import Aero2, draw_params
+from excite.policy import Layout
+from excite.rig.contract import Interval, Sample
+from excite.simulation import response, run_episode
+from excite.study.campaign import REACHED, targets_from
+
+TRUE = {"J_p": 0.025, "K_pu": 0.0110, "D_p": 0.0011}
+EASY = {"J_p": "5%", "K_pu": "10%"}
+
+
+def steady(steps: int = 60, size: float = 0.05) -> ex.Policy:
+    """A policy that reacts to what it sees, and stays far below the level."""
+    layout = Layout.of(Aero2().description, 4, steps)
+    rng = np.random.default_rng(0)
+    weights = [
+        (rng.normal(size=(8, layout.size)), rng.normal(size=8)),
+        (size * rng.normal(size=(1, 8)), np.zeros(1)),
+    ]
+    return ex.Policy(Aero2().description, layout, tuple(weights), {"spread": "factor:3"})
+
+
+# ---------------------------------------------------------------------------------- targets
+
+
+@pytest.mark.parametrize(
+    ("given", "half", "is_relative"),
+    [("1%", 0.01, True), (" 0.5 %", 0.005, True), ("1e-4", 1e-4, False), (2e-4, 2e-4, False)],
+)
+def test_a_target_is_a_share_of_the_estimate_or_a_number(given, half, is_relative):
+    (target,) = targets_from(Aero2().description, {"D_p": given})
+    assert (target.half, target.is_relative) == (pytest.approx(half), is_relative)
+    allowed = half * 0.002 if is_relative else half
+    assert target.share(-0.002, allowed) == pytest.approx(1)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({}, "a campaign needs a target, such as D_p=1%"),
+        ({"D_q": "1%"}, "unknown parameter of 'aero2' 'D_q'; did you mean 'D_p'"),
+        ({"D_p": "0%"}, "target of D_p must be a number above 0, or a percentage such as 1%"),
+        ({"D_p": "-1%"}, "target of D_p must be a number above 0"),
+        ({"D_p": "much"}, "got 'much'"),
+        ({"D_p": math.nan}, "got nan"),
+        ({"D_p": math.inf}, "got inf"),
+    ],
+)
+def test_a_target_that_is_not_allowed_is_one_sentence(given, words):
+    with pytest.raises((ValueError, TypeError)) as error:
+        targets_from(Aero2().description, given)
+    assert words in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"rounds": 0}, "rounds must be a whole number from 1 to 1000: got 0"),
+        ({"coast": -1}, "coast must be a whole number"),
+        ({"spread": 1.0}, "such as factor:3: got 1.0"),
+        ({"policy": "aero3"}, "aero3"),
+        ({"policy": "dc_motor"}, "the policy has 2 outputs; the plant has 1"),
+        ({"plant": "aero3"}, "unknown plant 'aero3'"),
+    ],
+)
+def test_a_campaign_that_cannot_be_played_is_one_sentence(options, words):
+    given = {"plant": "aero2", "target": EASY, **options}
+    with pytest.raises(ValueError, match=words.replace("(", r"\(")):
+        ex.Campaign(**given)
+
+
+def test_a_plant_without_a_shipped_policy_needs_one():
+    with pytest.raises(ValueError, match="no shipped policy for 'aero2\\+offset_voltage'"):
+        ex.Campaign("aero2+offset_voltage", {"J_p": "1%"})
+
+
+# ------------------------------------------------------------------------------ ask and tell
+
+
+@pytest.fixture(scope="module")
+def asked() -> ex.Campaign:
+    """A campaign of two rounds, with what `identify` makes of both."""
+    campaign = ex.Campaign("aero2", {"D_p": "0.001%"}, policy=steady(), rounds=2)
+    for seed in (1, 2):
+        policy = campaign.ask()
+        campaign.tell(ex.simulate("aero2", policy, params=TRUE, seed=seed))
+    return campaign
+
+
+def test_all_rounds_are_identified_together(asked):
+    records = [ex.simulate("aero2", steady(), params=TRUE, seed=seed) for seed in (1, 2)]
+    result = ex.identify(records, "aero2", initial_state="known")
+    for name, (estimate, half) in asked.rounds[-1].known.items():
+        low, high = result.ci95(name)
+        assert estimate == pytest.approx(result.params[name], rel=1e-6)
+        assert half == pytest.approx((high - low) / 2, rel=1e-4)
+        assert low < TRUE[name] < high
+    assert asked.num_samples == 120
+    assert asked.ask() is None
+    assert asked.reason == "2 rounds are played"
+    assert asked.rounds[0].decision.startswith("go on: D_p is")
+    with pytest.raises(ValueError, match="the campaign has ended: 2 rounds are played"):
+        asked.tell(records[0])
+
+
+def test_knowledge_after_every_sample_is_the_cramer_rao_bound(asked):
+    samples, halves = asked.knowledge()
+    assert samples[-1] == len(halves) == 120
+    params = Aero2().Params(*asked.result.params.values())
+    inputs = [jnp.asarray(record.inputs[:-1]) for record in asked.records]
+    for count in (30, 60):
+        information = experiment_information(Aero2(), params, inputs[0][:count])
+        expected = HALF_95 * np.sqrt(np.diag(np.linalg.inv(information))) * np.array(params)
+        np.testing.assert_allclose(halves[count - 1], expected, rtol=1e-6)
+    both = sum(experiment_information(Aero2(), params, u) for u in inputs)
+    expected = HALF_95 * np.sqrt(np.diag(np.linalg.inv(both))) * np.array(params)
+    np.testing.assert_allclose(halves[-1], expected, rtol=1e-6)
+
+
+def test_the_table_says_what_was_asked_and_reached(asked):
+    text = repr(asked)
+    assert "aero2: 2 rounds are played (120 samples in 2 rounds)" in text
+    assert max(map(len, text.splitlines())) <= 80
+    (row,) = (row for row in asked.rows() if row[0] == "D_p")
+    assert row[-2:] == ["0.001 %", "missed"]
+    assert "<table" in asked._repr_html_()
+    assert json.loads(json.dumps(asked.to_dict()))["num_samples"] == 120
+    assert asked.plot().axes
+
+
+def test_a_campaign_ends_where_a_level_is_reached():
+    campaign = ex.Campaign("aero2", EASY, policy=steady())
+    record = ex.simulate("aero2", steady(), params=TRUE, seed=1)
+    beyond = dataclasses.replace(record, outputs=record.outputs + 1.0)
+    campaign.tell(beyond)
+    assert campaign.reason == "unsafe: a critical level was reached"
+    tripped = ex.Campaign("aero2", EASY, policy=steady())
+    tripped.tell(record, "warning level exceeded", trip=True)
+    assert tripped.reason == "unsafe: warning level exceeded"
+
+
+def test_a_record_that_tells_nothing_is_a_round_without_an_estimate():
+    campaign = ex.Campaign("aero2", EASY, policy=steady())
+    record = ex.simulate("aero2", ex.read_policy("aero2"), params=TRUE, seed=1)
+    short = dataclasses.replace(
+        record, time=record.time[:3], inputs=record.inputs[:3], outputs=record.outputs[:3]
+    )
+    told = campaign.tell(short)
+    assert told.known == {}
+    assert told.decision == "go on: there is no estimate yet"
+    assert campaign.ask() is not None
+
+
+# ------------------------------------------------------------------------- what is expected
+
+
+def test_the_expected_samples_are_those_of_the_bound():
+    campaign = ex.Campaign("aero2", {"D_p": "30%", "K_pu": "20%"}, policy=steady(), rounds=3)
+    plant, found = Aero2(), campaign.expected
+    keys = jax.random.split(jax.random.key(0), 32)
+    for i in (0, 5):
+        params_key, key = jax.random.split(keys[i])
+        params = draw_params(plant, params_key, "factor:3")
+        excitation = ex.Campaign("aero2", EASY, policy=steady()).policy
+        from excite.excitation import PolicyExcitation
+
+        run = run_episode(plant, params, PolicyExcitation.of(excitation), 60, key)
+        count = int(found.samples[i]) if np.isfinite(found.samples[i]) else 180
+
+        def share(samples: int, run=run, params=params) -> float:
+            """Of the target that is farthest away, after so many samples."""
+            rounds, rest = divmod(samples, 60)
+            whole = experiment_information(plant, params, run.inputs)
+            part = experiment_information(plant, params, run.inputs[:rest]) if rest else 0
+            sd = np.sqrt(np.diag(np.linalg.inv(rounds * whole + part)))
+            return max(HALF_95 * sd[1] / 0.2, HALF_95 * sd[2] / 0.3)
+
+        if np.isfinite(found.samples[i]):
+            assert share(count) <= 1 + 1e-9
+        if count > 6:
+            assert share(count - 1) > 1
+
+
+def test_a_target_that_nothing_reaches_is_refused_before_the_first_round(tmp_path):
+    with pytest.raises(ValueError, match=r"reaches D_p to 1e-07 %: at best .* %; ask for less"):
+        ex.campaign("aero2", {"D_p": "0.0000001%"}, policy=steady(), out=tmp_path / "a", fast=True)
+    assert not (tmp_path / "a").exists()
+
+
+# ------------------------------------------------------------------------ the running round
+
+
+def test_a_round_ends_only_where_the_free_motion_after_it_is_safe():
+    campaign = ex.Campaign("aero2", EASY, policy=steady())
+    monitor = campaign.monitor(waits=True)
+    plant, fast = Aero2(), jnp.full((15, 1), 24.0)
+    known = {name: Interval(value, 1e-9) for name, value in TRUE.items()}
+    params = plant.Params(**TRUE)
+    outputs = np.asarray(response(plant, params, jnp.concatenate([fast, jnp.zeros((100, 1))])))
+    level = plant.definition.outputs[0].critical_level or 0.0
+    verdicts = []
+    for k in range(15):
+        sample = Sample(plant.description, 60, k, 0.1 * k, np.array(outputs[k]), np.array([24.0]))
+        monitor._live._latest = known
+        monitor._live._first = 1000  # no estimate but this one
+        verdicts.append(monitor(sample))
+        rest = jnp.concatenate([fast[:k], jnp.zeros((160 - k, 1))])
+        largest = float(np.abs(response(plant, params, rest)).max()) / level
+        assert verdicts[-1] == (largest < 0.97)
+    assert verdicts[0]
+    assert not verdicts[-1]
+    assert np.abs(outputs[14]).max() < level  # what would happen, and has not
+    monitor.close()
+
+
+@pytest.fixture(scope="module")
+def played(tmp_path_factory) -> tuple[Path, ex.Campaign]:
+    """Two rounds on the simulated rig, and where they are."""
+    folder = tmp_path_factory.mktemp("campaign") / "first"
+    made = ex.campaign(
+        "aero2", {"D_p": "0.3%"}, policy=steady(), rounds=2, out=folder, fast=True, seed=3
+    )
+    return folder, made
+
+
+@pytest.mark.science
+def test_every_round_has_its_own_noise_and_the_same_plant(played):
+    folder, made = played
+    first, second = made.records
+    assert (
+        first.metadata["ended"]["rig"]["true_params"]
+        == (second.metadata["ended"]["rig"]["true_params"])
+    )
+    assert not np.array_equal(first.outputs, second.outputs)
+    assert made.reason == "2 rounds are played"
+    saved = json.loads((folder / "campaign.json").read_text())
+    assert saved["num_samples"] == made.num_samples
+    assert len(saved["rounds"]) == 2
+
+
+@pytest.mark.science
+def test_a_campaign_that_was_interrupted_is_resumed_and_nothing_is_played_twice(played, tmp_path):
+    folder, made = played
+    again = tmp_path / "again"
+    again.mkdir()
+    for name in ("campaign.json", "round-01.csv", "round-01.json"):
+        (again / name).write_bytes((folder / name).read_bytes())
+    before = (again / "round-01.csv").stat().st_mtime_ns
+    told = []
+    resumed = ex.campaign(
+        "aero2", {"D_p": "0.3%"}, policy=steady(), rounds=2, out=again, fast=True, seed=3,
+        on_round=told.append,
+    )  # fmt: skip
+    assert (again / "round-01.csv").stat().st_mtime_ns == before
+    assert (again / "round-02.csv").read_text() == (folder / "round-02.csv").read_text()
+    assert resumed.to_dict() == made.to_dict()
+    assert len(told) == 2
+    with pytest.raises(ValueError, match=r"is another campaign, with seed 3 and not 4"):
+        ex.campaign("aero2", {"D_p": "0.3%"}, policy=steady(), rounds=2, out=again, seed=4)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "thesis.txt").write_text("mine")
+    with pytest.raises(ValueError, match="exists and is no campaign"):
+        ex.campaign("aero2", EASY, policy=steady(), out=tmp_path / "other", fast=True)
+
+
+@pytest.mark.science
+def test_the_command_ends_a_round_as_soon_as_enough_is_known(tmp_path):
+    asked = "--target", "D_p=2%,J_p=1%", "--policy", "aero2", "--fast"
+    done = excite("campaign", "aero2", *asked, "--out", tmp_path / "a", "--json")
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    assert told["reason"] == REACHED
+    assert told["num_samples"] < 100
+    record = ex.read_record(tmp_path / "a" / "round-01.csv")
+    true = record.metadata["ended"]["rig"]["true_params"]
+    for name, interval in told["rounds"][-1]["known"].items():
+        assert abs(interval["estimate"] - true[name]) < 3 * interval["ci95_half"]
+    missed = excite(
+        "campaign", "aero2", "--target", "D_p=0.01%", "--policy", "aero2", "--fast",
+        "--out", tmp_path / "b", "--rounds", "1", "--spread", "0.3",
+        "--plot", tmp_path / "known.png",
+    )  # fmt: skip
+    assert missed.returncode in (1, 2)
+    refused = excite("campaign", "aero2", "--target", "D_p=x", "--out", tmp_path / "c")
+    assert refused.returncode == 2
+    assert "target of D_p must be a number above 0" in refused.stderr
