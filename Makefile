@@ -56,7 +56,7 @@ results: .venv/core ## computes the committed results again (minutes in docs/ref
 	done
 
 agents: .venv/dev ## trains the agents of the studies again (hours; rerun to resume)
-	for study in table1 paper frontier robust emps dc_motor cart_pole aero2_lag half amplitude nls_reward spread reward \
+	for study in table1 paper frontier robust wide emps dc_motor cart_pole aero2_lag half amplitude nls_reward spread reward \
 	    two_minutes sim_to_real; do \
 	  $(BIN)/excite study run $$study --out runs/$$study || exit 1; \
 	done
@@ -64,6 +64,7 @@ agents: .venv/dev ## trains the agents of the studies again (hours; rerun to res
 policies: ## what is shipped in src/excite/policy/shipped, from the results of the studies (then: certificates)
 	cp results/robust/seeds/gradient_D/0/policy.safetensors src/excite/policy/shipped/aero2.safetensors
 	cp results/frontier/seeds/gradient_D/0/policy.safetensors src/excite/policy/shipped/aero2-ideal.safetensors
+	cp results/wide/seeds/gradient_A/0/policy.safetensors src/excite/policy/shipped/aero2-wide.safetensors
 	cp results/frontier/seeds/gradient_goals/0/policy.safetensors src/excite/policy/shipped/aero2-goals.safetensors
 	cp results/robust/seeds/gradient_D_p/0/policy.safetensors src/excite/policy/shipped/aero2-damping.safetensors
 	cp results/table1/seeds/RL_all/2/policy.safetensors src/excite/policy/shipped/aero2-ppo-all.safetensors
@@ -90,10 +91,11 @@ certificates: .venv/core ## searches for the worst plant of each shipped policy;
 
 evaluations: .venv/core ## evaluates the shipped policies on new plants, in results/policies
 	mkdir -p results/policies
-	for policy in $(filter-out cart_pole aero2 aero2-ideal aero2-goals aero2-damping,$(notdir $(basename $(wildcard src/excite/policy/shipped/*.safetensors)))); do \
+	for policy in $(filter-out cart_pole aero2 aero2-wide aero2-ideal aero2-goals aero2-damping,$(notdir $(basename $(wildcard src/excite/policy/shipped/*.safetensors)))); do \
 	  $(BIN)/excite evaluate $$policy --episodes 1000 --seed 7 --json > results/policies/$$policy.json || exit 1; \
 	done
 	$(BIN)/excite evaluate cart_pole --episodes 200 --seed 7 --json > results/policies/cart_pole.json
+	$(BIN)/excite evaluate aero2-wide --spread factor:3 --coast 50 --episodes 1000 --seed 7 --json > results/policies/aero2-wide.json
 	for policy in aero2 aero2-ideal aero2-goals aero2-damping; do \
 	  $(BIN)/excite evaluate $$policy --episodes 10000 --seed 7 --json > results/policies/$$policy.json || exit 1; \
 	done

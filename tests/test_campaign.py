@@ -150,7 +150,7 @@ def test_a_campaign_ends_where_a_level_is_reached():
     campaign.tell(beyond)
     assert campaign.reason == "unsafe: a critical level was reached"
     tripped = ex.Campaign("aero2", EASY, policy=steady())
-    tripped.tell(record, "warning level exceeded", trip=True)
+    tripped.tell(record, "warning level exceeded", unsafe=True)
     assert tripped.reason == "unsafe: warning level exceeded"
 
 
@@ -205,8 +205,17 @@ def test_a_target_that_nothing_reaches_is_refused_before_the_first_round(tmp_pat
 # ------------------------------------------------------------------------ the running round
 
 
-def test_a_round_ends_only_where_the_free_motion_after_it_is_safe():
+def test_a_round_ends_only_where_the_free_motion_after_it_is_safe(monkeypatch):
     campaign = ex.Campaign("aero2", EASY, policy=steady())
+    traces, usual = 0, response
+
+    def counted(*args):
+        nonlocal traces
+        traces += 1
+        return usual(*args)
+
+    monkeypatch.setattr("excite.study.campaign.response", counted)
+    jax.clear_caches()
     monitor = campaign.monitor(waits=True)
     plant, fast = Aero2(), jnp.full((15, 1), 24.0)
     known = {name: Interval(value, 1e-9) for name, value in TRUE.items()}
@@ -224,6 +233,7 @@ def test_a_round_ends_only_where_the_free_motion_after_it_is_safe():
         assert verdicts[-1] == (largest < 0.97)
     assert verdicts[0]
     assert not verdicts[-1]
+    assert traces == 1  # nothing is compiled while a round runs
     assert np.abs(outputs[14]).max() < level  # what would happen, and has not
     monitor.close()
 
@@ -270,6 +280,17 @@ def test_a_campaign_that_was_interrupted_is_resumed_and_nothing_is_played_twice(
     assert (again / "round-02.csv").read_text() == (folder / "round-02.csv").read_text()
     assert resumed.to_dict() == made.to_dict()
     assert len(told) == 2
+    (again / "round-02.csv").write_text("time,voltage,pitch\n")  # hardly begun when it was killed
+    once_more = ex.campaign(
+        "aero2", {"D_p": "0.3%"}, policy=steady(), rounds=2, out=again, fast=True, seed=3
+    )
+    assert once_more.to_dict() == made.to_dict()
+    content = (again / "round-01.csv").read_bytes()
+    eased = ex.campaign(
+        "aero2", {"D_p": "50%"}, policy=steady(), rounds=3, out=again, fast=True, seed=3
+    )
+    assert eased.reason == REACHED
+    assert (again / "round-01.csv").read_bytes() == content
     with pytest.raises(ValueError, match=r"is another campaign, with seed 3 and not 4"):
         ex.campaign("aero2", {"D_p": "0.3%"}, policy=steady(), rounds=2, out=again, seed=4)
     (tmp_path / "other").mkdir()

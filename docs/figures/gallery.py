@@ -19,6 +19,7 @@ SHOWN = {  # file: study and method
     "loop": ("emps", "loop-multisine tuned"),
     "robust": ("frontier", "robust"),
     "aero2": ("robust", "gradient D"),
+    "aero2-wide": ("wide", "gradient A"),
     "aero2-ideal": ("frontier", "gradient D"),
     "aero2-goals": ("frontier", "gradient goals"),
     "aero2-damping": ("robust", "gradient D_p"),

@@ -28,6 +28,7 @@ from ..record.figure import (
 from .numbers import digits_for, number
 from .rows import EstimatedParameter, EstimateSummary, Row
 
+_LEAST_KNOWN = 1e4  # an interval over its target that is drawn
 _HIGHEST = 5.0  # growth of a profile that is drawn, over the limit
 
 
@@ -103,6 +104,7 @@ def knowledge_figure(
     for end in ends[:-1]:
         axis.axvline(end, color=GREY, lw=0.8, ls=":")
     axis.set(yscale="log", xlabel="samples", ylabel="95 % interval over the target")
+    axis.set_ylim(top=min(axis.get_ylim()[1], _LEAST_KNOWN))
     add_legend(figure, axis)
     add_title(figure, title)
     return figure

@@ -9,6 +9,7 @@ nothing of the plant but the spread that it was trained for.
 from __future__ import annotations
 
 import dataclasses
+import textwrap
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -68,6 +69,7 @@ if TYPE_CHECKING:
 
 REACHED = "every target is reached"
 
+_UNSAFE = (Trip.LEVEL, Trip.PREDICTED_LEVEL, Trip.UNEXPLAINED)  # others interrupt a campaign
 _FIRST = 8  # samples before the first running estimate of a round
 _COAST = 100  # samples of free motion that must be safe, where the policy's training had none
 _SAFE = 0.97  # of the critical level: largest output allowed in the predicted free motion
@@ -247,13 +249,13 @@ class Campaign:
         """The policy to play in the next round, from rest; None once the campaign has ended."""
         return None if self.reason else self.policy
 
-    def tell(self, record: Record, ended: str = COMPLETE, trip: bool = False) -> Round:
+    def tell(self, record: Record, ended: str = COMPLETE, unsafe: bool = False) -> Round:
         """Takes the record of a round, identifies, and decides whether another one follows.
 
         Args:
             record: of the round, from rest.
             ended: why the round ended.
-            trip: whether it was ended because it was not safe.
+            unsafe: whether it ended because a level was near, or no declared plant explains it.
 
         Raises:
             ValueError: where the campaign has ended, or for a record of another plant.
@@ -275,8 +277,8 @@ class Campaign:
         near = float(np.nanmax(np.abs(record.outputs) / levels[None], initial=0.0))
         known = {} if self.result is None else known_of(self.result)
         shares = self.shares(known)
-        if trip or near >= 1:
-            self.reason = f"unsafe: {ended if trip else 'a critical level was reached'}"
+        if unsafe or near >= 1:
+            self.reason = f"unsafe: {ended if unsafe else 'a critical level was reached'}"
         elif shares and max(shares.values()) <= 1:
             self.reason = REACHED
         elif len(self.records) >= self.most_rounds:
@@ -372,24 +374,31 @@ class Campaign:
                 continue
             value, half = known[p.name]
             reached = ("reached" if shares[p.name] <= 1 else "missed") if p.name in shares else ""
-            relative = f"{100 * half / abs(value):.2g} %" if value else "–"
+            relative = f"{number(100 * half / abs(value), 2)} %" if value else "–"
             rows.append([p.name, f"{number(value)} {p.unit}".rstrip(), f"{half:.2g}", relative,
                          _told(targets.get(p.name)), reached])  # fmt: skip
         return rows
 
     def round_rows(self) -> list[list[str]]:
         """Rows of the table of rounds."""
-        return [
-            [str(i), str(r.num_samples), r.ended, f"{100 * r.nearness:.0f} %", r.decision]
-            for i, r in enumerate(self.rounds, 1)
-        ]
+        rows = []
+        for i, r in enumerate(self.rounds, 1):
+            is_told = r.ended == COMPLETE or r.ended in r.decision
+            decision = r.decision if is_told else f"{r.ended}; {r.decision}"
+            rows.append([str(i), str(r.num_samples), f"{100 * r.nearness:.0f} %", decision])
+        return rows
 
-    round_header = ("round", "samples", "ended", "of the level", "decision")
+    round_header = ("round", "samples", "of the level", "decision")
 
     def __repr__(self) -> str:
         """The tables that `excite campaign` prints."""
-        rounds = text_table("rounds", self.round_header, self.round_rows())
-        return f"{text_table(self.title, self.header, self.rows())}\n{rounds}"
+        tables = [
+            text_table(self.title, self.header, self.rows()),
+            text_table("rounds", self.round_header, self.round_rows()),
+        ]
+        if "expected" in vars(self):  # where it was computed
+            tables.append(textwrap.fill(f"expected before the first round: {self.expected}", 80))
+        return "\n".join(tables)
 
     def _repr_html_(self) -> str:
         """The same for a notebook."""
@@ -452,19 +461,24 @@ class Monitor:
         self._campaign, self._steps = campaign, steps
         self._live = LiveEstimate(plant, steps, True, estimator, first=_FIRST, waits=waits)
         self._inputs = np.tile(safe_input(plant.definition), (steps + campaign.coast, 1))
+        self._after(plant.nominal)  # compiles, before the first sample
 
     def __call__(self, sample: Sample) -> bool:
         """Takes one more sample; whether every target is reached and ending now is safe."""
         self._live(sample)
         known = self._live.latest
-        shares = self._campaign.shares(known)
-        rest = self._inputs.copy()
+        shares, plant = self._campaign.shares(known), self._campaign.plant
+        is_enough = bool(shares) and max(shares.values()) <= 1
+        if is_enough:
+            values = jnp.asarray([known[name].estimate for name in plant.nominal._fields])
+            params = plant.Params(*values)  # as numbers they would be compiled into the program
+            is_enough = self._after(params) < _SAFE
         self._inputs[sample.k] = sample.input
-        if not shares or max(shares.values()) > 1:
-            return False
-        plant = self._campaign.plant
-        params = plant.Params(*(known[name].estimate for name in plant.nominal._fields))
-        return float(_free_motion(plant, params, jnp.asarray(rest))) < _SAFE
+        return is_enough
+
+    def _after(self, params: Params) -> float:
+        """Largest output over its critical level if the round ended now."""
+        return float(_free_motion(self._campaign.plant, params, jnp.asarray(self._inputs)))
 
     def close(self) -> None:
         """Waits for the running estimate."""
@@ -630,10 +644,11 @@ def campaign(
                 made, opened(count), folder.path(count), filter, guard, stop, on_warning
             )
             outcome = played.outcome
-            if outcome.reason not in (COMPLETE, REACHED) and outcome.trip == Trip.NONE:
-                made.interrupted = outcome.reason
             on_round(_taken(made, played.record, outcome.reason, outcome.trip))
             folder.write(made)
+            if not made.reason:
+                is_whole = outcome.reason in (COMPLETE, REACHED)
+                made.interrupted = stop.reason if is_whole else outcome.reason
     progress("done", rounds, rounds)
     return made
 
@@ -658,9 +673,9 @@ def _played(
 
     try:
         played = run(
-            rig, made.policy, plant=made.plant, out=path, filter=filter, guard=guard,
-            spread=made.spread, on_sample=judged, on_warning=on_warning, stop=request,
-            live_estimate=False,
+            rig, made.policy, plant=made.plant, out=path, overwrite=path.exists(),
+            filter=filter, guard=guard, spread=made.spread, on_sample=judged,
+            on_warning=on_warning, stop=request, live_estimate=False,
         )  # fmt: skip
     finally:
         monitor.close()
@@ -669,7 +684,12 @@ def _played(
 
 def _taken(made: Campaign, record: Record, reason: str, trip: Trip) -> Round:
     """The campaign after a round of a rig."""
-    return made.tell(record, reason, trip != Trip.NONE)
+    return made.tell(record, reason, trip in _UNSAFE)
+
+
+def _has_samples(path: Path) -> bool:
+    """Whether a record has more than its header and one sample."""
+    return path.is_file() and len(path.read_bytes().splitlines()) > 2
 
 
 @dataclass(frozen=True)
@@ -683,7 +703,7 @@ class _Folder:
     def opened(cls, root: Path, made: Campaign, asked: Mapping[str, object]) -> _Folder:
         """A new folder, or that of the same campaign; ValueError for anything else."""
         own = made.to_dict()
-        kept = ("plant_hash", "policy_hash", "targets", "spread", "most_rounds", "coast")
+        kept = ("plant_hash", "policy_hash", "spread", "coast")
         settings = {**{name: own[name] for name in kept}, **asked}
         file = root / "campaign.json"
         if file.is_file():
@@ -712,9 +732,9 @@ class _Folder:
         write_json(self.root / "campaign.json", {**about, **made.to_dict()})
 
     def resume(self, made: Campaign, on_round: Callable[[Round], None]) -> None:
-        """Takes the rounds that were played before."""
-        while made.ask() is not None and self.path(len(made.rounds)).exists():
-            record = read_record(self.path(len(made.rounds)), made.plant.description)
+        """Takes the rounds that were played before; one that was hardly begun is played again."""
+        while made.ask() is not None and _has_samples(path := self.path(len(made.rounds))):
+            record = read_record(path, made.plant.description)
             ended = record.metadata.get("ended") or {"reason": "interrupted", "trip": "none"}
             trip = Trip[str(ended["trip"]).upper()]
             on_round(_taken(made, record, str(ended["reason"]), trip))
