@@ -87,7 +87,7 @@ def test_every_shipped_study_loads(path):
     study = read_study(path)
     assert study.name == path.stem
     assert study.episodes >= (100 if study.agents else 1000)
-    own = {"paper": [], "robust": ["chirp", "ideal plant"]}
+    own = {"paper": [], "robust": ["chirp", "ideal plant"], "wide": ["chirp"]}
     assert list(study.methods)[:3] == own.get(path.stem, ["random", "prbs", "chirp"])
     assert set(study.reference) <= {*study.methods, *study.agents}
 

@@ -18,6 +18,7 @@ from excite.plant.catalogue import plant_named
 from excite.policy import read_policy, shipped_policies
 from excite.record import read_record
 from excite.simulation import run_episode
+from excite.study.falsify import trained_in
 from excite.study.table import study_table
 
 STUDY = """
@@ -204,9 +205,10 @@ def test_shipped_policies_are_listed_sound_and_safe():
         policy = read_policy(path)
         plant = plant_named(policy.plant.name)
         assert policy.plant.hash == plant.description.hash, name
+        spread, _, coast = trained_in(policy, plant)
         episodes = run_episodes(
-            plant, excitation_named(name, {}, plant), policy.layout.num_steps, 0.3,
-            jax.random.split(jax.random.key(77), 100),
+            plant, excitation_named(name, {}, plant), policy.layout.num_steps, spread,
+            jax.random.split(jax.random.key(77), 100), None, coast,
         )  # fmt: skip
         assert not jnp.any(episodes.is_violation), name
 

@@ -350,7 +350,7 @@ def violations_note(study: StudyFacts) -> str:
     else:
         where = "on its simulated rig" if study.rig else "in the plant's description"
         declared += f", all else as {where}"
-    coast = f" or in the {study.coast} samples after them" * bool(study.coast)
+    coast = f", also in the {study.coast} samples after their end" * bool(study.coast)
     note = (
         f"Violations: experiments that reached a critical level{coast}, on plants drawn at random "
         f"({declared}). They are sampled: 'excite falsify' searches for the worst plant."

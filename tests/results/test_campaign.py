@@ -1,0 +1,38 @@
+"""Committed results of campaigns are of the shipped policy, and the pages say what they are."""
+
+import json
+import re
+
+import pytest
+from experiments import ROOT
+
+from excite.policy import read_policy
+
+FOLDER = ROOT / "results" / "campaign"
+PAGE = (ROOT / "docs" / "explanation" / "results.md").read_text()
+
+
+@pytest.mark.parametrize("name", ["aero2", "aero2_noisy", "coverage"])
+def test_the_results_are_of_the_shipped_policy(name):
+    found = json.loads((FOLDER / f"{name}.json").read_text())
+    assert found["policy_hash"] == read_policy("aero2-wide").hash
+    assert found["plants"] >= 1000
+
+
+def test_the_page_says_how_many_samples_are_needed_and_that_no_level_was_reached():
+    found = json.loads((FOLDER / "aero2.json").read_text())
+    assert found["violations_of_whole_rounds"] == found["violations_after_whole_rounds"] == 0
+    for target, words in {"0.005": "0.5 %", "0.001": "0.1 %"}.items():
+        own, known = found["targets"][target], found["targets"][target]["samples_until_known"]
+        assert own["violations"] == 0
+        (line,) = (line for line in PAGE.splitlines() if line.startswith(f"| {words} |"))
+        cells = [cell.strip() for cell in line.split("|")[2:-1]]
+        shown = [f"{known[key]:.0f}" if known[key] else "–" for key in ("median", "90 %", "all")]
+        assert cells == [*shown, f"{own['missed']}/{found['plants']}"]
+
+
+def test_intervals_hold_where_a_round_ends_by_its_own_estimate():
+    found = json.loads((FOLDER / "coverage.json").read_text())
+    shown = [f"{value:.1f}" for value in found["coverage_percent"].values()]
+    assert re.search(rf"{shown[0]}, {shown[1]} and {shown[2]} %", PAGE)
+    assert all(93 <= value <= 97 for value in found["coverage_percent"].values())
