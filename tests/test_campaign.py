@@ -53,7 +53,7 @@ def test_a_target_is_a_share_of_the_estimate_or_a_number(given, half, is_relativ
     ("given", "words"),
     [
         ({}, "a campaign needs a target, such as D_p=1%"),
-        ({"D_q": "1%"}, "unknown parameter of 'aero2' 'D_q'; did you mean 'D_p'"),
+        ({"D_q": "1%"}, "unknown parameter 'D_q'; did you mean 'D_p'"),
         ({"D_p": "0%"}, "target of D_p must be a number above 0, or a percentage such as 1%"),
         ({"D_p": "-1%"}, "target of D_p must be a number above 0"),
         ({"D_p": "much"}, "got 'much'"),

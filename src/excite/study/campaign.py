@@ -40,7 +40,7 @@ from ..description import (
 from ..environment import run_episodes
 from ..environment.falsification import nearness
 from ..estimation import NLS
-from ..estimation.identify import identify
+from ..estimation.identify import RecordLike, identify
 from ..estimation.prior_knowledge import with_prior
 from ..estimation.result import Identification
 from ..excitation import PolicyExcitation
@@ -52,12 +52,12 @@ from ..plant.contract import with_nominal
 from ..policy import Policy, mismatch, read_policy
 from ..policy.file import shipped_policies
 from ..record import Record, read_record
-from ..report.numbers import number
+from ..report.numbers import digits_for, number
 from ..report.tables import html_table, text_table
 from ..rig.catalogue import RigOptions, rig_named
 from ..rig.contract import AbstractRig, Interval, Sample
 from ..rig.live_estimate import LiveEstimate
-from ..rig.loop import COMPLETE, Stop, interruptible
+from ..rig.loop import COMPLETE, interruptible
 from ..rig.session import RunResult, run
 from ..safety import Trip, critical_levels, safe_input
 from ..simulation import response
@@ -107,7 +107,7 @@ def targets_from(plant: PlantDescription, given: Mapping[str, str | float]) -> t
     found, names = [], names_of(plant.parameters)
     for name, value in by_name("target", given, "a dict by parameter").items():
         if name not in names:
-            raise unknown(f"parameter of {plant.name!r}", name, names)
+            raise unknown("parameter", name, names)
         is_relative = isinstance(value, str) and value.strip().endswith("%")
         text = value.strip().removesuffix("%") if isinstance(value, str) else value
         try:
@@ -249,11 +249,11 @@ class Campaign:
         """The policy to play in the next round, from rest; None once the campaign has ended."""
         return None if self.reason else self.policy
 
-    def tell(self, record: Record, ended: str = COMPLETE, unsafe: bool = False) -> Round:
+    def tell(self, record: RecordLike, ended: str = COMPLETE, unsafe: bool = False) -> Round:
         """Takes the record of a round, identifies, and decides whether another one follows.
 
         Args:
-            record: of the round, from rest.
+            record: of the round, from rest, or its file.
             ended: why the round ended.
             unsafe: whether it ended because a level was near, or no declared plant explains it.
 
@@ -263,6 +263,8 @@ class Campaign:
         if self.reason:
             raise ValueError(f"the campaign has ended: {self.reason}")
         d = self.plant.description
+        if not isinstance(record, Record):
+            record = read_record(path_from("record", record, "a record or a path"), d)
         if record.outputs.shape[1] != len(d.outputs) or record.inputs.shape[1] != len(d.inputs):
             raise ValueError(f"the record has other inputs or outputs than {d.name!r}")
         self.records.append(record)
@@ -375,7 +377,8 @@ class Campaign:
             value, half = known[p.name]
             reached = ("reached" if shares[p.name] <= 1 else "missed") if p.name in shares else ""
             relative = f"{number(100 * half / abs(value), 2)} %" if value else "–"
-            rows.append([p.name, f"{number(value)} {p.unit}".rstrip(), f"{half:.2g}", relative,
+            shown = f"{number(value, digits_for(value, half))} {p.unit}".rstrip()
+            rows.append([p.name, shown, f"{half:.2g}", relative,
                          _told(targets.get(p.name)), reached])  # fmt: skip
         return rows
 
@@ -634,21 +637,17 @@ def campaign(
              "guard": guard}  # fmt: skip
     folder = _Folder.opened(root, made, asked)
     folder.resume(made, on_round)
-    with interruptible() as stop:
-        while made.ask() is not None and not made.interrupted:
-            count = len(made.rounds)
-            progress(f"round {count + 1}", count, rounds)
-            if count and pause:
-                time.sleep(pause)
-            played = _played(
-                made, opened(count), folder.path(count), filter, guard, stop, on_warning
-            )
-            outcome = played.outcome
-            on_round(_taken(made, played.record, outcome.reason, outcome.trip))
-            folder.write(made)
-            if not made.reason:
-                is_whole = outcome.reason in (COMPLETE, REACHED)
-                made.interrupted = stop.reason if is_whole else outcome.reason
+    while made.ask() is not None and not made.interrupted:
+        count = len(made.rounds)
+        progress(f"round {count + 1}", count, rounds)
+        if count and pause:
+            time.sleep(pause)
+        played = _played(made, opened(count), folder.path(count), filter, guard, on_warning)
+        outcome = played.outcome
+        on_round(_taken(made, played.record, outcome.reason, outcome.trip))
+        folder.write(made)
+        if not made.reason and outcome.reason not in (COMPLETE, REACHED):
+            made.interrupted = outcome.reason
     progress("done", rounds, rounds)
     return made
 
@@ -659,26 +658,24 @@ def _played(
     path: Path,
     filter: bool,
     guard: bool,
-    stop: Stop,
     on_warning: Callable[[str], None],
 ) -> RunResult:
     """One round on a rig, which ends as soon as enough is known."""
-    monitor, request = made.monitor(waits=not rig.is_real_time), Stop()
+    monitor = made.monitor(waits=not rig.is_real_time)
+    with interruptible() as stop:
 
-    def judged(sample: Sample) -> None:
-        if stop.reason:
-            request.ask(stop.reason)
-        elif monitor(sample):
-            request.ask(REACHED)
+        def judge(sample: Sample) -> None:
+            if monitor(sample):
+                stop.ask(REACHED)
 
-    try:
-        played = run(
-            rig, made.policy, plant=made.plant, out=path, overwrite=path.exists(),
-            filter=filter, guard=guard, spread=made.spread, on_sample=judged,
-            on_warning=on_warning, stop=request, live_estimate=False,
-        )  # fmt: skip
-    finally:
-        monitor.close()
+        try:
+            played = run(
+                rig, made.policy, plant=made.plant, out=path, overwrite=path.exists(),
+                filter=filter, guard=guard, spread=made.spread, on_sample=judge,
+                on_warning=on_warning, stop=stop, live_estimate=False,
+            )  # fmt: skip
+        finally:
+            monitor.close()
     return cast("RunResult", played)  # without dry_run
 
 
