@@ -187,7 +187,10 @@ def test_a_policy_file_is_scored_with_the_row_of_a_study(folder):
         (("design", "aero3", "--out", "x.csv"), "unknown plant 'aero3'; did you mean 'aero2'"),
         (("design", "aero2", "--out", "x.txt"), "x.txt"),
         (("design", "aero2", "--kind", "chrip", "--out", "x.csv"), "did you mean 'chirp'"),
-        (("design", "aero2", "--spread", 1, "--out", "x.csv"), "1.0 is not in the range 0<=x<1"),
+        (
+            ("design", "aero2", "--spread", 1, "--out", "x.csv"),
+            "'1' is not allowed: it must lie in [0, 1), or be a factor",
+        ),
     ],
 )
 def test_what_is_not_allowed_is_a_sentence(arguments, words, tmp_path):

@@ -597,7 +597,7 @@ def campaign(
         'every target is reached'
 
     Args:
-        plant, target, policy, spread, rounds, coast: as for `Campaign`.
+        plant: as for `Campaign`, and so are `target`, `policy`, `spread`, `rounds` and `coast`.
         rig: a name, `FILE.fmu`, `FILE.json`, `path/to/file.py:ClassName` or a rig, as for `run`.
         out: folder of the campaign.
         address: board identifier of the Quanser rig.
