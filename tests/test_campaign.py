@@ -112,9 +112,9 @@ def test_all_rounds_are_identified_together(asked):
         assert low < TRUE[name] < high
     assert asked.num_samples == 120
     assert asked.ask() is None
-    assert asked.reason == "2 rounds are played"
+    assert asked.reason == "all rounds are played"
     assert asked.rounds[0].decision.startswith("go on: D_p is")
-    with pytest.raises(ValueError, match="the campaign has ended: 2 rounds are played"):
+    with pytest.raises(ValueError, match="the campaign has ended: all rounds are played"):
         asked.tell(records[0])
 
 
@@ -134,7 +134,7 @@ def test_knowledge_after_every_sample_is_the_cramer_rao_bound(asked):
 
 def test_the_table_says_what_was_asked_and_reached(asked):
     text = repr(asked)
-    assert "aero2: 2 rounds are played (120 samples in 2 rounds)" in text
+    assert "aero2: all rounds are played (120 samples in 2 rounds)" in text
     assert max(map(len, text.splitlines())) <= 80
     (row,) = (row for row in asked.rows() if row[0] == "D_p")
     assert row[-2:] == ["0.001 %", "missed"]
@@ -162,8 +162,28 @@ def test_a_record_that_tells_nothing_is_a_round_without_an_estimate():
     )
     told = campaign.tell(short)
     assert told.known == {}
-    assert told.decision == "go on: there is no estimate yet"
+    assert told.decision.startswith("go on: there is no estimate yet (")
     assert campaign.ask() is not None
+    with pytest.raises(ValueError, match="needs at least two samples: got one"):
+        campaign.tell(
+            dataclasses.replace(
+                record, time=record.time[:1], inputs=record.inputs[:1], outputs=record.outputs[:1]
+            )
+        )
+    assert campaign.tell(record).known  # the short one before spoils nothing
+
+
+def test_a_round_that_was_interrupted_does_not_count_in_the_budget():
+    campaign = ex.Campaign("aero2", {"D_p": "0.001%"}, policy=steady(), rounds=1)
+    record = ex.simulate("aero2", steady(), params=TRUE, seed=1)
+    campaign.tell(record, "interrupted by SIGINT")
+    assert campaign.ask() is not None
+    campaign.tell(record)
+    assert campaign.reason == "all rounds are played"
+
+
+def test_a_share_of_nothing_is_infinite():
+    assert targets_from(Aero2().description, {"D_p": "1%"})[0].share(0.0, 1e-3) == math.inf
 
 
 # ------------------------------------------------------------------------- what is expected
@@ -257,7 +277,7 @@ def test_every_round_has_its_own_noise_and_the_same_plant(played):
         == (second.metadata["ended"]["rig"]["true_params"])
     )
     assert not np.array_equal(first.outputs, second.outputs)
-    assert made.reason == "2 rounds are played"
+    assert made.reason == "all rounds are played"
     saved = json.loads((folder / "campaign.json").read_text())
     assert saved["num_samples"] == made.num_samples
     assert len(saved["rounds"]) == 2

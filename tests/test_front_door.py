@@ -150,6 +150,7 @@ MISTAKES = {
     "ex.Campaign('aero2', {'D_p': '1%'}, spread='3')": "such as factor:3: got '3'",
     "ex.Campaign('aero2', {'D_p': '1%'}, rounds=2.5)": "rounds must be a whole number from 1",
     "ex.Campaign('aero2', {'D_p': '1%'}).tell(3)": "record must be a record or a path: got int 3",
+    "ex.campaign('aero2', {'D_p': '1%'}, 3, out='x')": "rig must be a name, a file, path",
     "ex.campaign('aero2', {'D_p': '1%'}, out=3)": "out must be a path: got int 3",
     "ex.campaign('aero2', {'D_p': '1%'}, out='x', pause='5')": "pause must be a number: got str",
     "ex.campaign('aero2', {'D_p': '1%'}, out='x', pause=-1)": "pause must be a number of seconds",

@@ -101,12 +101,10 @@ def campaign(
     A round plays the policy from rest and ends as soon as enough is known. Exit code 1 where
     the campaign ends without every target.
     """
-    from ..files import require_new_file
     from ..study.campaign import REACHED
     from ..study.campaign import campaign as campaigned
+    from .run import EXIT_CODES
 
-    if plot is not None:
-        require_new_file(plot, overwrite=False)
     with progress_bar(f"campaign on {plant}") as progress:
         made = campaigned(
             plant,
@@ -126,6 +124,6 @@ def campaign(
         from ..record.figure import save
 
         save(made.plot(), plot)
-    is_interrupted = made.interrupted == "interrupted by SIGINT"
-    code = 130 if is_interrupted else 0 if made.reason == REACHED else 1
+    failed = 1 if made.interrupted or made.reason != REACHED else 0
+    code = EXIT_CODES.get(made.interrupted, failed)
     click.get_current_context().exit(code)

@@ -28,7 +28,7 @@ from .options import (
 if TYPE_CHECKING:
     from ..rig.session import RunResult
 
-_EXIT_CODES = {
+EXIT_CODES = {
     "interrupted by SIGINT": 130,
     "interrupted": 130,  # by a second Ctrl-C, where the rig hangs
     "interrupted by SIGTERM": 143,
@@ -146,7 +146,7 @@ def _run_and_show(as_json: bool, **options: Any) -> int:
         _show(result)
     if isinstance(result, DryRun) or result.outcome.is_complete:
         return 0
-    return _EXIT_CODES.get(result.outcome.reason, 1)
+    return EXIT_CODES.get(result.outcome.reason, 1)
 
 
 def _prepare() -> None:

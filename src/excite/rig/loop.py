@@ -108,11 +108,13 @@ class Stop:
         reason: one sentence; empty without a request.
         has_begun: whether the experiment has begun; before, signals act as usual.
         is_ending: whether it ends already; a request then changes nothing.
+        asked: all requests, also those that changed nothing.
     """
 
     def __init__(self, has_begun: bool = True) -> None:
         """No request."""
         self.reason, self.has_begun, self.is_ending = "", has_begun, False
+        self.asked: list[str] = []
         self._since = 0.0
 
     def ask(self, reason: str) -> None:
@@ -122,6 +124,7 @@ class Stop:
             KeyboardInterrupt: where rig or player did not react to a request for two seconds.
         """
         now = time.perf_counter()
+        self.asked.append(reason)
         if not self.reason:
             self.reason, self._since = reason, now
         elif not self.is_ending and now - self._since > _PATIENCE:

@@ -8,6 +8,7 @@ nothing of the plant but the spread that it was trained for.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import textwrap
 import time
@@ -36,6 +37,7 @@ from ..description import (
     path_from,
     require_whole,
     unknown,
+    wrong_type,
 )
 from ..environment import run_episodes
 from ..environment.falsification import nearness
@@ -69,7 +71,9 @@ if TYPE_CHECKING:
 
 REACHED = "every target is reached"
 
+_OWN = {"campaign.json", ".lock"}  # files of a campaign without rounds
 _UNSAFE = (Trip.LEVEL, Trip.PREDICTED_LEVEL, Trip.UNEXPLAINED)  # others interrupt a campaign
+_WHOLE = (COMPLETE, REACHED)  # ends of rounds that count in the budget
 _FIRST = 8  # samples before the first running estimate of a round
 _COAST = 100  # samples of free motion that must be safe, where the policy's training had none
 _SAFE = 0.97  # of the critical level: largest output allowed in the predicted free motion
@@ -92,7 +96,9 @@ class Target:
 
     def share(self, value: Any, half: Any) -> Any:
         """Half of an interval over that allowed; the target is reached at one."""
-        return half / (self.half * abs(value) if self.is_relative else self.half)
+        allowed = self.half * np.abs(value) if self.is_relative else self.half
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.divide(half, allowed)  # infinite for a share of nothing
 
     def __str__(self) -> str:
         return f"{100 * self.half:g} %" if self.is_relative else f"{self.half:g}"
@@ -267,6 +273,8 @@ class Campaign:
             record = read_record(path_from("record", record, "a record or a path"), d)
         if record.outputs.shape[1] != len(d.outputs) or record.inputs.shape[1] != len(d.inputs):
             raise ValueError(f"the record has other inputs or outputs than {d.name!r}")
+        if len(record.time) < 2:
+            raise ValueError("the record of a round needs at least two samples: got one")
         self.records.append(record)
         count, status = len(record.time) - 1, "too few samples for an estimate"
         try:
@@ -283,9 +291,10 @@ class Campaign:
             self.reason = f"unsafe: {ended if unsafe else 'a critical level was reached'}"
         elif shares and max(shares.values()) <= 1:
             self.reason = REACHED
-        elif len(self.records) >= self.most_rounds:
-            self.reason = f"{self.most_rounds} rounds are played"
-        decision = f"end: {self.reason}" if self.reason else f"go on: {_missing(shares)}"
+        elif sum(e in _WHOLE for e in [*(r.ended for r in self.rounds), ended]) >= self.most_rounds:
+            self.reason = "all rounds are played"
+        missing = _missing(shares) if shares else f"there is no estimate yet ({status})"
+        decision = f"end: {self.reason}" if self.reason else f"go on: {missing}"
         told = Round(count, ended, near, known, status, decision)
         self.rounds.append(told)
         return told
@@ -536,9 +545,9 @@ def known_of(result: Identification) -> dict[str, Interval]:
 
 def _missing(shares: Mapping[str, float]) -> str:
     """The target that is farthest from being reached."""
-    if not shares:
-        return "there is no estimate yet"
     name, share = max(shares.items(), key=lambda item: item[1])
+    if not share < float("inf"):
+        return f"{name} is not identifiable yet"
     return f"{name} is {share:.2g} times as uncertain as asked"
 
 
@@ -624,12 +633,18 @@ def campaign(
 
     def opened(count: int) -> AbstractRig:
         """The rig for a round, after so many others."""
-        if not isinstance(rig, str):
+        if isinstance(rig, AbstractRig):
             return rig
+        if not isinstance(rig, str):
+            raise wrong_type("rig", rig, "a name, a file, path/to/file.py:ClassName or a rig")
         options = RigOptions(address, fast, seed, made.spread, fault or {}, experiment=count)
         return rig_named(rig, made.plant, made.plant.description, options)
 
-    opened(0)  # refuses a rig that cannot be used, before the prediction
+    if not opened(0).starts_at_rest:
+        raise ValueError(
+            "every round of a campaign begins at rest, and this rig does not say that it does "
+            "(starts_at_rest)"
+        )
     progress("predicting what can be reached", 0, rounds)
     made.require_reachable()
     name = rig if isinstance(rig, str) else type(rig).__name__
@@ -642,12 +657,16 @@ def campaign(
         progress(f"round {count + 1}", count, rounds)
         if count and pause:
             time.sleep(pause)
-        played = _played(made, opened(count), folder.path(count), filter, guard, on_warning)
+        path = folder.path(count)
+        played, signals = _played(made, opened(count), path, filter, guard, on_warning)
         outcome = played.outcome
-        on_round(_taken(made, played.record, outcome.reason, outcome.trip))
-        folder.write(made)
-        if not made.reason and outcome.reason not in (COMPLETE, REACHED):
+        if _has_samples(path):
+            on_round(_taken(made, played.record, outcome.reason, outcome.trip))
+            folder.write(made)
+        if outcome.error is not None or (outcome.reason not in _WHOLE and not made.reason):
             made.interrupted = outcome.reason
+        elif signals and not made.reason:
+            made.interrupted = signals[0]
     progress("done", rounds, rounds)
     return made
 
@@ -659,8 +678,8 @@ def _played(
     filter: bool,
     guard: bool,
     on_warning: Callable[[str], None],
-) -> RunResult:
-    """One round on a rig, which ends as soon as enough is known."""
+) -> tuple[RunResult, list[str]]:
+    """One round on a rig, which ends as soon as enough is known, and signals that came."""
     monitor = made.monitor(waits=not rig.is_real_time)
     with interruptible() as stop:
 
@@ -675,8 +694,10 @@ def _played(
                 on_warning=on_warning, stop=stop, live_estimate=False,
             )  # fmt: skip
         finally:
-            monitor.close()
-    return cast("RunResult", played)  # without dry_run
+            with contextlib.suppress(Exception):  # the record is complete
+                monitor.close()
+    signals = [reason for reason in stop.asked if reason != REACHED]
+    return cast("RunResult", played), signals  # without dry_run
 
 
 def _taken(made: Campaign, record: Record, reason: str, trip: Trip) -> Round:
@@ -703,7 +724,7 @@ class _Folder:
         kept = ("plant_hash", "policy_hash", "spread", "coast")
         settings = {**{name: own[name] for name in kept}, **asked}
         file = root / "campaign.json"
-        if file.is_file():
+        if file.is_file() and (root / "round-01.csv").exists():
             before = read_json(file, "settings", "rounds")["settings"]
             other = [name for name, value in settings.items() if before.get(name) != value]
             if other:
@@ -711,11 +732,11 @@ class _Folder:
                     f"{root} is another campaign, with {other[0]} {before.get(other[0])!r} and not "
                     f"{settings[other[0]]!r}: choose another folder"
                 )
-        elif root.exists() and (not root.is_dir() or any(root.iterdir())):
+        elif root.exists() and not (root.is_dir() and {p.name for p in root.iterdir()} <= _OWN):
             raise ValueError(f"{root} exists and is no campaign: choose another folder")
         root.mkdir(parents=True, exist_ok=True)
         folder = cls(root, settings)
-        if not file.is_file():
+        if not (root / "round-01.csv").exists():
             folder.write(made)
         return folder
 
