@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from .options import (
+    COAST,
     NUMBERS,
     OUT_FILE,
     SEED,
@@ -65,7 +66,7 @@ _TARGETS = Assignments(str, "a percentage such as 1% or a number")
 @click.option("--rounds", type=WholeNumber(1, 1000), default=10, show_default=True, help="At most.")
 @click.option(
     "--coast",
-    type=WholeNumber(0, 100_000),
+    type=COAST,
     metavar="N",
     help="Samples after a round's end in which the plant must be safe; default that of the "
     "policy's training, or 100.",

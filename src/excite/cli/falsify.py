@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from .options import (
+    COAST,
     NUMBERS,
     OUT_FILE,
     SEED,
@@ -44,7 +45,7 @@ from .options import (
 @uncertainty_option("What else may differ; default that of the policy's training.")
 @click.option(
     "--coast",
-    type=WholeNumber(0, 100_000),
+    type=COAST,
     metavar="N",
     help="Samples after the end that are searched too; default that of the training, or 0.",
 )

@@ -151,9 +151,10 @@ def _option_value(text: str) -> bool | float | list[object]:
     return value
 
 
+COAST = WholeNumber(0, 100_000)
 coast_option = click.option(
     "--coast",
-    type=WholeNumber(0, 100_000),
+    type=COAST,
     default=0,
     show_default=True,
     metavar="N",

@@ -27,7 +27,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from jaxtyping import Array, Float, PyTree
 
-from ..description import Spread, SpreadLike, names_of
+from ..description import SpreadLike, names_of
 from ..plant import EMPS, AbstractPlant, Aero2, CartPole, DCMotor
 from ..policy import Layout
 from .objective import AbstractObjective
@@ -65,7 +65,6 @@ def _process(
             "JAX does not support fork: spawn the processes, as with vector_kwargs="
             '{"context": "spawn"}, or step all environments as one batch, make_vec\'s default'
         )
-    Spread.of(choices.get("spread", 0.3))
     penalty_weight = choices.get("penalty_weight", 1.0)
     if not 0 <= penalty_weight < math.inf:
         raise ValueError(f"penalty_weight must lie in [0, inf): got {penalty_weight}")

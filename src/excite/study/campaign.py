@@ -283,8 +283,8 @@ class Campaign:
             self.result = result if result.is_usable else self.result
         except ValueError as error:  # this record tells nothing; another one may
             status = str(error)
-        levels = np.array([x if np.isfinite(x) else np.inf for x in critical_levels(d)])
-        near = float(np.nanmax(np.abs(record.outputs) / levels[None], initial=0.0))
+        sizes = np.abs(record.outputs) / critical_levels(d)[None]
+        near = float(np.nanmax(sizes, initial=0.0))
         known = {} if self.result is None else known_of(self.result)
         shares = self.shares(known)
         if unsafe or near >= 1:
@@ -470,7 +470,7 @@ class Monitor:
             estimator = dataclasses.replace(estimator, prior=prior)
             plant = with_nominal(plant, dict(before.params))
         steps = campaign.policy.layout.num_steps
-        self._campaign, self._steps = campaign, steps
+        self._campaign = campaign
         self._live = LiveEstimate(plant, steps, True, estimator, first=_FIRST, waits=waits)
         self._inputs = np.tile(safe_input(plant.definition), (steps + campaign.coast, 1))
         self._after(plant.nominal)  # compiles, before the first sample

@@ -104,8 +104,13 @@ def train(
         "decision": {n: v for n, v in decision.items() if v not in (None, [], {})},
         "training": by_name("training", training),
     }
-    settings = {"episodes": episodes, "num_steps": steps, "spread": spread, "seeds": seeds}
-    settings["coast"] = coast
+    settings = {
+        "episodes": episodes,
+        "num_steps": steps,
+        "spread": spread,
+        "coast": coast,
+        "seeds": seeds,
+    }
     agents = {f"{method}({', '.join(rewards)})": agent}
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) if out is None else path_from("out", out)
