@@ -18,7 +18,8 @@ from excite.plant import Aero2, draw_params
 from excite.policy import Layout
 from excite.rig.contract import Interval, Sample
 from excite.simulation import response, run_episode
-from excite.study.campaign import REACHED, targets_from
+from excite.study.campaign import REACHED
+from excite.study.targets import targets_from
 
 TRUE = {"J_p": 0.025, "K_pu": 0.0110, "D_p": 0.0011}
 EASY = {"J_p": "5%", "K_pu": "10%"}
@@ -52,7 +53,7 @@ def test_a_target_is_a_share_of_the_estimate_or_a_number(given, half, is_relativ
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        ({}, "a campaign needs a target, such as D_p=1%"),
+        ({}, "a target is needed, such as D_p=1%"),
         ({"D_q": "1%"}, "unknown parameter 'D_q'; did you mean 'D_p'"),
         ({"D_p": "0%"}, "target of D_p must be a number above 0, or a percentage such as 1%"),
         ({"D_p": "-1%"}, "target of D_p must be a number above 0"),
@@ -95,7 +96,7 @@ def test_a_plant_without_a_shipped_policy_needs_one():
 @pytest.fixture(scope="module")
 def asked() -> ex.Campaign:
     """A campaign of two rounds, with what `identify` makes of both."""
-    campaign = ex.Campaign("aero2", {"D_p": "0.001%"}, policy=steady(), rounds=2)
+    campaign = ex.Campaign("aero2", {"D_p": "0.001%"}, policy=steady(), rounds=2, redesign=False)
     for seed in (1, 2):
         policy = campaign.ask()
         campaign.tell(ex.simulate("aero2", policy, params=TRUE, seed=seed))
@@ -174,7 +175,7 @@ def test_a_record_that_tells_nothing_is_a_round_without_an_estimate():
 
 
 def test_a_round_that_was_interrupted_does_not_count_in_the_budget():
-    campaign = ex.Campaign("aero2", {"D_p": "0.001%"}, policy=steady(), rounds=1)
+    campaign = ex.Campaign("aero2", {"D_p": "0.001%"}, policy=steady(), rounds=1, redesign=False)
     record = ex.simulate("aero2", steady(), params=TRUE, seed=1)
     campaign.tell(record, "interrupted by SIGINT")
     assert campaign.ask() is not None
@@ -234,7 +235,7 @@ def test_a_round_ends_only_where_the_free_motion_after_it_is_safe(monkeypatch):
         traces += 1
         return usual(*args)
 
-    monkeypatch.setattr("excite.study.campaign.response", counted)
+    monkeypatch.setattr("excite.study.monitor.response", counted)
     jax.clear_caches()
     monitor = campaign.monitor(waits=True)
     plant, fast = Aero2(), jnp.full((15, 1), 24.0)

@@ -36,7 +36,8 @@ _PLACES = {
     "run_study": "study.run",
     "report": "report.html",
     "run": "rig.session",
-    "campaign": "study.campaign",
+    "next_experiment": "study.next_experiment",
+    "campaign": "study.campaign_on_rig",
     # nouns
     "Record": "record.record",
     "read_record": "record.read",
@@ -132,10 +133,11 @@ if TYPE_CHECKING:
     from .rig.session import run as run
     from .simulation import simulate as simulate
     from .study.campaign import Campaign as Campaign
-    from .study.campaign import campaign as campaign
+    from .study.campaign_on_rig import campaign as campaign
     from .study.catalogue import studies as studies
     from .study.evaluate import evaluate as evaluate
     from .study.falsify import falsify as falsify
+    from .study.next_experiment import next_experiment as next_experiment
     from .study.run import run_study as run_study
     from .study.spec import Study as Study
     from .study.spec import read_study as read_study

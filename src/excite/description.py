@@ -467,7 +467,7 @@ def by_name(
     what: str, given: Mapping[str, _T] | None, allowed: str = "a dict by name"
 ) -> dict[str, _T]:
     """A copy of values by name, empty for None; TypeError for anything else."""
-    if not isinstance(given, Mapping | None):
+    if not isinstance(given, Mapping | None) or not all(isinstance(n, str) for n in given or {}):
         raise wrong_type(what, given, allowed)
     return dict(given or {})
 

@@ -228,6 +228,22 @@ def took_lock(file: IO[Any]) -> bool:
     return True
 
 
+@contextlib.contextmanager
+def locked_folder(folder: Path, what: str) -> Iterator[None]:
+    """The folder, created if missing, for one process at a time; ValueError otherwise."""
+    if folder.is_file():
+        raise ValueError(f"{folder} exists and is no run folder; choose another name")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = (folder / ".lock").open("w")
+    except OSError as error:
+        raise ValueError(f"{folder}: cannot be written ({error.strerror})") from None
+    with lock:
+        if not took_lock(lock):
+            raise ValueError(f"{folder}: another process is working on {what}")
+        yield
+
+
 def class_at(path: Path, word: str, base: type, kind: str) -> Any:
     """A class derived from `base` in a user's file. Importing the file runs its code.
 

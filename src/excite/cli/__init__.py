@@ -26,6 +26,7 @@ from .export import export
 from .falsify import falsify
 from .identify import identify
 from .information import information
+from .next import next_experiment
 from .options import RememberingGroup, RunFailedError, show_warning
 from .plants import plants
 from .policies import evaluate, policies
@@ -48,6 +49,7 @@ _SECTIONS: dict[str, dict[click.Command, str]] = {
         policies: "excite policies",
     },
     "Design and train": {
+        next_experiment: "excite next record.csv --target D_p=1% --steps 200 --out next.csv",
         design: "excite design aero2 --out signal.csv",
         train: "excite train aero2 --out runs/first",
         evaluate: "excite evaluate aero2 --episodes 100",

@@ -7,13 +7,13 @@ from typing import Any
 
 import click
 
+from .next import TARGETS
 from .options import (
     COAST,
     NUMBERS,
     OUT_FILE,
     SEED,
     SPREAD,
-    Assignments,
     Number,
     WholeNumber,
     computing,
@@ -24,15 +24,13 @@ from .options import (
     show_json,
 )
 
-_TARGETS = Assignments(str, "a percentage such as 1% or a number")
-
 
 @click.command()
 @click.argument("plant")
 @click.option(
     "--target",
     "targets",
-    type=_TARGETS,
+    type=TARGETS,
     multiple=True,
     required=True,
     help="Half of the 95 % interval to be reached, such as D_p=1%,J_p=0.5%, or a number in the "
@@ -71,7 +69,19 @@ _TARGETS = Assignments(str, "a percentage such as 1% or a number")
     help="Samples after a round's end in which the plant must be safe; default that of the "
     "policy's training, or 100.",
 )
-@click.option("--pause", type=Number(0), default=0.0, help="Before the next round [s].")
+@click.option(
+    "--redesign/--no-redesign",
+    default=True,
+    help="Play signals redesigned for what is known, after the first round, where they need fewer "
+    "samples than the policy; not with --guard.",
+)
+@click.option(
+    "--pause",
+    type=Number(0),
+    default=0.0,
+    metavar="SECONDS",
+    help="Wait before every round but the first, so that the plant comes to rest.",
+)
 @click.option("--filter", is_flag=True, help="Predictive safety filter for this spread.")
 @click.option("--guard", is_flag=True, help="Brake where no declared plant explains a round.")
 @click.option("--address", default="0", show_default=True, help="Board of the Quanser rig.")
@@ -103,7 +113,7 @@ def campaign(
     the campaign ends without every target.
     """
     from ..study.campaign import REACHED
-    from ..study.campaign import campaign as campaigned
+    from ..study.campaign_on_rig import campaign as campaigned
     from .run import EXIT_CODES
 
     with progress_bar(f"campaign on {plant}") as progress:

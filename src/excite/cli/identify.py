@@ -123,7 +123,7 @@ def arguments_of(options: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _priors(words: Sequence[str]) -> list[dict[str, str] | Path] | None:
+def given_priors(words: Sequence[str]) -> list[dict[str, str] | Path] | None:
     """Priors by parameter, and paths of others."""
     found = [
         NAMES.convert(w, None, None) if "=" in w and not Path(w).exists() else Path(w)
@@ -244,7 +244,7 @@ def identify(
             options["plant"],
             options["estimator"],
             **{name: merged(options[name]) for name in ("start", "hold", "uncertain")},
-            prior=_priors(options["prior"]),
+            prior=given_priors(options["prior"]),
             likelihood=options["likelihood"],
             intervals=options["intervals"],
             progress=progress,

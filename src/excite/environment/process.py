@@ -195,12 +195,16 @@ class Env(eqx.Module):
         return new, output, jnp.where(is_finite, gain, 0.0)
 
     def coasting(self, state: EnvState) -> Float[Array, "sample output"]:
-        """True outputs after the experiment, under the input that ends it."""
+        """True outputs after the experiment, under the input that ends it.
+
+        They stay as they are from where the simulation diverges.
+        """
         plant = self.plant.changed(**state.constants._asdict())
         rest = jnp.asarray(safe_input(plant.definition))
 
         def advance(own: Array, _: None) -> tuple[Array, Array]:
-            own = step(plant, own, rest, state.params)
+            after = step(plant, own, rest, state.params)
+            own = jnp.where(jnp.all(jnp.isfinite(after)), after, own)
             return own, plant.true_output(own, state.params)
 
         return jax.lax.scan(advance, state.plant_state, None, length=self.coast)[1]

@@ -110,6 +110,40 @@ def knowledge_figure(
     return figure
 
 
+def candidates_figure(
+    description: PlantDescription,
+    time: Float[np.ndarray, " sample"],
+    names: Sequence[str],
+    inputs: Sequence[Float[np.ndarray, "sample input"]],
+    shares: Sequence[Mapping[str, Float[np.ndarray, " sample"]]],
+) -> matplotlib.figure.Figure:
+    """Inputs of experiments that could be made next, and what would be known after each sample.
+
+    Args:
+        description: of the plant.
+        time: of the samples [s].
+        names: of the candidates, a column each.
+        inputs: of each candidate.
+        shares: of each candidate, the 95 % interval over that asked for, by parameter.
+    """
+    figure, axes = new_figure(1 + len(description.inputs), len(names), sharey="row")
+    for column, (name, own, known) in enumerate(zip(names, inputs, shares, strict=True)):
+        for row, part in enumerate(description.inputs):
+            axis = axes[row, column]
+            axis.step(time[: len(own)], own[:, row], where="post", color=colour_of(0), lw=1.0)
+            axis.set(ylabel=f"{part.name} [{part.unit}]" if column == 0 else "")
+        axes[0, column].set(title=name)
+        axis = axes[-1, column]
+        for i, (parameter, share) in enumerate(known.items()):
+            shown = np.where(np.isfinite(share), share, np.nan)
+            axis.plot(time[: len(share)], shown, color=colour_of(i), lw=1.4, label=parameter)
+        axis.axhline(1, color="black", lw=0.8, ls="--", label="asked for")
+        axis.set(yscale="log", xlabel="time [s]")
+    axes[-1, 0].set(ylabel="95 % interval over the target")
+    add_legend(figure, axes[-1, 0])
+    return figure
+
+
 def autocorrelation_figure(
     description: PlantDescription, residuals: Sequence[Float[np.ndarray, "sample output"]]
 ) -> matplotlib.figure.Figure:

@@ -26,9 +26,9 @@ from ..description import path_from, require_whole
 from ..files import (
     csv_text,
     json_ready,
+    locked_folder,
     new_run_folder,
     require_free_run_folder,
-    took_lock,
     write_bytes,
     write_json,
 )
@@ -261,7 +261,7 @@ def opened(
     is_begun = folder.is_dir() and bool({p.name for p in folder.iterdir()} - {*markers, ".lock"})
     if is_begun and not any((folder / name).is_file() for name in markers):
         raise ValueError(f"{folder} exists and is no run folder; choose another name")
-    with _locked(folder):
+    with locked_folder(folder, "this study"):
         plant, text = study.build_plant(), _plant_text(study)
         marker = {**_marker(study, plant, text), "command": command}
         if overwrite:
@@ -287,22 +287,6 @@ def _clear(folder: Path) -> None:
             shutil.rmtree(path)
         elif path.name != ".lock":
             path.unlink()
-
-
-@contextlib.contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """The folder, created if missing, for one process at a time."""
-    if folder.is_file():
-        raise ValueError(f"{folder} exists and is no run folder; choose another name")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        lock = (folder / ".lock").open("w")
-    except OSError as error:
-        raise ValueError(f"{folder}: cannot be written ({error.strerror})") from None
-    with lock:
-        if not took_lock(lock):
-            raise ValueError(f"{folder}: another process is working on this study")
-        yield
 
 
 def _checkpoint_seconds() -> float:

@@ -128,7 +128,7 @@ class Optimisation(eqx.Module):
     @classmethod
     def start(cls, player: PyTree, settings: GradientSettings, env: Env) -> Optimisation:
         """Before the first update."""
-        adam = _optimiser(settings).init(eqx.filter(player, eqx.is_array))
+        adam = optimiser(settings).init(eqx.filter(player, eqx.is_array))
         weight, count = jnp.asarray(settings.penalty_weight, float), settings.num_adversaries
         if (box := env.uncertainty) is None:
             return cls(player, adam, weight)
@@ -175,7 +175,7 @@ def update(
 
     (cost, (batch, nearest)), gradient = eqx.filter_value_and_grad(loss, has_aux=True)(now.player)
     gradient = jax.tree.map(lambda leaf: jnp.where(jnp.isfinite(cost), leaf, jnp.nan), gradient)
-    step, adam = _optimiser(settings).update(gradient, now.adam)
+    step, adam = optimiser(settings).update(gradient, now.adam)
     is_near = jnp.mean(nearest >= settings.near) > settings.violation_rate
     change = jnp.where(is_near, settings.penalty_growth, -settings.penalty_decay)
     player = eqx.apply_updates(now.player, step)
@@ -405,7 +405,7 @@ def rank(settings: GradientSettings, row: Mapping[str, float]) -> tuple[float, f
     return (-too_many - too_near if row["steps"] else -math.inf, worth)
 
 
-def _optimiser(settings: GradientSettings) -> optax.GradientTransformation:
+def optimiser(settings: GradientSettings) -> optax.GradientTransformation:
     """Adam on clipped gradients; a gradient that is not finite is left out and counted."""
     rate = optax.cosine_decay_schedule(settings.learning_rate, settings.num_updates)
     adam = optax.chain(optax.clip_by_global_norm(settings.max_grad_norm), optax.adam(rate))

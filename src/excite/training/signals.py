@@ -267,13 +267,18 @@ def _first_signals(env: Env, keys: Key[Array, " search"]) -> OpenLoop:
     usual = np.array([i.amplitude for i in plant.definition.inputs]) / env.layout.input_half
 
     def one(key: PRNGKeyArray) -> Float[Array, "time input"]:
-        smooth = Multisine().shape(plant, steps, key)
-        noise = jax.random.normal(key, smooth.shape)
-        spectrum = jnp.abs(jnp.fft.rfft(smooth, axis=0)) * jnp.exp(
-            2j * math.pi * jax.random.uniform(key, (steps // 2 + 1, smooth.shape[1]))
-        )
-        drawn = jnp.fft.irfft(spectrum, steps, axis=0)
-        unit = drawn / jnp.maximum(jnp.max(jnp.abs(drawn), axis=0), 1e-12)[None]
-        return 0.2 * jnp.asarray(usual)[None] * (unit + 0.01 * noise)
+        noise = jax.random.normal(key, (steps, len(usual)))
+        return 0.2 * jnp.asarray(usual)[None] * (random_sines(plant, steps, key) + 0.01 * noise)
 
     return OpenLoop(jax.vmap(one)(keys))
+
+
+def random_sines(
+    plant: AbstractPlant, num_steps: int, key: PRNGKeyArray
+) -> Float[Array, "time input"]:
+    """A sum of sines in the plant's band, with random phases; its peak is one."""
+    smooth = Multisine().shape(plant, num_steps, key)
+    phases = jax.random.uniform(key, (num_steps // 2 + 1, smooth.shape[1]))
+    spectrum = jnp.abs(jnp.fft.rfft(smooth, axis=0)) * jnp.exp(2j * math.pi * phases)
+    drawn = jnp.fft.irfft(spectrum, num_steps, axis=0)
+    return drawn / jnp.maximum(jnp.max(jnp.abs(drawn), axis=0), 1e-12)[None]

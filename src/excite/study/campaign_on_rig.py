@@ -1,0 +1,254 @@
+"""A campaign on a rig: its rounds are played, recorded in a folder, and resumed from there."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, cast
+
+from .. import __version__
+from ..description import (
+    LARGEST_SEED,
+    SpreadLike,
+    as_number,
+    by_name,
+    path_from,
+    require_whole,
+    wrong_type,
+)
+from ..excitation import Replay
+from ..files import locked_folder, read_json, write_json
+from ..plant.catalogue import PlantLike
+from ..policy import Policy
+from ..record import Record, read_record
+from ..rig.catalogue import RigOptions, rig_named
+from ..rig.contract import AbstractRig, Sample
+from ..rig.loop import interruptible
+from ..rig.session import RunResult, run
+from ..safety import Trip
+from ..training.checkpoint import Progress
+from .campaign import REACHED, WHOLE, Campaign, Round
+
+_OWN = {"campaign.json", ".lock"}  # files of a campaign without rounds
+_UNSAFE = (Trip.LEVEL, Trip.PREDICTED_LEVEL, Trip.UNEXPLAINED)  # others interrupt a campaign
+
+
+def campaign(
+    plant: PlantLike,
+    target: Mapping[str, str | float],
+    rig: str | AbstractRig = "simulated",
+    *,
+    out: str | Path,
+    policy: str | Path | Policy | None = None,
+    spread: SpreadLike | None = None,
+    rounds: int = 10,
+    coast: int | None = None,
+    redesign: bool = True,
+    address: str = "0",
+    fast: bool = False,
+    seed: int = 0,
+    fault: Mapping[str, float] | None = None,
+    filter: bool = False,
+    guard: bool = False,
+    pause: float = 0.0,
+    progress: Progress = lambda *_: None,
+    on_round: Callable[[Round], None] = lambda _: None,
+    on_warning: Callable[[str], None] = lambda _: None,
+) -> Campaign:
+    """Plays rounds of experiments on a rig until the parameters are known as asked.
+
+    Every round begins at rest and is recorded in the folder `out`. Rerun with the same arguments
+    to resume an interrupted campaign: nothing is played twice.
+
+        >>> import excite as ex, tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     asked = {"D_p": "2%", "J_p": "1%"}
+        ...     found = ex.campaign("aero2", asked, out=folder + "/first", fast=True)
+        >>> found.reason
+        'every target is reached'
+
+    Args:
+        plant: as for `Campaign`, and so are `target`, `policy`, `spread`, `rounds`,
+            `coast` and `redesign`.
+        rig: a name, `FILE.fmu`, `FILE.json`, `path/to/file.py:ClassName` or a rig, as for `run`.
+        out: folder of the campaign.
+        address: board identifier of the Quanser rig.
+        fast: whether a simulated rig runs as fast as it can, not in real time.
+        seed: of a simulated rig's hidden parameters, noise and jitter.
+        fault: of a simulated rig, as for `run`.
+        filter: adds a predictive safety filter for parameters within the spread.
+        guard: ends a round that no declared plant explains, as for `run`.
+        pause: before every round but the first, so that the plant comes to rest [s].
+        progress: called with a text, how much is done, and the total.
+        on_round: called after every round.
+        on_warning: called with sentences about what is played.
+
+    Raises:
+        ValueError: for an argument that is not allowed, a target that no plant of the spread
+            reaches, or a folder of another campaign.
+        TypeError: for an argument of another type.
+    """
+    made = Campaign(
+        plant, target, policy=policy, spread=spread, rounds=rounds, coast=coast,
+        redesign=redesign and not guard,  # a guard knows its policy
+    )  # fmt: skip
+    require_whole("seed", seed, 0, LARGEST_SEED)
+    if not 0 <= as_number("pause", pause) < 1e5:
+        raise ValueError(f"pause must be a number of seconds, not below 0: got {pause!r}")
+    root = path_from("out", out)
+
+    def opened(count: int) -> AbstractRig:
+        """The rig for a round, after so many others."""
+        if isinstance(rig, AbstractRig):
+            return rig
+        if not isinstance(rig, str):
+            raise wrong_type("rig", rig, "a name, a file, path/to/file.py:ClassName or a rig")
+        options = RigOptions(address, fast, seed, made.spread, fault or {}, experiment=count)
+        return rig_named(rig, made.plant, made.plant.description, options)
+
+    if not opened(0).starts_at_rest:
+        raise ValueError(
+            "every round of a campaign begins at rest, and this rig does not say that it does "
+            "(starts_at_rest)"
+        )
+    name = rig if isinstance(rig, str) else type(rig).__name__
+    asked = {"rig": name, "seed": seed, "fault": dict(by_name("fault", fault)), "filter": filter,
+             "guard": guard}  # fmt: skip
+    folder = _Folder.checked(root, made, asked)
+    if not folder.has_rounds:
+        progress("predicting what can be reached", 0, rounds)
+        made.require_reachable()
+    for sentence in made.warnings:
+        on_warning(sentence)
+    with locked_folder(root, "this campaign"):
+        folder.resume(made, on_round)
+        while not made.reason and not made.interrupted:
+            count = len(made.rounds)
+            if count and pause:
+                made.interrupted = _paused(pause)
+                if made.interrupted:
+                    break
+            progress(f"preparing round {count + 1}", count, rounds)
+            played, signals = _played(
+                made, opened(count), folder.path(count), filter, guard,
+                lambda count=count: progress(f"round {count + 1}", count, rounds),
+            )  # fmt: skip
+            outcome = played.outcome
+            if _has_samples(folder.path(count)):
+                on_round(_taken(made, played.record, outcome.reason, outcome.trip))
+            if outcome.error is not None or (outcome.reason not in WHOLE and not made.reason):
+                made.interrupted = outcome.reason
+            elif signals and not made.reason:
+                made.interrupted = signals[0]
+            folder.write(made)
+    progress("done", rounds, rounds)
+    return made
+
+
+def _paused(seconds: float) -> str:
+    """Waits; a signal ends the wait, and is what is returned."""
+    end = time.monotonic() + seconds
+    with interruptible() as stop:
+        while not stop.reason and (left := end - time.monotonic()) > 0:
+            time.sleep(min(left, 0.1))
+    return stop.reason
+
+
+def _played(
+    made: Campaign,
+    rig: AbstractRig,
+    path: Path,
+    filter: bool,
+    guard: bool,
+    on_begin: Callable[[], None],
+) -> tuple[RunResult, list[str]]:
+    """One round on a rig, which ends as soon as enough is known, and signals that came."""
+    asked = made.ask()
+    monitor = made.monitor(waits=not rig.is_real_time)
+    on_begin()
+    with interruptible() as stop:
+
+        def judge(sample: Sample) -> None:
+            if monitor(sample):
+                stop.ask(REACHED)
+
+        try:
+            played = run(
+                rig, asked if isinstance(asked, Policy) else None, plant=made.plant,
+                excitation=asked if isinstance(asked, Replay) else None,
+                steps=made.policy.layout.num_steps, out=path, overwrite=path.exists(),
+                filter=filter, guard=guard, spread=made.spread, on_sample=judge,
+                stop=stop, live_estimate=False,
+            )  # fmt: skip
+        finally:
+            with contextlib.suppress(Exception):  # the record is complete
+                monitor.close()
+    signals = [reason for reason in stop.asked if reason != REACHED]
+    return cast("RunResult", played), signals  # without dry_run
+
+
+def _taken(made: Campaign, record: Record, reason: str, trip: Trip, goes_on: bool = False) -> Round:
+    """The campaign after a round of a rig."""
+    return made.tell(record, reason, trip in _UNSAFE, goes_on)
+
+
+def _has_samples(path: Path) -> bool:
+    """Whether a record has more than its header and one sample."""
+    return path.is_file() and len(path.read_bytes().splitlines()) > 2
+
+
+@dataclass(frozen=True)
+class _Folder:
+    """Where a campaign is kept: its settings and rounds, and a record of each."""
+
+    root: Path
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def checked(cls, root: Path, made: Campaign, asked: Mapping[str, object]) -> _Folder:
+        """A folder that is new, or of the same campaign; ValueError for anything else."""
+        own = made.to_dict()
+        kept = ("plant_hash", "policy_hash", "spread", "coast", "redesign")
+        settings = {**{name: own[name] for name in kept}, **asked}
+        file = root / "campaign.json"
+        if file.is_file() and (root / "round-01.csv").exists():
+            before = read_json(file, "settings", "rounds")["settings"]
+            other = [name for name, value in settings.items() if before.get(name) != value]
+            if other:
+                raise ValueError(
+                    f"{root} is another campaign, with {other[0]} {before.get(other[0])!r} and not "
+                    f"{settings[other[0]]!r}: choose another folder"
+                )
+        elif root.exists() and not (root.is_dir() and {p.name for p in root.iterdir()} <= _OWN):
+            raise ValueError(f"{root} exists and is no campaign: choose another folder")
+        return cls(root, settings)
+
+    @property
+    def has_rounds(self) -> bool:
+        """Whether a round was played before."""
+        return _has_samples(self.path(0))
+
+    def path(self, index: int) -> Path:
+        """Of the record of a round."""
+        return self.root / f"round-{index + 1:02}.csv"
+
+    def write(self, made: Campaign) -> None:
+        """Settings, and what every round brought."""
+        about = {"excite": __version__, "settings": dict(self.settings)}
+        write_json(self.root / "campaign.json", {**about, **made.to_dict()})
+
+    def resume(self, made: Campaign, on_round: Callable[[Round], None]) -> None:
+        """Takes the rounds that were played before; one that was hardly begun is played again."""
+        if self.has_rounds:
+            before = read_json(self.root / "campaign.json", "expected")
+            made.prediction = str(before["expected"])
+        while _has_samples(path := self.path(len(made.rounds))):
+            record = read_record(path, made.plant.description)
+            ended = record.metadata.get("ended") or {"reason": "interrupted", "trip": "none"}
+            trip = Trip[str(ended["trip"]).upper()]
+            goes_on = _has_samples(self.path(len(made.rounds) + 1))
+            on_round(_taken(made, record, str(ended["reason"]), trip, goes_on))
+        self.write(made)
