@@ -3,6 +3,10 @@
 import dataclasses
 import json
 import math
+import os
+import signal
+import threading
+import time
 from pathlib import Path
 
 import jax
@@ -13,12 +17,14 @@ from commands import excite
 
 import excite as ex
 from excite.description import HALF_95
+from excite.files import locked_folder
 from excite.information import experiment_information
 from excite.plant import Aero2, draw_params
 from excite.policy import Layout
 from excite.rig.contract import Interval, Sample
 from excite.simulation import response, run_episode
 from excite.study.campaign import REACHED
+from excite.study.campaign_on_rig import _paused
 from excite.study.targets import targets_from
 
 TRUE = {"J_p": 0.025, "K_pu": 0.0110, "D_p": 0.0011}
@@ -259,6 +265,42 @@ def test_a_round_ends_only_where_the_free_motion_after_it_is_safe(monkeypatch):
     monitor.close()
 
 
+def test_one_process_at_a_time_works_in_a_folder(tmp_path):
+    with (
+        locked_folder(tmp_path / "a", "this campaign"),
+        pytest.raises(ValueError, match="another process is working on this campaign"),
+        locked_folder(tmp_path / "a", "this campaign"),
+    ):
+        pass
+    with locked_folder(tmp_path / "a", "this campaign"):
+        pass
+
+
+def test_a_signal_ends_the_pause_between_rounds():
+    begin = time.monotonic()
+    threading.Timer(0.2, lambda: os.kill(os.getpid(), signal.SIGINT)).start()
+    assert _paused(60.0) == "interrupted by SIGINT"
+    assert time.monotonic() - begin < 30
+    assert _paused(0.01) == ""
+
+
+def test_a_spread_beyond_that_of_the_policy_is_a_warning():
+    wide = ex.Campaign("aero2", EASY, policy=steady(), spread="factor:4")
+    assert wide.warnings == (
+        "the policy was trained for a spread of factor:3; outside it, it promises nothing",
+    )
+    assert wide.warnings[0] in " ".join(repr(wide).split())
+    assert ex.Campaign("aero2", EASY, policy=steady(), spread="factor:2").warnings == ()
+
+
+def test_a_record_that_was_followed_by_another_ends_nothing():
+    campaign = ex.Campaign("aero2", EASY, policy=ex.read_policy("aero2"), redesign=False)
+    record = ex.simulate("aero2", campaign.ask(), params=TRUE, seed=1)
+    assert campaign.tell(record, goes_on=True).decision.startswith("go on: ")
+    campaign.tell(record)
+    assert campaign.reason == REACHED
+
+
 @pytest.fixture(scope="module")
 def played(tmp_path_factory) -> tuple[Path, ex.Campaign]:
     """Two rounds on the simulated rig, and where they are."""
@@ -311,6 +353,7 @@ def test_a_campaign_that_was_interrupted_is_resumed_and_nothing_is_played_twice(
         "aero2", {"D_p": "50%"}, policy=steady(), rounds=3, out=again, fast=True, seed=3
     )
     assert eased.reason == REACHED
+    assert len(eased.rounds) == 2  # all that was recorded is used
     assert (again / "round-01.csv").read_bytes() == content
     with pytest.raises(ValueError, match=r"is another campaign, with seed 3 and not 4"):
         ex.campaign("aero2", {"D_p": "0.3%"}, policy=steady(), rounds=2, out=again, seed=4)

@@ -458,3 +458,20 @@ def test_a_second_plant_of_a_class_is_not_compiled_again():
     ]  # fmt: skip
     assert traces == compiled
     assert len({ours, *others}) == 5
+
+
+class Growing(TwoMasses):
+    """A plant whose simulation diverges."""
+
+    def derivative(self, state, input, params):
+        return 50 * state * jnp.sum(state**2)
+
+
+def test_a_coast_that_diverges_keeps_its_last_numbers():
+    env = Env.of(Growing(), coast=20)
+    state, _ = env.reset(KEY)
+    state = dataclasses.replace(state, plant_state=jnp.full_like(state.plant_state, 3.0))
+    outputs = env.coasting(state)
+    assert np.all(np.isfinite(outputs))
+    np.testing.assert_array_equal(outputs[-1], outputs[-2])
+    assert np.max(np.abs(outputs[-1])) > 1
