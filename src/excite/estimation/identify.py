@@ -187,7 +187,7 @@ def identify(
     held_out = _listed(validate, "validate")
     if validate_columns and not held_out:
         raise ValueError("validate_columns need a held-out record (--validate)")
-    plant = plant_from(_plant_of(given[0]) if plant is None else plant)
+    plant = plant_from(plant_named_by(given[0]) if plant is None else plant)
     estimator, begin = _chosen(estimator, plant, start, hold)
     estimator = _with_likelihood(estimator, likelihood)
     if prior is not None:
@@ -326,7 +326,7 @@ def _listed(records: RecordLike | Sequence[RecordLike], what: str) -> list[Recor
     return list(listed)
 
 
-def _plant_of(record: RecordLike) -> str:
+def plant_named_by(record: RecordLike) -> str:
     """The plant that a record's sidecar names."""
     is_read = isinstance(record, Record)
     where = (record.source if is_read else str(record)) or "the record"

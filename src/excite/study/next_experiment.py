@@ -28,7 +28,7 @@ from ..description import (
 )
 from ..environment import prior_sd_of
 from ..environment.falsification import nearness
-from ..estimation.identify import RecordLike, identify
+from ..estimation.identify import RecordLike, identify, plant_named_by
 from ..estimation.prior_knowledge import PriorLike, with_prior
 from ..estimation.result import Identification
 from ..excitation import AbstractExcitation, Coast, PolicyExcitation, Replay
@@ -423,14 +423,19 @@ def next_experiment(
     if out is not None:
         require_record_path(Path(out), overwrite)
     reach = Spread.of(spread)
-    progress("estimating", 0, 2)
-    own, given = _estimated(known, plant, prior)
+    parts, own = _parts(known, plant, prior)
     d = own.description
+    if target is not None:
+        targets_from(d, target)  # a wrong one is told before the records are identified
     played = None
     if policy is not None:
         found = policy if isinstance(policy, Policy) else read_policy(policy)
         mismatch(found, d)
         played = ("policy" if isinstance(policy, Policy) else f"policy {policy}", found)
+    progress("estimating", 0, 2)
+    given = _estimate(parts, own, prior)
+    if isinstance(given, Identification) and given.basis is not None:
+        own = given.basis.plant  # sampled as the records are
     region = region_of(own, given, reach)
     _require_within(own, region, reach)
     names = names_of(d.parameters)
@@ -453,32 +458,49 @@ def next_experiment(
     return result
 
 
-def _estimated(
+def _parts(
     known: RecordLike | Sequence[RecordLike] | Identification,
     plant: PlantLike | None,
     prior: PriorLike | Sequence[PriorLike] | None,
-) -> tuple[AbstractPlant, Identification | Path]:
-    """The plant, and an estimate of its parameters: a result, or the folder of one."""
+) -> tuple[list[Any], AbstractPlant]:
+    """What is known, as a list, and the plant; ValueError for what cannot be used together."""
     parts = [known] if isinstance(known, str | Path | Record | Identification) else list(known)
-    folders = [p for p in parts if isinstance(p, str | Path) and Path(p).is_dir()]
-    if not isinstance(known, Identification) and not folders:
-        result = identify(known, plant, prior=prior)
-        if not result.is_usable:
-            raise ValueError(f"the records give no estimate ({result.status})")
-    elif len(parts) > 1 or prior is not None:
+    if not parts:
+        raise ValueError("no record is given")
+    if any(map(_is_result, parts)) and (len(parts) > 1 or prior is not None):
         raise ValueError(
             "a run folder or a result is taken alone, without a prior: identify its records "
             "together with the others, or give the records"
         )
-    elif isinstance(known, Identification):
-        result = known
-    else:
-        folder = Path(folders[0])
-        named = EstimateSummary.read(folder / "estimate.json", "identify the records again").plant
-        return plant_from(named if plant is None else plant), folder
-    if result.basis is not None and plant is None:
-        return result.basis.plant, result
-    return plant_from(result.plant.name if plant is None else plant), result
+    if plant is not None:
+        return parts, plant_from(plant)
+    first = parts[0]
+    if isinstance(first, Identification):
+        return parts, plant_from(first.plant.name) if first.basis is None else first.basis.plant
+    if isinstance(first, str | Path) and Path(first).is_dir():
+        path = Path(first) / "estimate.json"
+        return parts, plant_from(EstimateSummary.read(path, "identify the records again").plant)
+    return parts, plant_from(plant_named_by(first))
+
+
+def _is_result(part: object) -> bool:
+    """Whether it is an identification or its run folder, and not a record."""
+    is_folder = isinstance(part, str | Path) and Path(part).is_dir()
+    return is_folder or isinstance(part, Identification)
+
+
+def _estimate(
+    parts: list[Any], plant: AbstractPlant, prior: PriorLike | Sequence[PriorLike] | None
+) -> Identification | Path:
+    """The parameters' estimate: a result, or the folder of one."""
+    if isinstance(parts[0], Identification):
+        return parts[0]
+    if _is_result(parts[0]):
+        return Path(parts[0])
+    result = identify(parts, plant, prior=prior)
+    if not result.is_usable:
+        raise ValueError(f"the records give no estimate ({result.status})")
+    return result
 
 
 def _require_within(plant: AbstractPlant, region: Region, spread: Spread) -> None:
