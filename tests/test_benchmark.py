@@ -13,12 +13,12 @@ from documented import documented
 from excite.environment.episodes import Episodes, run_episodes
 from excite.estimation import Status
 from excite.excitation import PRBS, Chirp, Random
-from excite.files import json_ready
+from excite.files import json_ready, locked_folder
 from excite.information import best_possible
 from excite.plant import EMPS, Aero2, draw_params
 from excite.report.study_table import footnotes
 from excite.study import methods as benchmark
-from excite.study.run import _locked, opened, run_study
+from excite.study.run import opened, run_study
 from excite.study.spec import Study, study_from
 from excite.study.statistics import wilson
 from excite.study.table import finished_table
@@ -363,7 +363,10 @@ def test_nothing_is_removed_where_a_study_cannot_be_trained(tmp_path, monkeypatc
 
 def test_nothing_is_removed_where_another_process_works_on_the_study(tmp_path):
     study, kept = trained(tmp_path / "run")
-    with _locked(tmp_path / "run"), pytest.raises(ValueError, match="another process"):
+    with (
+        locked_folder(tmp_path / "run", "this study"),
+        pytest.raises(ValueError, match="another process"),
+    ):
         run_study(study, tmp_path / "run", overwrite=True, workers=1)
     assert kept.exists()
 
