@@ -274,7 +274,7 @@ class NextExperiment:
         return Record.of_episode(time, self.chosen.inputs, outputs, origin)
 
     def save(self, path: str | Path, overwrite: bool = False) -> None:
-        """Writes the inputs to be played (.csv, .mat); `excite run --signal` plays the file.
+        """Writes the inputs to be played (.csv, .mat); `excite run --input` plays the file.
 
         Of a policy these are the inputs on the estimated plant; played as a policy, it reacts.
 
@@ -406,7 +406,7 @@ def next_experiment(
         ahead: experiments of this length for which the redesign looks ahead.
         coast: samples after the experiment in which the plant must be safe too.
         seed: of the redesign's starts, and of the noise.
-        out: file of the inputs (.csv, .mat); `excite run --signal` plays it.
+        out: file of the inputs (.csv, .mat); `excite run --input` plays it.
         overwrite: replaces an existing file.
         progress: called with a text, how much is done, and the total.
 
