@@ -309,7 +309,14 @@ def played(tmp_path_factory) -> tuple[Path, ex.Campaign]:
     """Two rounds on the simulated rig, and where they are."""
     folder = tmp_path_factory.mktemp("campaign") / "first"
     made = ex.campaign(
-        "aero2", {"D_p": "0.3%"}, policy=steady(), rounds=2, out=folder, fast=True, seed=3
+        "aero2",
+        {"D_p": "0.3%"},
+        policy=steady(),
+        rounds=2,
+        out=folder,
+        fast=True,
+        seed=3,
+        redesign=False,
     )
     return folder, made
 
@@ -340,6 +347,7 @@ def test_a_campaign_that_was_interrupted_is_resumed_and_nothing_is_played_twice(
     told = []
     resumed = ex.campaign(
         "aero2", {"D_p": "0.3%"}, policy=steady(), rounds=2, out=again, fast=True, seed=3,
+        redesign=False,
         on_round=told.append,
     )  # fmt: skip
     assert (again / "round-01.csv").stat().st_mtime_ns == before
@@ -348,18 +356,34 @@ def test_a_campaign_that_was_interrupted_is_resumed_and_nothing_is_played_twice(
     assert len(told) == 2
     (again / "round-02.csv").write_text("time,voltage,pitch\n")  # hardly begun when it was killed
     once_more = ex.campaign(
-        "aero2", {"D_p": "0.3%"}, policy=steady(), rounds=2, out=again, fast=True, seed=3
+        "aero2",
+        {"D_p": "0.3%"},
+        policy=steady(),
+        rounds=2,
+        out=again,
+        fast=True,
+        seed=3,
+        redesign=False,
     )
     assert once_more.to_dict() == made.to_dict()
     content = (again / "round-01.csv").read_bytes()
     eased = ex.campaign(
-        "aero2", {"D_p": "50%"}, policy=steady(), rounds=3, out=again, fast=True, seed=3
+        "aero2",
+        {"D_p": "50%"},
+        policy=steady(),
+        rounds=3,
+        out=again,
+        fast=True,
+        seed=3,
+        redesign=False,
     )
     assert eased.reason == REACHED
     assert len(eased.rounds) == 2  # all that was recorded is used
     assert (again / "round-01.csv").read_bytes() == content
     with pytest.raises(ValueError, match=r"is another campaign, with seed 3 and not 4"):
-        ex.campaign("aero2", {"D_p": "0.3%"}, policy=steady(), rounds=2, out=again, seed=4)
+        ex.campaign(
+            "aero2", {"D_p": "0.3%"}, policy=steady(), rounds=2, out=again, seed=4, redesign=False
+        )
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "thesis.txt").write_text("mine")
     with pytest.raises(ValueError, match="exists and is no campaign"):
