@@ -6,6 +6,7 @@ import math
 import signal
 import time
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -304,20 +305,18 @@ def test_a_record_that_was_followed_by_another_ends_nothing():
     assert campaign.reason == REACHED
 
 
+def repeated(out: Path, target: Any = None, **options: Any) -> ex.Campaign:
+    """The campaign of `played` in a folder, with what differs."""
+    usual = {"rounds": 2, "fast": True, "seed": 3, "redesign": False}
+    return ex.campaign("aero2", target or {"D_p": "0.3%"}, policy=steady(), out=out,
+                       **(usual | options))  # fmt: skip
+
+
 @pytest.fixture(scope="module")
 def played(tmp_path_factory) -> tuple[Path, ex.Campaign]:
     """Two rounds on the simulated rig, and where they are."""
     folder = tmp_path_factory.mktemp("campaign") / "first"
-    made = ex.campaign(
-        "aero2",
-        {"D_p": "0.3%"},
-        policy=steady(),
-        rounds=2,
-        out=folder,
-        fast=True,
-        seed=3,
-        redesign=False,
-    )
+    made = repeated(folder)
     return folder, made
 
 
@@ -345,45 +344,21 @@ def test_a_campaign_that_was_interrupted_is_resumed_and_nothing_is_played_twice(
         (again / name).write_bytes((folder / name).read_bytes())
     before = (again / "round-01.csv").stat().st_mtime_ns
     told = []
-    resumed = ex.campaign(
-        "aero2", {"D_p": "0.3%"}, policy=steady(), rounds=2, out=again, fast=True, seed=3,
-        redesign=False,
-        on_round=told.append,
-    )  # fmt: skip
+    resumed = repeated(again, on_round=told.append)
     assert (again / "round-01.csv").stat().st_mtime_ns == before
     assert (again / "round-02.csv").read_text() == (folder / "round-02.csv").read_text()
     assert resumed.to_dict() == made.to_dict()
     assert len(told) == 2
     (again / "round-02.csv").write_text("time,voltage,pitch\n")  # hardly begun when it was killed
-    once_more = ex.campaign(
-        "aero2",
-        {"D_p": "0.3%"},
-        policy=steady(),
-        rounds=2,
-        out=again,
-        fast=True,
-        seed=3,
-        redesign=False,
-    )
+    once_more = repeated(again)
     assert once_more.to_dict() == made.to_dict()
     content = (again / "round-01.csv").read_bytes()
-    eased = ex.campaign(
-        "aero2",
-        {"D_p": "50%"},
-        policy=steady(),
-        rounds=3,
-        out=again,
-        fast=True,
-        seed=3,
-        redesign=False,
-    )
+    eased = repeated(again, {"D_p": "50%"}, rounds=3)
     assert eased.reason == REACHED
     assert len(eased.rounds) == 2  # all that was recorded is used
     assert (again / "round-01.csv").read_bytes() == content
     with pytest.raises(ValueError, match=r"is another campaign, with seed 3 and not 4"):
-        ex.campaign(
-            "aero2", {"D_p": "0.3%"}, policy=steady(), rounds=2, out=again, seed=4, redesign=False
-        )
+        repeated(again, seed=4)
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "thesis.txt").write_text("mine")
     with pytest.raises(ValueError, match="exists and is no campaign"):

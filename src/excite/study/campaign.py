@@ -40,7 +40,7 @@ from ..rig.loop import COMPLETE
 from ..safety import critical_levels
 from .falsify import trained_in
 from .monitor import Monitor
-from .next_experiment import REDESIGNED, NextExperiment, best_of, candidates, region_of
+from .next_experiment import COAST, REDESIGNED, NextExperiment, best_of, candidates, region_of
 from .targets import (
     farthest,
     half_intervals,
@@ -56,7 +56,6 @@ if TYPE_CHECKING:
 REACHED = "every target is reached"
 WHOLE = (COMPLETE, REACHED)  # ends of rounds that count in the budget
 
-_COAST = 100  # samples of free motion that must be safe, where the policy's training had none
 _PLANTS = 32  # drawn to predict what a campaign reaches
 
 
@@ -139,9 +138,9 @@ class Campaign:
         result: estimate from all records; None before the first.
         reason: why the campaign ended; empty while it goes on.
         next: how the coming round was chosen, after the first estimate.
-        interrupted: why `campaign` stopped before its end; empty where it did not.
-        prediction: what was expected before the first round, as a sentence; empty where that was
-            not computed.
+        interrupted: what interrupted `campaign`, such as a signal; empty if nothing did.
+        prediction: what was expected before the first round, as a sentence; empty if that was not
+            computed.
         warnings: sentences about policy and plant.
     """
 
@@ -183,7 +182,7 @@ class Campaign:
         self.policy = _policy(policy, description)
         usual, _, usual_coast = trained_in(self.policy, self.plant)
         self.spread = Spread.of(usual if spread is None else spread)
-        self.coast = coast if coast is not None else usual_coast or _COAST
+        self.coast = coast if coast is not None else usual_coast or COAST
         require_whole("coast", self.coast, 0)
         self.redesign = redesign
         self.warnings = _warnings(self.policy, self.plant, self.spread)

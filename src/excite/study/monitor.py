@@ -20,8 +20,7 @@ from ..rig.contract import Interval, Sample
 from ..rig.live_estimate import LiveEstimate
 from ..safety import safe_input
 from ..simulation import response
-
-SAFE = 0.97  # of the critical level: largest output allowed in the predicted free motion
+from ..training.redesign import SAFE
 
 _FIRST = 8  # samples before the first running estimate of a round
 

@@ -425,8 +425,7 @@ def next_experiment(
     reach = Spread.of(spread)
     parts, own = _parts(known, plant, prior)
     d = own.description
-    if target is not None:
-        targets_from(d, target)  # a wrong one is told before the records are identified
+    targets = None if target is None else targets_from(d, target)
     played = None
     if policy is not None:
         found = policy if isinstance(policy, Policy) else read_policy(policy)
@@ -443,7 +442,7 @@ def next_experiment(
     values = zip(names, np.asarray(region.center), half, strict=True)
     now = {name: Interval(float(value), float(own)) for name, value, own in values}
     usual = {name: known.ci95_half / 2 for name, known in now.items()}
-    targets = targets_from(d, usual if target is None else target)
+    targets = targets or targets_from(d, usual)
     length = steps or (played[1].layout.num_steps if played else 200)
     progress("redesigning", 1, 2)
     made = candidates(

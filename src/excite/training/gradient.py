@@ -26,6 +26,7 @@ from jaxtyping import Array, Float, Key, PRNGKeyArray, PyTree
 from ..environment import Env, EnvState
 from ..environment.falsification import Cases, Effort, OnPlant, climbed, nearness, search
 from ..excitation import Coast, PolicyExcitation
+from ..plant import AbstractPlant
 from ..plant.uncertainty import Uncertainty
 from ..policy import Layout, Weights, act
 from ..safety import watched_levels
@@ -223,15 +224,22 @@ def _excess(
 ) -> tuple[Float[Array, " case"], Float[Array, " case"]]:
     """Of each case, the mean square of the distance beyond the margin, and the nearness."""
     plant = play.uncertainty.plant
-    watched, _, critical = watched_levels(plant.definition)
 
-    def excess(case: Cases) -> tuple[Array, Array]:
+    def judged(case: Cases) -> tuple[Array, Array]:
         outputs = play.outputs(case)
-        over = jnp.abs(outputs[:, np.array(watched, int)]) / critical[None] - margin
-        over = jnp.maximum(over, 0.0) / (1 - margin)
-        return jnp.mean(jnp.sum(over**2, axis=1)), nearness(plant, outputs)
+        return mean_excess(plant, outputs, margin), nearness(plant, outputs)
 
-    return jax.vmap(excess)(cases)
+    return jax.vmap(judged)(cases)
+
+
+def mean_excess(
+    plant: AbstractPlant, outputs: Float[Array, "time output"], margin: float
+) -> Float[Array, ""]:
+    """The mean square of the outputs' distance beyond the margin; one is the critical level."""
+    watched, _, critical = watched_levels(plant.definition)
+    over = jnp.abs(outputs[:, np.array(watched, int)]) / critical[None] - margin
+    over = jnp.maximum(over, 0.0) / (1 - margin)
+    return jnp.mean(jnp.sum(over**2, axis=1))
 
 
 update_all = eqx.filter_jit(

@@ -22,14 +22,14 @@ from scipy.stats import chi2
 from ..environment.falsification import nearness
 from ..information import experiment_information
 from ..plant import AbstractPlant, Params
-from ..safety import safe_input, watched_levels
+from ..safety import safe_input
 from ..simulation import response
-from .gradient import GradientSettings, optimiser
+from .gradient import GradientSettings, mean_excess, optimiser
 from .signals import random_sines
 
 HELD = 0.999  # probability of the ellipsoid
 POINTS, JUDGES = 12, 66  # around the estimate: of the criterion, and of the line search
-SAFE = 0.97  # of the critical level: largest output of a signal
+SAFE = 0.97  # of the critical level: largest output that is allowed
 
 SEARCH = GradientSettings(num_updates=100, learning_rate=0.15, margin=0.95, penalty_weight=100.0)
 
@@ -123,7 +123,6 @@ def redesigned(
     lower, upper = (x[None, None] for x in plant.input_limits)
     middle, half = (lower + upper) / 2, (upper - lower) / 2
     rest = jnp.tile(jnp.asarray(safe_input(plant.definition)), (coast, 1))
-    watched, _, critical = watched_levels(plant.definition)
     points, judges = region.plants(plant, POINTS), region.plants(plant, JUDGES)
 
     def uncertainty(params: Params, inputs: Float[Array, "round time input"]) -> Array:
@@ -134,15 +133,13 @@ def redesigned(
     def outputs(params: Params, own: Float[Array, "time input"]) -> Array:
         return response(plant, params, jnp.concatenate([own, rest]))
 
-    def excess(params: Params, own: Float[Array, "time input"]) -> Array:
-        size = jnp.abs(outputs(params, own)[:, np.array(watched, int)]) / critical[None]
-        over = jnp.maximum(size - settings.margin, 0.0) / (1 - settings.margin)
-        return jnp.mean(jnp.sum(over**2, axis=1))
+    def beyond(params: Params, own: Float[Array, "time input"]) -> Array:
+        return mean_excess(plant, outputs(params, own), settings.margin)
 
     def loss(latent: Array) -> Array:
         inputs = middle + half * jnp.tanh(latent)
         unknown = jax.vmap(uncertainty, (0, None))(points, inputs)
-        over = jax.vmap(jax.vmap(excess, (None, 0)), (0, None))(points, inputs)
+        over = jax.vmap(jax.vmap(beyond, (None, 0)), (0, None))(points, inputs)
         return jnp.mean(unknown) + settings.penalty_weight * jnp.mean(over)
 
     adam = optimiser(settings)
