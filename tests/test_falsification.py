@@ -143,7 +143,7 @@ def test_a_spread_beyond_a_bound_names_the_remedy():
     parameters = (Oscillator.definition.parameter("w"), narrow)
     definition = dataclasses.replace(Oscillator.definition, parameters=parameters)
     plant = type("Narrow", (Oscillator,), {"definition": definition})()
-    with pytest.raises(ValueError, match=r"smaller --spread, or .*--uncertainty zeta=LOW:HIGH"):
+    with pytest.raises(ValueError, match=r"smaller spread, or .*\(zeta=LOW:HIGH"):
         Uncertainty.of(plant, 0.3)
     with pytest.raises(ValueError, match=r"bounds 0 to 0.11$"):
         Uncertainty.of(plant, 0.3, {"zeta": (0.1, 0.2)})

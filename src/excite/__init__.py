@@ -37,6 +37,7 @@ _PLACES = {
     "report": "report.html",
     "run": "rig.session",
     "next_experiment": "study.next_experiment",
+    "discriminate": "study.discrimination",
     "campaign": "study.campaign_on_rig",
     # nouns
     "Record": "record.record",
@@ -135,6 +136,7 @@ if TYPE_CHECKING:
     from .study.campaign import Campaign as Campaign
     from .study.campaign_on_rig import campaign as campaign
     from .study.catalogue import studies as studies
+    from .study.discrimination import discriminate as discriminate
     from .study.evaluate import evaluate as evaluate
     from .study.falsify import falsify as falsify
     from .study.next_experiment import next_experiment as next_experiment

@@ -21,6 +21,7 @@ from .campaign import campaign
 from .compare_plants import compare_plants
 from .completion import complete_names
 from .design import design
+from .discriminate import discriminate
 from .doctor import doctor
 from .export import export
 from .falsify import falsify
@@ -50,6 +51,7 @@ _SECTIONS: dict[str, dict[click.Command, str]] = {
     },
     "Design and train": {
         next_experiment: "excite next record.csv --target D_p=1% --steps 200 --out next.csv",
+        discriminate: "excite discriminate aero2 aero2_lag,tau=0.05:0.25 --out next.csv",
         design: "excite design aero2 --out signal.csv",
         train: "excite train aero2 --out runs/first",
         evaluate: "excite evaluate aero2 --episodes 100",

@@ -76,6 +76,14 @@ from .options import (
     "samples than the policy; not with --guard.",
 )
 @click.option(
+    "--rival",
+    "rivals",
+    multiple=True,
+    metavar="PLANT,NAME=LOW:HIGH",
+    help="Another plant that may be the true one, as for excite discriminate; repeatable. Signals "
+    "tell them apart first.",
+)
+@click.option(
     "--pause",
     type=Number(0),
     default=0.0,

@@ -98,9 +98,7 @@ class Uncertainty(eqx.Module):
                 by_spread = _PARAMETERS not in ranges and name in groups[_PARAMETERS]
                 if name in ranges or not by_spread:
                     raise
-                advice = (
-                    f"a smaller --spread, or a range of its own (--uncertainty {name}=LOW:HIGH)"
-                )
+                advice = f"a smaller spread, or a range of its own ({name}=LOW:HIGH)"
                 raise ValueError(f"{error}: take {advice}") from None
         return cls(
             whole,
@@ -234,12 +232,12 @@ def _read(name: str, given: Any, about: _Quantity) -> _Interval:
     if not isinstance(given, str):
         raise ValueError(f"range of {name} must be {_ALLOWED}: got {given!r}")
     text = given.strip()
+    first, colon, second = text.partition(":")
+    if not about.size and (text.endswith("%") or (first == "factor" and about.is_signed)):
+        raise ValueError(f"range of {name} needs two numbers LOW:HIGH: got {given!r}")
     if text.endswith("%"):
-        if not about.size:
-            raise ValueError(f"range of {name} needs two numbers LOW:HIGH: got {given!r}")
         reach = _as_number(name, text[:-1], given) / 100 * about.size
         return _Interval(about.nominal - reach, about.nominal + reach)
-    first, colon, second = text.partition(":")
     if first == "factor":
         factor = _as_number(name, second, given)
         if about.is_signed:

@@ -144,6 +144,36 @@ def candidates_figure(
     return figure
 
 
+def rivals_figure(
+    description: PlantDescription,
+    time: Float[np.ndarray, " sample"],
+    inputs: Float[np.ndarray, "time input"],
+    responses: Mapping[str, Float[np.ndarray, "sample output"]],
+) -> matplotlib.figure.Figure:
+    """An experiment that tells rival plants apart, and the outputs of each of them.
+
+    Args:
+        description: of a plant with the rivals' inputs and outputs.
+        time: of the samples [s].
+        inputs: of the experiment, without that after the last sample.
+        responses: noise-free outputs of each rival, by name.
+    """
+    names = (*description.inputs, *description.outputs)
+    figure, axes = new_figure(len(names))
+    for row, part in enumerate(names):
+        axes[row, 0].set(ylabel=f"{part.name} [{part.unit}]")
+    for i in range(len(description.inputs)):
+        own = np.append(inputs[:, i], inputs[-1, i])
+        axes[i, 0].step(time, own, where="post", color="black", lw=1.0)
+    for column, (name, outputs) in enumerate(responses.items()):
+        for i in range(len(description.outputs)):
+            axis = axes[len(description.inputs) + i, 0]
+            axis.plot(time, outputs[:, i], color=colour_of(column), lw=1.4, label=name)
+    axes[-1, 0].set(xlabel="time [s]")
+    add_legend(figure, axes[-1, 0])
+    return figure
+
+
 def autocorrelation_figure(
     description: PlantDescription, residuals: Sequence[Float[np.ndarray, "sample output"]]
 ) -> matplotlib.figure.Figure:

@@ -1,17 +1,18 @@
 """Campaigns: rounds of experiments until the parameters are known as precisely as asked.
 
-A round plays a policy from rest, or, once there is an estimate, a signal redesigned for what is
-known, where that is better. It ends with its last sample, or as soon as the running estimate
-reaches every target and the free motion that would follow is predicted to be safe. After every
-round all records are identified together. The policy needs to know nothing of the plant but the
-spread that it was trained for.
+Where several plants may be the true one, the first rounds play signals that tell them apart, until
+one is chosen. A round then plays a policy from rest, or, once there is an estimate, a signal
+redesigned for what is known, where that is better. It ends with its last sample, or as soon as the
+running estimate reaches every target and the free motion that would follow is predicted to be
+safe. After every round all records are identified together. The policy needs to know nothing of
+the plant but the spread that it was trained for.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -38,6 +39,7 @@ from ..report.tables import html_table, text_table
 from ..rig.contract import Interval
 from ..rig.loop import COMPLETE
 from ..safety import critical_levels
+from .discrimination import Discrimination, RivalLike, judged, rivals_from, with_experiment
 from .falsify import trained_in
 from .monitor import Monitor
 from .next_experiment import COAST, REDESIGNED, NextExperiment, best_of, candidates, region_of
@@ -56,6 +58,10 @@ if TYPE_CHECKING:
 REACHED = "every target is reached"
 WHOLE = (COMPLETE, REACHED)  # ends of rounds that count in the budget
 
+DISCRIMINATING = "signal for rivals"
+
+_SHORT = 20  # samples of a round that tells rivals apart
+_PADDED = 8  # rounds for which the fits of rivals are compiled
 _PLANTS = 32  # drawn to predict what a campaign reaches
 
 
@@ -65,7 +71,7 @@ class Round:
 
     Attributes:
         num_samples: of the round.
-        played: the policy, or a redesigned signal.
+        played: the policy, a redesigned signal, or one that tells rivals apart.
         ended: why, as a sentence.
         nearness: largest measured output over its critical level.
         known: of each parameter, the estimate from this and all earlier rounds with half of its
@@ -126,7 +132,9 @@ class Campaign:
         'every target is reached'
 
     Attributes:
-        plant: as identification knows it.
+        declared: the plant as it was given.
+        plant: as identification knows it: the declared one, or the rival that was chosen.
+        discrimination: of the rivals after the last round; None where there are none.
         targets: by parameter.
         policy: that is played in the first round.
         redesign: whether the policy is compared with redesigned signals in later rounds.
@@ -154,6 +162,7 @@ class Campaign:
         rounds: int = 10,
         coast: int | None = None,
         redesign: bool = True,
+        rivals: Sequence[RivalLike] = (),
     ) -> None:
         """A campaign before its first round.
 
@@ -169,12 +178,14 @@ class Campaign:
                 policy's training, or 100.
             redesign: whether signals are redesigned for later rounds, and played where they reach
                 the targets with fewer samples than the policy; see `next_experiment`.
+            rivals: other plants of which one may be the true one, as for `discriminate`. Signals
+                tell them apart first, in rounds of 20 samples.
 
         Raises:
             ValueError: for a name or a value that is not allowed.
             TypeError: for an argument of another type.
         """
-        self.plant = plant_from(plant)
+        self.declared = self.plant = plant_from(plant)
         description = self.plant.description
         self.targets = targets_from(description, target)
         require_whole("rounds", rounds, 1, 1000)
@@ -185,6 +196,13 @@ class Campaign:
         self.coast = coast if coast is not None else usual_coast or COAST
         require_whole("coast", self.coast, 0)
         self.redesign = redesign
+        self.discrimination: Discrimination | None = None
+        if rivals:
+            self.discrimination = judged(rivals_from([self.plant, *rivals], self.spread), [])
+            for rival in self.discrimination.rivals:
+                for name in [t.parameter for t in self.targets]:
+                    if name not in rival.estimate:
+                        raise ValueError(f"rival {rival.name} has no parameter {name!r}, a target")
         self.warnings = _warnings(self.policy, self.plant, self.spread)
         self.records: list[Record] = []
         self.rounds: list[Round] = []
@@ -197,13 +215,28 @@ class Campaign:
 
         That is the policy; after the first estimate, a signal redesigned for what is known, where
         that is better. No signal is redesigned where the plant does not explain the records.
+        While several rivals are possible, it is a signal that tells them apart.
         """
         if self.reason:
             return None
+        if self.discrimination is not None and self.is_undecided:
+            if self.discrimination.inputs is None:
+                self.discrimination = with_experiment(
+                    self.discrimination, _SHORT, self.coast, seed=len(self.rounds)
+                )
+            if self.discrimination.inputs is None:
+                self.reason = self.discrimination.decision
+                return None
+            return self.discrimination.excitation
         if self.result is not None and self.redesign and self.next is None:
             self.next = self._next(self.result)
         chosen = None if self.next is None else self.next.chosen
         return self.policy if chosen is None else chosen.excitation
+
+    @property
+    def is_undecided(self) -> bool:
+        """Whether several rivals are still possible."""
+        return self.discrimination is not None and self.discrimination.chosen is None
 
     def _next(self, result: Identification) -> NextExperiment | None:
         """The candidates of the coming round; None where the estimate is not to be trusted."""
@@ -245,18 +278,18 @@ class Campaign:
         if len(record.time) < 2:
             raise ValueError("the record of a round needs at least two samples: got one")
         self.records.append(record)
-        count, status = len(record.time) - 1, "too few samples for an estimate"
-        try:
-            result = identify(self.records, self.plant, start=self._start(), initial_state="known")
-            status = result.status
-            self.result = result if result.is_usable else self.result
-        except ValueError as error:  # this record tells nothing; another one may
-            status = str(error)
+        played, structure = self._played(record), ""
+        if self.discrimination is not None and self.is_undecided:
+            self.discrimination = self.discrimination.after(self.records, _PADDED)
+            self.plant = self.discrimination.plant or self.plant
+            structure = self.discrimination.decision
+        count, status = len(record.time) - 1, structure
+        if not self.is_undecided:
+            status = self._identify()
         sizes = np.abs(record.outputs) / critical_levels(d)[None]
         near = float(np.nanmax(sizes, initial=0.0))
         known = {} if self.result is None else known_of(self.result)
         shares = self.shares(known)
-        played = self._played(record)
         if goes_on:
             self.reason = ""
         elif unsafe or near >= 1:
@@ -265,18 +298,33 @@ class Campaign:
             self.reason = REACHED
         elif sum(e in WHOLE for e in [*(r.ended for r in self.rounds), ended]) >= self.most_rounds:
             self.reason = "all rounds are played"
+        elif self.discrimination is not None and not self.discrimination.is_explained:
+            self.reason = structure
         missing = farthest(shares) if shares else f"there is no estimate yet ({status})"
         decision = f"end: {self.reason}" if self.reason else f"go on: {missing}"
+        if structure and not self.is_undecided:
+            decision = f"{structure}; {decision}"
         told = Round(count, played, ended, near, known, status, decision)
         self.rounds.append(told)
         self.next = None
         return told
 
+    def _identify(self) -> str:
+        """Identifies all records together; returns the status."""
+        try:
+            result = identify(self.records, self.plant, start=self._start(), initial_state="known")
+        except ValueError as error:  # this record tells nothing; another one may
+            return str(error)
+        self.result = result if result.is_usable else self.result
+        return result.status
+
     def _played(self, record: Record) -> str:
         """The name of what a round played."""
+        if self.is_undecided:
+            return DISCRIMINATING
         if self.next is not None and self.next.chosen is not None:
             return self.next.chosen.name
-        is_policy = not self.rounds or "policy_hash" in record.metadata
+        is_policy = self.result is None or "policy_hash" in record.metadata
         return "policy" if is_policy or not self.redesign else REDESIGNED
 
     def shares(self, known: Mapping[str, Interval]) -> dict[str, float]:
@@ -284,7 +332,12 @@ class Campaign:
         return shares_of(self.targets, known)
 
     def _start(self) -> dict[str, float] | None:
-        return None if self.result is None else dict(self.result.params)
+        """Where the next identification begins."""
+        if self.result is not None:
+            return dict(self.result.params)
+        chosen = None if self.discrimination is None else self.discrimination.chosen
+        names = names_of(self.plant.definition.parameters)
+        return chosen and {name: chosen.estimate[name].estimate for name in names}
 
     def monitor(self, waits: bool = False) -> Monitor:
         """A judge of the next round while it runs; see `Monitor`."""
@@ -335,13 +388,15 @@ class Campaign:
         """The campaign as JSON-ready data."""
         return {
             "plant": self.plant.description.name,
-            "plant_hash": self.plant.description.hash,
+            "plant_hash": self.declared.description.hash,
             "policy_hash": self.policy.hash,
             "targets": {t.parameter: str(t) for t in self.targets},
             "spread": self.spread.setting,
             "most_rounds": self.most_rounds,
             "coast": self.coast,
             "redesign": self.redesign,
+            "rivals": [] if self.discrimination is None else self.discrimination.names,
+            "structure": self.discrimination and self.discrimination.to_dict(),
             "warnings": list(self.warnings),
             "expected": self.prediction,
             "reason": self.reason,

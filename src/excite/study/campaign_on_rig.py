@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
@@ -31,6 +31,7 @@ from ..rig.session import RunResult, run
 from ..safety import Trip
 from ..training.checkpoint import Progress
 from .campaign import REACHED, WHOLE, Campaign, Round
+from .discrimination import RivalLike
 
 _OWN = {"campaign.json", ".lock"}  # files of a campaign without rounds
 _UNSAFE = (Trip.LEVEL, Trip.PREDICTED_LEVEL, Trip.UNEXPLAINED)  # others interrupt a campaign
@@ -47,6 +48,7 @@ def campaign(
     rounds: int = 10,
     coast: int | None = None,
     redesign: bool = True,
+    rivals: Sequence[RivalLike] = (),
     address: str = "0",
     fast: bool = False,
     seed: int = 0,
@@ -72,7 +74,7 @@ def campaign(
 
     Args:
         plant: as for `Campaign`, and so are `target`, `policy`, `spread`, `rounds`,
-            `coast` and `redesign`.
+            `coast`, `redesign` and `rivals`.
         rig: a name, `FILE.fmu`, `FILE.json`, `path/to/file.py:ClassName` or a rig, as for `run`.
         out: folder of the campaign.
         address: board identifier of the Quanser rig.
@@ -94,7 +96,10 @@ def campaign(
     made = Campaign(
         plant, target, policy=policy, spread=spread, rounds=rounds, coast=coast,
         redesign=redesign and not guard,  # a guard knows its policy
+        rivals=rivals,
     )  # fmt: skip
+    if rivals and guard:
+        raise ValueError("a guard knows one plant and its policy: give rivals or a guard")
     require_whole("seed", seed, 0, LARGEST_SEED)
     if not 0 <= as_number("pause", pause) < 1e5:
         raise ValueError(f"pause must be a number of seconds, not below 0: got {pause!r}")
@@ -107,7 +112,7 @@ def campaign(
         if not isinstance(rig, str):
             raise wrong_type("rig", rig, "a name, a file, path/to/file.py:ClassName or a rig")
         options = RigOptions(address, fast, seed, made.spread, fault or {}, experiment=count)
-        return rig_named(rig, made.plant, made.plant.description, options)
+        return rig_named(rig, made.declared, made.declared.description, options)
 
     if not opened(0).starts_at_rest:
         raise ValueError(
@@ -115,9 +120,9 @@ def campaign(
             "(starts_at_rest)"
         )
     name = rig if isinstance(rig, str) else type(rig).__name__
-    asked = {"rig": name, "seed": seed, "fault": dict(by_name("fault", fault)), "filter": filter,
-             "guard": guard}  # fmt: skip
-    folder = _Folder.checked(root, made, asked)
+    settings = {"rig": name, "seed": seed, "fault": dict(by_name("fault", fault)), "filter": filter,
+                "guard": guard}  # fmt: skip
+    folder = _Folder.checked(root, made, settings)
     if not folder.has_rounds:
         progress("predicting what can be reached", 0, rounds)
         made.require_reachable()
@@ -132,8 +137,10 @@ def campaign(
                 if made.interrupted:
                     break
             progress(f"preparing round {count + 1}", count, rounds)
+            if (asked := made.ask()) is None:
+                break
             played, signals = _played(
-                made, opened(count), folder.path(count), filter, guard,
+                made, asked, opened(count), folder.path(count), filter, guard,
                 lambda count=count: progress(f"round {count + 1}", count, rounds),
             )  # fmt: skip
             outcome = played.outcome
@@ -159,6 +166,7 @@ def _paused(seconds: float) -> str:
 
 def _played(
     made: Campaign,
+    asked: Policy | Replay,
     rig: AbstractRig,
     path: Path,
     filter: bool,
@@ -166,26 +174,27 @@ def _played(
     on_begin: Callable[[], None],
 ) -> tuple[RunResult, list[str]]:
     """One round on a rig, which ends as soon as enough is known, and signals that came."""
-    asked = made.ask()
-    monitor = made.monitor(waits=not rig.is_real_time)
+    monitor = None if made.is_undecided else made.monitor(waits=not rig.is_real_time)
     on_begin()
     with interruptible() as stop:
 
         def judge(sample: Sample) -> None:
-            if monitor(sample):
+            if monitor is not None and monitor(sample):
                 stop.ask(REACHED)
 
         try:
             played = run(
                 rig, asked if isinstance(asked, Policy) else None, plant=made.plant,
                 excitation=asked if isinstance(asked, Replay) else None,
-                steps=made.policy.layout.num_steps, out=path, overwrite=path.exists(),
+                steps=len(asked.inputs) if isinstance(asked, Replay) else None,
+                out=path, overwrite=path.exists(),
                 filter=filter, guard=guard, spread=made.spread, on_sample=judge,
                 stop=stop, live_estimate=False,
             )  # fmt: skip
         finally:
             with contextlib.suppress(Exception):  # the record is complete
-                monitor.close()
+                if monitor is not None:
+                    monitor.close()
     signals = [reason for reason in stop.asked if reason != REACHED]
     return cast("RunResult", played), signals  # without dry_run
 
@@ -211,7 +220,7 @@ class _Folder:
     def checked(cls, root: Path, made: Campaign, asked: Mapping[str, object]) -> _Folder:
         """A folder that is new, or of the same campaign; ValueError for anything else."""
         own = made.to_dict()
-        kept = ("plant_hash", "policy_hash", "spread", "coast", "redesign")
+        kept = ("plant_hash", "policy_hash", "spread", "coast", "redesign", "rivals")
         settings = {**{name: own[name] for name in kept}, **asked}
         file = root / "campaign.json"
         if file.is_file() and (root / "round-01.csv").exists():
@@ -246,7 +255,7 @@ class _Folder:
             before = read_json(self.root / "campaign.json", "expected")
             made.prediction = str(before["expected"])
         while _has_samples(path := self.path(len(made.rounds))):
-            record = read_record(path, made.plant.description)
+            record = read_record(path, made.declared.description)
             ended = record.metadata.get("ended") or {"reason": "interrupted", "trip": "none"}
             trip = Trip[str(ended["trip"]).upper()]
             goes_on = _has_samples(self.path(len(made.rounds) + 1))

@@ -34,7 +34,7 @@ SAFE = 0.97  # of the critical level: largest output that is allowed
 SEARCH = GradientSettings(num_updates=100, learning_rate=0.15, margin=0.95, penalty_weight=100.0)
 
 _STARTS = 2  # of the search
-_FACTORS = np.concatenate([np.linspace(1.15, 0.8, 15), np.geomspace(0.75, 0.02, 12)])
+FACTORS = np.concatenate([np.linspace(1.15, 0.8, 15), np.geomspace(0.75, 0.02, 12)])
 
 
 class Region(eqx.Module):
@@ -163,7 +163,7 @@ def redesigned(
         return jnp.max(jax.vmap(of)(inputs))
 
     def line_search(actions: Array) -> tuple[Array, Array, Array]:
-        scaled = jnp.clip(jnp.asarray(_FACTORS)[:, None, None, None] * actions[None], -1, 1)
+        scaled = jnp.clip(jnp.asarray(FACTORS)[:, None, None, None] * actions[None], -1, 1)
         sizes = jax.lax.map(lambda own: largest(middle + half * own), scaled)
         first = jnp.argmax(sizes < SAFE)  # the largest factor that is safe
         inputs = middle + half * scaled[first]

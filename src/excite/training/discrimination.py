@@ -1,0 +1,188 @@
+"""The signal that tells rival plants apart.
+
+Two rivals are as far apart as the outputs of a plant of one are from those of the nearest plant
+of the other, in standard deviations of the noise (T-optimality: A. Atkinson, V. Fedorov, The
+design of experiments for discriminating between two rival models, 1975). The nearest plant is
+searched again for every signal, and what earlier records tell of it counts.
+
+The rival with the largest evidence is the wrong one with a probability of at most the sum over
+all pairs of sqrt(p_i p_j) exp(-D_ij / 8), with their probabilities p before and the squared
+distance D (T. Kailath, The divergence and Bhattacharyya distance measures in signal selection,
+1967). The signal makes this bound small, on average over plants of each rival, and is safe for
+all of them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..environment.falsification import nearness
+from ..estimation.evidence import Fit, Rival, nearest, probabilities
+from ..safety import safe_input
+from .gradient import GradientSettings, mean_excess, optimiser
+from .redesign import FACTORS, JUDGES, SAFE
+from .redesign import SEARCH as REDESIGN
+
+SEARCH = dataclasses.replace(REDESIGN, num_updates=40)
+
+_PLANTS, _WATCHED = 4, 12  # of each rival: of the bound, and of the penalty
+_WIDE = 4.0  # standard deviations up to which a plant is possible, for safety
+_STEPS = 20  # of the last search for the nearest plants
+
+
+class Discriminating(eqx.Module):
+    """The best safe signal of a search.
+
+    Attributes:
+        inputs: in the inputs' units.
+        bounds: of every start, on the probability that the wrong rival is chosen; infinite
+            where no safe signal was found.
+        nearness: largest output over its critical level, on plants of all rivals, coast included.
+    """
+
+    inputs: Float[Array, "time input"]
+    bounds: Float[Array, " start"]
+    nearness: Float[Array, ""]
+
+
+def error_bound(probabilities: Float[Array, " rival"]) -> Float[Array, ""]:
+    """The bound before an experiment, from the rivals' probabilities."""
+    roots = jnp.sqrt(probabilities)
+    return (jnp.sum(roots) ** 2 - 1) / 2
+
+
+@eqx.filter_jit
+def discriminating(
+    rivals: Sequence[Rival],
+    fits: Sequence[Fit],
+    starts: Float[Array, "start time input"],
+    coast: int,
+    settings: GradientSettings = SEARCH,
+) -> Discriminating:
+    """A signal, played from rest, that tells rivals apart and is safe for the plants of all.
+
+    Args:
+        rivals: with the same inputs and outputs, and the sensor of the experiment.
+        fits: what is known of each.
+        starts: of the search, side by side.
+        coast: samples after the experiment in which it must be safe too.
+        settings: of the search by Adam, and of its penalty of outputs near a level.
+    """
+    first = rivals[0].box.plant
+    lower, upper = (x[None] for x in first.input_limits)
+    middle, half = (lower + upper) / 2, (upper - lower) / 2
+    rest = jnp.tile(jnp.asarray(safe_input(first.definition)), (coast, 1))
+    plants = [_possible(fit, _PLANTS) for fit in fits]
+    judges = [_possible(fit, JUDGES, _WIDE) for fit in fits]
+    log_p = jnp.log(probabilities(fits))
+    others = [[j for j in range(len(rivals)) if j != i] for i in range(len(rivals))]
+
+    def seen(rival: Rival, z: Array, inputs: Array) -> Array:
+        outputs = jax.vmap(rival.response, (0, None))(z, inputs)
+        return (outputs / first.sensor.sd[None, None]).reshape(len(z), -1)
+
+    def targets(inputs: Array) -> list[Array]:
+        """For each rival, the outputs of the others' plants."""
+        all_seen = [seen(r, z, inputs) for r, z in zip(rivals, plants, strict=True)]
+        return [jnp.concatenate([all_seen[j] for j in own]) for own in others]
+
+    def searched(inputs: Array, starts: list[Array], num_steps: int) -> list[Array]:
+        """For each rival, its plants nearest to those of the others."""
+
+        def of(rival: Rival, fit: Fit, target: Array, start: Array) -> Array:
+            def residual(z: Array) -> Array:
+                return seen(rival, z[None], inputs)[0] - target
+
+            return nearest(residual, fit, start, num_steps)[0]
+
+        return [
+            jax.vmap(of, (None, None, 0, 0))(*each)
+            for each in zip(rivals, fits, targets(inputs), starts, strict=True)
+        ]
+
+    def log_bound(inputs: Array, near: list[Array]) -> Array:
+        """The bound's logarithm, where these are the nearest plants."""
+        terms = []
+        for i, target in enumerate(targets(inputs)):
+            change = near[i] - fits[i].z[None]
+            before = jnp.einsum("pi,ij,pj->p", change, fits[i].information, change)
+            D = before + jnp.sum((seen(rivals[i], near[i], inputs) - target) ** 2, axis=1)
+            pair = (log_p[i] + log_p[jnp.array(others[i])]) / 2
+            terms.append(jnp.repeat(pair, _PLANTS) - D / 8)
+        return jax.nn.logsumexp(jnp.concatenate(terms)) - math.log(2 * _PLANTS)
+
+    def outputs(inputs: Array, count: int) -> Array:
+        """Of possible plants of all rivals, coast included."""
+        whole = jnp.concatenate([inputs, rest])
+        return jnp.concatenate(
+            [
+                jax.vmap(rival.response, (0, None))(z[:count], whole)
+                for rival, z in zip(rivals, judges, strict=True)
+            ]
+        )
+
+    def beyond(inputs: Array) -> Array:
+        over = jax.vmap(lambda own: mean_excess(first, own, settings.margin))
+        return jnp.mean(over(outputs(inputs, _WATCHED)))
+
+    def largest(inputs: Array) -> Array:
+        return jnp.max(jax.vmap(lambda own: nearness(first, own))(outputs(inputs, JUDGES)))
+
+    def loss(latent: Array, near: list[Array]) -> Array:
+        inputs = middle + half * jnp.tanh(latent)
+        return log_bound(inputs, near) + settings.penalty_weight * beyond(inputs)
+
+    adam = optimiser(settings)
+    unmoved = [
+        jnp.tile(fit.z, (_PLANTS * len(own), 1)) for fit, own in zip(fits, others, strict=True)
+    ]
+
+    def search(inputs: Array) -> Array:
+        latent = jnp.arctanh(jnp.clip((inputs - middle) / half, -0.98, 0.98))
+
+        def update(now: tuple, _: None) -> tuple[tuple, None]:
+            latent, near, state = now
+            near = searched(middle + half * jnp.tanh(latent), near, 1)
+            change, state = adam.update(jax.grad(loss)(latent, near), state)
+            return (latent + change, near, state), None
+
+        begin = (latent, unmoved, adam.init(latent))
+        (latent, _, _), _ = jax.lax.scan(update, begin, length=settings.num_updates)
+        return jnp.tanh(latent)
+
+    def line_search(actions: Array) -> tuple[Array, Array, Array]:
+        scaled = jnp.clip(jnp.asarray(FACTORS)[:, None, None] * actions[None], -1, 1)
+        sizes = jax.lax.map(lambda own: largest(middle + half * own), scaled)
+        at = jnp.argmax(sizes < SAFE)  # the largest factor that is safe
+        inputs = middle + half * scaled[at]
+        found = jnp.exp(log_bound(inputs, searched(inputs, unmoved, _STEPS)))
+        return inputs, jnp.where(sizes[at] < SAFE, found, jnp.inf), sizes[at]
+
+    inputs, bounds, sizes = jax.lax.map(lambda own: line_search(search(own)), starts)
+    best = jnp.argmin(bounds)
+    return Discriminating(inputs[best], bounds, sizes[best])
+
+
+def _possible(
+    fit: Fit, count: int, distance: float | None = None
+) -> Float[Array, "plant quantity"]:
+    """Plants that are possible: the best fit, and others drawn around it.
+
+    They are drawn as probable as they are, or lie so many standard deviations away, the first of
+    them on the axes.
+    """
+    size = len(fit.z)
+    values, axes = jnp.linalg.eigh(fit.information)
+    units = jax.random.normal(jax.random.key(0), (count, size))
+    if distance is not None:
+        units = units / jnp.linalg.norm(units, axis=1)[:, None]
+        units = distance * jnp.concatenate([jnp.eye(size), -jnp.eye(size), units])
+    units = jnp.concatenate([jnp.zeros((1, size)), units])[:count]
+    return fit.z[None] + (units / jnp.sqrt(values)[None]) @ axes.T
