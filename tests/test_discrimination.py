@@ -83,7 +83,8 @@ def test_before_an_experiment_all_rivals_are_as_probable():
     found = ex.discriminate(RIVALS, steps=STEPS, coast=COAST)
     assert [r.probability for r in found.rivals] == [0.5, 0.5]
     assert found.bounds[0] == pytest.approx(0.5)  # of two: the root of 0.5 * 0.5
-    assert float(error_bound(jnp.asarray([0.9, 0.1]))) == pytest.approx(0.3)
+    assert float(error_bound(jnp.asarray([0.5, 0.4, 0.1]))) == pytest.approx(0.5)
+    assert float(error_bound(jnp.asarray([0.999, 0.001]))) == pytest.approx(0.001)
     assert float(error_bound(jnp.asarray([1.0, 0.0]))) == 0.0
 
 
@@ -119,9 +120,13 @@ def test_the_bound_of_two_known_plants_is_that_of_kailath_and_holds():
                       for r in rivals)  # fmt: skip
     D = float(np.sum((ideal - lagging) ** 2)) / sd**2
     assert D > 0
-    bound = float(jnp.min(made.bounds))
+    bound = float(jnp.exp(jnp.min(made.log_bounds)))
     assert bound == pytest.approx(0.5 * math.exp(-D / 8), rel=1e-6)
     assert norm.cdf(-math.sqrt(D) / 2) <= bound  # the error of the likelihood ratio
+    for start in starts:  # as loud as the input may be
+        loud = start * 24 / jnp.max(jnp.abs(start))
+        one, other = (np.asarray(r.response(jnp.zeros(len(r.box.names)), loud)) for r in rivals)
+        assert float(np.sum((one - other) ** 2)) / sd**2 < D
 
 
 @pytest.mark.parametrize(
@@ -159,11 +164,18 @@ def test_where_no_plant_explains_the_records_none_is_chosen():
     [
         (["aero2"], {}, "at least two plants are needed: got 1"),
         (["aero2", "aero2"], {}, "aero2 is given twice"),
-        (["aero2", "dc_motor"], {}, "rivals need the same outputs: dc_motor has speed, current"),
+        (
+            ["aero2", "dc_motor"],
+            {},
+            "the same outputs: name of dc_motor is speed, current; of aero2 ",
+        ),
         (["aero2", "aero2_lag,tau"], {}, "'tau' is no range: a rival is PLANT,NAME=LOW:HIGH"),
         (["aero2", "aero2_lag,tua=1:2"], {}, "rival 'aero2_lag,tua=1:2': unknown quantity"),
         (["aero2", "aero2_lag,tau=2:1"], {}, "range of tau contains no plant"),
         (["aero2", "aero2+lag"], {}, "rival 'aero2+lag': range of lag_voltage needs two numbers"),
+        (["aero2", f"{LAG},noise=1:2"], {}, "the noise is that of the first plant's sensor"),
+        (["aero2", f"{LAG},tau=1:2"], {}, "the range of tau is given twice"),
+        (["aero2", ("aero2_lag", {"tau": [1]})], {}, "range of tau must be two numbers"),
         (RIVALS, {"spread": 2.0}, "spread must lie in"),
         (RIVALS, {"steps": 1}, "steps must be a whole number"),
         (RIVALS, {"initial_state": "free"}, "initial_state must be auto or known: got 'free'"),
@@ -175,11 +187,50 @@ def test_rivals_that_cannot_be_compared_are_one_sentence(plants, options, words)
         ex.discriminate(plants, **options)
 
 
+class Weaker(Aero2Lag):
+    """Of which less is allowed."""
+
+    definition = dataclasses.replace(
+        Aero2Lag.definition,
+        name="weaker",
+        outputs=(dataclasses.replace(Aero2Lag.definition.outputs[0], critical_level=0.6),),
+    )
+
+
+def test_a_rival_with_another_level_is_refused():
+    with pytest.raises(ValueError, match=r"same outputs: critical level of weaker is 0\.6; of aer"):
+        ex.discriminate(["aero2", Weaker])
+    with pytest.raises(ValueError, match=r"critical level of aero2 is 0\.69"):
+        ex.discriminate([Weaker, "aero2"])
+
+
+def test_of_a_record_with_a_gap_the_part_before_it_counts():
+    record = ex.simulate("aero2_lag", "prbs", steps=60, params={"tau": 0.1}, seed=1)
+    rows = np.r_[:30, 36:61]
+    gap = dataclasses.replace(
+        record, time=record.time[rows], inputs=record.inputs[rows], outputs=record.outputs[rows]
+    )
+    found = ex.discriminate(RIVALS, gap)
+    assert found.chosen is not None
+    assert found.chosen.name == LAG
+    cut = dataclasses.replace(
+        record, time=record.time[:30], inputs=record.inputs[:30], outputs=record.outputs[:30]
+    )
+    same = ex.discriminate(RIVALS, cut)
+    misfits, expected = ([r.misfit_factor for r in f.rivals] for f in (found, same))
+    assert misfits == pytest.approx(expected)
+
+
+def test_ranges_are_part_of_a_rivals_name():
+    rivals = rivals_from(["aero2", ("aero2_lag", {"tau": (0.05, 0.1)}), LAG], 0.3)
+    assert [rival.name for rival in rivals] == ["aero2", "aero2_lag,tau=0.05:0.1", LAG]
+
+
 def test_a_record_from_elsewhere_is_refused():
     moving = dataclasses.replace(ex.simulate("aero2", "chirp", steps=40), metadata={})
     with pytest.raises(ValueError, match="does not say that it starts at rest"):
         ex.discriminate(RIVALS, moving)
-    with pytest.raises(ValueError, match="has 1 inputs and 2 outputs; aero2 has 1 and 1"):
+    with pytest.raises(ValueError, match="has 1 inputs and 2 outputs; plant 'aero2' has 1 and 1"):
         ex.discriminate(RIVALS, ex.simulate(DCMotor(), "chirp", steps=40))
     with pytest.raises(TypeError, match="plants must be a list of at least two plants"):
         ex.discriminate("aero2")
@@ -196,9 +247,16 @@ def test_the_command_writes_the_signal_and_says_what_python_says(tmp_path):
     assert told == json.loads(json.dumps(found.to_dict()))
     assert done.returncode == 0
     written = ex.read_record(out)
-    np.testing.assert_allclose(written.inputs[:-1], found.inputs, rtol=1e-6)
+    np.testing.assert_allclose(written.inputs[:-1], found.excitation.inputs, rtol=1e-6)
     assert plot.read_bytes().startswith(b"\x89PNG")
     assert max(map(len, repr(found).splitlines())) <= 80
+    record = tmp_path / "record.csv"
+    ex.simulate("aero2", found.excitation, steps=STEPS, seed=4).save(record)
+    known = excite(*arguments, "--record", record, "--out", tmp_path / "none.csv")
+    assert known.returncode == 0
+    assert "aero2 is chosen (probability 1.0000)" in known.stdout
+    assert "no signal was designed" in known.stderr
+    assert not (tmp_path / "none.csv").exists()
     again = excite(*arguments, "--out", out)
     assert again.returncode == 2
     assert "exists" in again.stderr
@@ -231,6 +289,26 @@ def test_a_campaign_ends_where_no_rival_explains_the_records():
     assert campaign.reason.startswith("no rival explains the records")
     assert told.known == {}
     assert campaign.ask() is None
+    last = ex.Campaign("aero2", {"J_p": "2%"}, rivals=[LAG], spread=0.3, coast=COAST, rounds=1)
+    last.tell(record)
+    assert last.reason.startswith("no rival explains the records")  # and not the end of the budget
+
+
+def test_a_choice_that_a_later_record_contradicts_is_made_again():
+    campaign = ex.Campaign("aero2", {"D_p": "0.001%"}, rivals=[LAG], spread=0.3, coast=COAST)
+    asked = campaign.ask()
+    campaign.tell(ex.simulate("aero2", asked, steps=STEPS, seed=5))
+    assert campaign.plant.description.name == "aero2"
+    other = ex.simulate("aero2+offset", asked, steps=STEPS, params={"offset_voltage": 8.0}, seed=6)
+    campaign.tell(other)
+    assert campaign.reason.startswith("no rival explains the records")
+
+
+def test_a_campaign_ends_where_no_signal_is_safe():
+    given = f"{LAG},initial_pitch=-0.69:0.69"  # beyond the level in the free motion
+    campaign = ex.Campaign("aero2", {"J_p": "2%"}, rivals=[given], spread=0.3, coast=COAST)
+    assert campaign.ask() is None
+    assert campaign.reason == "undecided; no safe signal was found"
 
 
 def test_targets_are_parameters_of_every_rival():
@@ -261,10 +339,10 @@ def test_a_campaign_on_a_rig_is_resumed_with_the_same_decisions(tmp_path):
         (tmp_path / "again" / name).write_bytes((tmp_path / "first" / name).read_bytes())
     again = played("again")
     assert again.to_dict() == first.to_dict()
-    with pytest.raises(ValueError, match=r"is another campaign, with rivals \['aero2', "):
+    with pytest.raises(ValueError, match=r"is another campaign, with rivals \{'aero2': "):
         ex.campaign(
             "aero2", {"J_p": "1%"}, str(tmp_path / "truth.json"), coast=COAST, rounds=4,
             fast=True, out=tmp_path / "again",
         )  # fmt: skip
-    with pytest.raises(ValueError, match="give rivals or a guard"):
+    with pytest.raises(ValueError, match="guard and filter know one plant"):
         ex.campaign("aero2", {"J_p": "1%"}, rivals=[LAG], guard=True, out=tmp_path / "none")

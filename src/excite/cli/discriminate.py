@@ -86,7 +86,10 @@ def discriminate(
 
     with progress_bar("discriminate") as progress:
         found = verb(plants, records, progress=progress, **options)
-    if plot is not None and found.inputs is not None:
+    if found.inputs is None:
+        for path in filter(None, (options["out"], plot)):
+            click.echo(f"no signal was designed: {path} is not written", err=True)
+    elif plot is not None:
         from ..record.figure import save
 
         save(found.plot(), plot)

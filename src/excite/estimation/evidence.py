@@ -25,6 +25,7 @@ from .contract import Experiments, residual_of
 
 _STEPS, _STARTS = 40, 16  # of the searches for the best fit
 _DAMPING = 1e-2, 1e-9, 1e9  # first, smallest, largest; in diagonals of the information
+_LOST = -1e30  # logarithm of the evidence where every simulation diverged
 _LONGEST = 1.0  # step of a search, in each z
 
 
@@ -57,7 +58,7 @@ class Fit(eqx.Module):
     Attributes:
         z: of the best fit.
         information: at the best fit, of records and box together.
-        log_evidence: of the records, but for a constant that all rivals share.
+        log_evidence: of the records, up to a constant that all rivals share.
         misfit: sum of squared residuals over the noise's variance.
     """
 
@@ -90,7 +91,9 @@ def fitted(rival: Rival, experiments: Experiments) -> Fit:
     z, S = ends[jnp.argmin(costs)], jax.jacfwd(residual)(ends[jnp.argmin(costs)])
     information = S.T @ S + before.information
     evidence = -0.5 * (jnp.min(costs) + jnp.linalg.slogdet(information)[1])
-    return Fit(z, information, evidence, jnp.sum(residual(z) ** 2))
+    fit = Fit(z, information, evidence, jnp.sum(residual(z) ** 2))
+    lost = Fit(before.z, before.information, jnp.asarray(_LOST), jnp.asarray(jnp.inf))
+    return jax.tree.map(lambda own, other: jnp.where(jnp.isfinite(evidence), own, other), fit, lost)
 
 
 def nearest(
@@ -110,9 +113,15 @@ def nearest(
         found = jnp.sum(values**2) + change @ known.information @ change
         return jnp.where(jnp.isfinite(found), found, jnp.inf)
 
+    def both(z: Array) -> tuple[Array, Array]:
+        values = residual(z)
+        return values, values
+
+    with_slopes = jax.jacfwd(both, has_aux=True)
+
     def step(now: tuple, _: None) -> tuple[tuple, None]:
         z, least, damping = now
-        values, S = residual(z), jax.jacfwd(residual)(z)
+        S, values = with_slopes(z)
         A = S.T @ S + known.information
         b = S.T @ values + known.information @ (z - known.z)
         move = jnp.linalg.solve(A + damping * jnp.diag(jnp.diagonal(A)), -b)

@@ -181,10 +181,10 @@ def identify(
             file that cannot be used, and for a name or a value that is not allowed.
         TypeError: for an argument of another type.
     """
-    given = _listed(records, "records")
+    given = records_in(records, "records")
     if not given:
         raise ValueError("no record is given")
-    held_out = _listed(validate, "validate")
+    held_out = records_in(validate, "validate")
     if validate_columns and not held_out:
         raise ValueError("validate_columns need a held-out record (--validate)")
     plant = plant_from(plant_named_by(given[0]) if plant is None else plant)
@@ -207,7 +207,7 @@ def identify(
     progress("reading", 0.0, 1.0)
     of_files = {"scales": scales, "units": units, "set_inputs": set_inputs, "dt": dt, "rows": rows}
     _require_files([*given, *held_out], columns=columns, **of_files)
-    read = partial(_read, plant.description, **of_files)
+    read = partial(record_for, plant.description, **of_files)
     of_held_out = by_name("columns", columns) | by_name("validate_columns", validate_columns)
     records = [read(record, columns=columns) for record in given]
     validation = [read(record, columns=of_held_out) for record in held_out]
@@ -314,7 +314,7 @@ def identify(
     )
 
 
-def _listed(records: RecordLike | Sequence[RecordLike], what: str) -> list[RecordLike]:
+def records_in(records: RecordLike | Sequence[RecordLike], what: str) -> list[RecordLike]:
     """One or several records as a list."""
     listed = [records] if isinstance(records, RecordLike) else records
     allowed = "a record or the path of an experiment file, or several"
@@ -347,7 +347,7 @@ def _require_files(records: Sequence[RecordLike], **options: object) -> None:
                 raise ValueError(f"{name} is for files, and the records are given as objects")
 
 
-def _read(description: PlantDescription, given: RecordLike, **options: Any) -> Record:
+def record_for(description: PlantDescription, given: RecordLike, **options: Any) -> Record:
     """A record or that of a file; ValueError where it does not have the plant's columns."""
     if not isinstance(given, Record):
         return read_record(given, description, **options)

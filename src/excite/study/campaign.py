@@ -24,8 +24,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..description import PlantDescription, Spread, SpreadLike, names_of, path_from, require_whole
+from ..description import (
+    PlantDescription,
+    Spread,
+    SpreadLike,
+    names_of,
+    path_from,
+    require_whole,
+    wrong_type,
+)
 from ..environment import run_episodes
+from ..estimation import Status
 from ..estimation.identify import RecordLike, identify
 from ..estimation.result import Identification
 from ..excitation import PolicyExcitation, Replay
@@ -134,7 +143,7 @@ class Campaign:
     Attributes:
         declared: the plant as it was given.
         plant: as identification knows it: the declared one, or the rival that was chosen.
-        discrimination: of the rivals after the last round; None where there are none.
+        discrimination: of the rivals, when they were last compared; None where there are none.
         targets: by parameter.
         policy: that is played in the first round.
         redesign: whether the policy is compared with redesigned signals in later rounds.
@@ -197,6 +206,8 @@ class Campaign:
         require_whole("coast", self.coast, 0)
         self.redesign = redesign
         self.discrimination: Discrimination | None = None
+        if isinstance(rivals, str) or not isinstance(rivals, Sequence):
+            raise wrong_type("rivals", rivals, "a list of plants")
         if rivals:
             self.discrimination = judged(rivals_from([self.plant, *rivals], self.spread), [])
             for rival in self.discrimination.rivals:
@@ -231,6 +242,9 @@ class Campaign:
         if self.result is not None and self.redesign and self.next is None:
             self.next = self._next(self.result)
         chosen = None if self.next is None else self.next.chosen
+        if self.next is not None and chosen is None and self.plant is not self.declared:
+            self.reason = self.next.decision  # nothing is known of the policy on this plant
+            return None
         return self.policy if chosen is None else chosen.excitation
 
     @property
@@ -279,13 +293,16 @@ class Campaign:
             raise ValueError("the record of a round needs at least two samples: got one")
         self.records.append(record)
         played, structure = self._played(record), ""
-        if self.discrimination is not None and self.is_undecided:
-            self.discrimination = self.discrimination.after(self.records, _PADDED)
-            self.plant = self.discrimination.plant or self.plant
-            structure = self.discrimination.decision
+        if self.is_undecided:
+            structure = self._compare()
         count, status = len(record.time) - 1, structure
         if not self.is_undecided:
             status = self._identify()
+            is_explained = self.result is not None and self.result.misfit_factor <= 1
+            is_doubtful = status != Status.SUCCESSFUL.sentence or not is_explained
+            if self.discrimination is not None and not structure and is_doubtful:
+                structure = self._compare()  # the record may contradict an earlier choice
+                status = structure if self.is_undecided else self._identify()
         sizes = np.abs(record.outputs) / critical_levels(d)[None]
         near = float(np.nanmax(sizes, initial=0.0))
         known = {} if self.result is None else known_of(self.result)
@@ -296,10 +313,10 @@ class Campaign:
             self.reason = f"unsafe: {ended if unsafe else 'a critical level was reached'}"
         elif shares and max(shares.values()) <= 1:
             self.reason = REACHED
-        elif sum(e in WHOLE for e in [*(r.ended for r in self.rounds), ended]) >= self.most_rounds:
-            self.reason = "all rounds are played"
         elif self.discrimination is not None and not self.discrimination.is_explained:
             self.reason = structure
+        elif sum(e in WHOLE for e in [*(r.ended for r in self.rounds), ended]) >= self.most_rounds:
+            self.reason = "all rounds are played" + f"; {structure}" * self.is_undecided
         missing = farthest(shares) if shares else f"there is no estimate yet ({status})"
         decision = f"end: {self.reason}" if self.reason else f"go on: {missing}"
         if structure and not self.is_undecided:
@@ -308,6 +325,17 @@ class Campaign:
         self.rounds.append(told)
         self.next = None
         return told
+
+    def _compare(self) -> str:
+        """Compares the rivals; the plant is the one that is chosen. Returns the decision."""
+        if self.discrimination is None:
+            return ""
+        self.discrimination = self.discrimination.after(self.records, _PADDED)
+        if self.is_undecided or self.discrimination.plant is not self.plant:
+            self.result = None
+        self.plant = self.discrimination.plant or self.plant
+        self.warnings = _warnings(self.policy, self.plant, self.spread)
+        return self.discrimination.decision
 
     def _identify(self) -> str:
         """Identifies all records together; returns the status."""
@@ -395,7 +423,7 @@ class Campaign:
             "most_rounds": self.most_rounds,
             "coast": self.coast,
             "redesign": self.redesign,
-            "rivals": [] if self.discrimination is None else self.discrimination.names,
+            "rivals": {} if self.discrimination is None else self.discrimination.plants,
             "structure": self.discrimination and self.discrimination.to_dict(),
             "warnings": list(self.warnings),
             "expected": self.prediction,
@@ -447,9 +475,13 @@ class Campaign:
             text_table(self.title, self.header, self.rows()),
             text_table("rounds", self.round_header, self.round_rows()),
         ]
+        if self.discrimination is not None and self.is_undecided:
+            rows = self.discrimination.rows()
+            tables.append(text_table("rivals", self.discrimination.header, rows))
         told = [f"warning: {sentence}" for sentence in self.warnings]
         if self.prediction:
-            told.append(f"expected before the first round: {self.prediction}")
+            without = ", without the rounds for rivals" * (self.discrimination is not None)
+            told.append(f"expected before the first round{without}: {self.prediction}")
         tables += [textwrap.fill(sentence, 80) for sentence in told]
         return "\n".join(tables)
 

@@ -98,8 +98,8 @@ def campaign(
         redesign=redesign and not guard,  # a guard knows its policy
         rivals=rivals,
     )  # fmt: skip
-    if rivals and guard:
-        raise ValueError("a guard knows one plant and its policy: give rivals or a guard")
+    if rivals and (guard or filter):
+        raise ValueError("guard and filter know one plant: they do not go together with rivals")
     require_whole("seed", seed, 0, LARGEST_SEED)
     if not 0 <= as_number("pause", pause) < 1e5:
         raise ValueError(f"pause must be a number of seconds, not below 0: got {pause!r}")
@@ -138,14 +138,18 @@ def campaign(
                     break
             progress(f"preparing round {count + 1}", count, rounds)
             if (asked := made.ask()) is None:
+                folder.write(made)
                 break
             played, signals = _played(
                 made, asked, opened(count), folder.path(count), filter, guard,
                 lambda count=count: progress(f"round {count + 1}", count, rounds),
             )  # fmt: skip
-            outcome = played.outcome
+            outcome, warned = played.outcome, made.warnings
             if _has_samples(folder.path(count)):
                 on_round(_taken(made, played.record, outcome.reason, outcome.trip))
+            for sentence in made.warnings:
+                if sentence not in warned:
+                    on_warning(sentence)
             if outcome.error is not None or (outcome.reason not in WHOLE and not made.reason):
                 made.interrupted = outcome.reason
             elif signals and not made.reason:
@@ -225,7 +229,8 @@ class _Folder:
         file = root / "campaign.json"
         if file.is_file() and (root / "round-01.csv").exists():
             before = read_json(file, "settings", "rounds")["settings"]
-            other = [name for name, value in settings.items() if before.get(name) != value]
+            # One that is missing was not there when the folder was begun.
+            other = [n for n, value in settings.items() if before.get(n, type(value)()) != value]
             if other:
                 raise ValueError(
                     f"{root} is another campaign, with {other[0]} {before.get(other[0])!r} and not "

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +20,7 @@ from ..description import (
     LARGEST_SEED,
     RARE,
     SpreadLike,
+    by_name,
     path_from,
     require_whole,
     wrong_type,
@@ -26,14 +28,14 @@ from ..description import (
 from ..estimation import Experiments
 from ..estimation.diagnosis import chi2_tail
 from ..estimation.evidence import Fit, Rival, fitted, probabilities, unplayed
-from ..estimation.from_records import experiments_of, sampled_as
-from ..estimation.identify import RecordLike
+from ..estimation.from_records import experiments_of, parts_of, sampled_as
+from ..estimation.identify import RecordLike, record_for, records_in
 from ..excitation import Replay
 from ..information import require_noise
 from ..plant import AbstractPlant
 from ..plant.catalogue import PlantLike, plant_from
 from ..plant.uncertainty import Range, Uncertainty
-from ..record import Record, read_record, require_record_path, write_record
+from ..record import Record, require_record_path, write_record
 from ..report.numbers import digits_for, number
 from ..report.tables import html_table, text_table
 from ..rig.contract import Interval
@@ -48,6 +50,7 @@ if TYPE_CHECKING:
 RivalLike: TypeAlias = PlantLike | tuple[PlantLike, Mapping[str, Range]]
 """A plant, and ranges of its parameters: `"aero2_lag,tau=0.05:0.25"` or a pair of the two."""
 
+_SMALLEST = 1e-99  # bound that is told
 DECIDED = 0.99  # probability at which a rival is chosen
 
 
@@ -79,7 +82,8 @@ class Discrimination:
         rivals: in the order in which they were given.
         inputs: of the experiment, in the inputs' units; None where no safe one was found, or one
             rival is chosen.
-        bounds: on the probability that the wrong rival is chosen, now and after the experiment.
+        bounds: on the probability that the wrong rival has the largest evidence, now and after
+            the experiment: an estimate; see `excite.training.discrimination`.
         nearness: largest output over its critical level, on plants of all rivals that are still
             possible, coast included; NaN where no experiment was designed.
     """
@@ -103,9 +107,9 @@ class Discrimination:
         return any(rival.explains for rival in self.rivals)
 
     @property
-    def names(self) -> list[str]:
-        """Of the rivals, in the order in which they were given."""
-        return [rival.name for rival in self.rivals]
+    def plants(self) -> dict[str, str]:
+        """Hash of each rival's plant, by the rival's name."""
+        return {rival.name: rival.box.plant.description.hash for rival in self._rivals}
 
     @property
     def plant(self) -> AbstractPlant | None:
@@ -132,10 +136,12 @@ class Discrimination:
         if self.inputs is None:
             if not np.isnan(self.nearness):
                 return "undecided; no safe signal was found"
-            return f"undecided; {best.name} has a probability of {best.probability:.2f}"
+            told = ", ".join(f"{r.name} {r.probability:.2f}" for r in self.rivals)
+            return f"undecided; probabilities: {told}"
         return (
-            f"undecided; play the signal of {len(self.inputs)} samples: it lowers the bound on "
-            f"the probability of a wrong choice from {before:.2g} to {after:.2g}"
+            f"undecided; play the signal of {len(self.inputs)} samples: it lowers the probability "
+            f"of a wrong choice from at most {before:.2g} to at most "
+            f"{max(after, _SMALLEST):.2g} (estimated)"
         )
 
     @property
@@ -189,9 +195,7 @@ class Discrimination:
                 {
                     "plant": r.name,
                     "probability": r.probability,
-                    "misfit_factor": r.misfit_factor
-                    if r.misfit_factor == r.misfit_factor
-                    else None,
+                    "misfit_factor": _finite(r.misfit_factor),
                     "explains": r.explains,
                     "estimate": {n: interval._asdict() for n, interval in r.estimate.items()},
                 }
@@ -200,7 +204,7 @@ class Discrimination:
             "chosen": None if self.chosen is None else self.chosen.name,
             "decision": self.decision,
             "num_steps": None if self.inputs is None else len(self.inputs),
-            "error_bound": {"now": self.bounds[0], "after": _finite(self.bounds[1])},
+            "error_bound": {"now": _finite(self.bounds[0]), "after": _finite(self.bounds[1])},
             "nearness": _finite(self.nearness),
         }
 
@@ -216,7 +220,8 @@ class Discrimination:
                 for name, (value, half) in r.estimate.items()
                 if name not in shared
             ]
-            rows.append([r.name, f"{r.probability:.4f}", number(r.misfit_factor), ", ".join(own)])
+            probability = f"{r.probability:.4f}" if self.is_explained else "–"
+            rows.append([r.name, probability, number(r.misfit_factor), ", ".join(own)])
         return rows
 
     def __repr__(self) -> str:
@@ -261,7 +266,8 @@ def discriminate(
         coast: samples after the experiment in which the plant must be safe too.
         initial_state: "known" where the records are from rest and their sidecars do not say so.
         seed: of the starts of the search.
-        out: file of the experiment (.csv, .mat); `excite run --input` plays it.
+        out: file of the experiment (.csv, .mat), which `excite run --input` plays; it is not
+            written where no experiment is needed, or none is safe.
         overwrite: replaces an existing file.
         progress: called with a text, how much is done, and the total.
 
@@ -271,14 +277,14 @@ def discriminate(
         TypeError: for an argument of another type.
     """
     require_whole("steps", steps, 2, 10_000)
+    given = records_in(records, "records") if records != () else []
     require_whole("coast", coast, 0)
     require_whole("seed", seed, 0, LARGEST_SEED)
     if initial_state not in ("auto", "known"):
         raise ValueError(f"initial_state must be auto or known: got {initial_state!r}")
     if out is not None:
-        require_record_path(Path(out), overwrite)
+        require_record_path(path_from("out", out), overwrite)
     rivals = rivals_from(plants, spread)
-    given = [records] if isinstance(records, str | Path | Record) else list(records)
     own = [_from_rest(record, rivals[0], initial_state) for record in given]
     progress("comparing", 0, 2)
     found = judged(sampled_like(rivals, own), own)
@@ -292,7 +298,12 @@ def discriminate(
 
 
 def rivals_from(given: Sequence[RivalLike], spread: SpreadLike) -> tuple[Rival, ...]:
-    """Rivals with the sensor of the first; ValueError for those that cannot be compared."""
+    """Rivals with the sensor and the sampling time of the first.
+
+    Raises:
+        ValueError: for rivals with other inputs, outputs, units, limits or levels.
+        TypeError: for an argument of another type.
+    """
     if isinstance(given, str) or not isinstance(given, Sequence):
         raise wrong_type("plants", given, "a list of at least two plants")
     if len(given) < 2:
@@ -300,77 +311,91 @@ def rivals_from(given: Sequence[RivalLike], spread: SpreadLike) -> tuple[Rival, 
     rivals = [_rival(own, spread) for own in given]
     first = rivals[0].box.plant
     require_noise(first)
-    for name, d in [(rival.name, rival.box.plant.definition) for rival in rivals]:
-        for what in ("inputs", "outputs"):
-            own, others = ([p.name for p in getattr(x, what)] for x in (d, first.definition))
-            if own != others:
-                raise ValueError(
-                    f"rivals need the same {what}: {name} has {', '.join(own) or 'none'}, "
-                    f"{rivals[0].name} has {', '.join(others) or 'none'}"
-                )
-        if not d.inputs:
-            raise ValueError(f"{name} has no inputs: there is no experiment to design")
+    for rival in rivals:
+        _require_alike(rival, rivals[0])
     names = [rival.name for rival in rivals]
     twice = [name for i, name in enumerate(names) if name in names[:i]]
     if twice:
         raise ValueError(f"{twice[0]} is given twice")
-    return tuple(_changed(r, sensor=first.sensor, dt=first.dt) for r in rivals)
+    return tuple(
+        eqx.tree_at(
+            lambda r: r.box.plant, rival, rival.box.plant.changed(sensor=first.sensor, dt=first.dt)
+        )
+        for rival in rivals
+    )
+
+
+def _require_alike(rival: Rival, first: Rival) -> None:
+    """Raises ValueError where one signal cannot be played, or is not as safe, on both."""
+    d, other = rival.box.plant.definition, first.box.plant.definition
+    if not d.inputs:
+        raise ValueError(f"{rival.name} has no inputs: there is no experiment to design")
+    for what, attributes in (
+        ("inputs", ("name", "unit", "lower", "upper")),
+        ("outputs", ("name", "unit", "warning_level", "critical_level")),
+    ):
+        for attribute in attributes:
+            own, others = (
+                [getattr(part, attribute) for part in getattr(x, what)] for x in (d, other)
+            )
+            if own != others:
+                raise ValueError(
+                    f"rivals need the same {what}: {attribute.replace('_', ' ')} of {rival.name} "
+                    f"is {', '.join(map(str, own))}; of {first.name} {', '.join(map(str, others))}"
+                )
 
 
 def _rival(given: RivalLike, spread: SpreadLike) -> Rival:
-    """One rival, from a plant and ranges."""
+    """One rival, from a plant and ranges; the name tells both."""
     plant, ranges = given if isinstance(given, tuple) and len(given) == 2 else (given, None)
-    name = ""
+    ranges = by_name("ranges", ranges, "a dict of ranges by name")
+    word, texts = plant, []
     if isinstance(plant, str):
-        name, (plant, *texts) = plant, plant.split(",")
-        pairs = [text.partition("=") for text in texts]
-        for text, (what, _, value) in zip(texts, pairs, strict=True):
-            if not (what.strip() and value.strip()):
-                raise ValueError(
-                    f"rival {name!r}: {text!r} is no range: a rival is PLANT,NAME=LOW:HIGH,..."
-                )
-        ranges = {**(ranges or {}), **{what.strip(): value.strip() for what, _, value in pairs}}
-    found = plant_from(plant)
+        word, *texts = plant.split(",")
+    for text in texts:
+        name, _, value = (part.strip() for part in text.partition("="))
+        if not (name and value):
+            raise ValueError(
+                f"rival {plant!r}: {text!r} is no range: a rival is PLANT,NAME=LOW:HIGH,..."
+            )
+        if name in ranges:
+            raise ValueError(f"rival {plant!r}: the range of {name} is given twice")
+        ranges = {**ranges, name: value}
+    found = plant_from(word)
+    title = word if isinstance(word, str) else found.definition.name
+    told = plant if isinstance(plant, str) else title
+    if "noise" in ranges:
+        raise ValueError(f"rival {told!r}: the noise is that of the first plant's sensor")
     try:
         box = Uncertainty.of(found, spread, ranges)
     except ValueError as error:
-        raise ValueError(f"rival {name or found.definition.name!r}: {error}") from None
-    return Rival(name or found.definition.name, box)
+        raise ValueError(f"rival {told!r}: {error}") from None
+    shown = (f"{name}={_shown(value)}" for name, value in ranges.items())
+    return Rival(",".join([title, *shown]), box)
 
 
-def _changed(rival: Rival, **numbers: Any) -> Rival:
-    box = rival.box
-    plant = box.plant.changed(**numbers)
-    return Rival(rival.name, Uncertainty(plant, box.lower, box.upper, box.names, box.is_factor))
+def _shown(given: Range) -> str:
+    """A range as a text."""
+    return given if isinstance(given, str) else ":".join(f"{value:g}" for value in given)
 
 
 def sampled_like(rivals: Sequence[Rival], records: Sequence[Record]) -> tuple[Rival, ...]:
     """The rivals with the sampling time of the records."""
-    if not records:
-        return tuple(rivals)
-    dt = sampled_as(records, rivals[0].box.plant).dt
-    return tuple(_changed(rival, dt=dt) for rival in rivals)
+    return tuple(
+        eqx.tree_at(lambda r: r.box.plant, rival, sampled_as(records, rival.box.plant))
+        if records
+        else rival
+        for rival in rivals
+    )
 
 
 def _from_rest(given: RecordLike, rival: Rival, initial_state: str) -> Record:
     """A record from the plant's initial state; ValueError for any other."""
-    plant = rival.box.plant
-    if isinstance(given, Record):
-        record = given
-    else:
-        path = path_from("record", given, "a record or a path")
-        record = read_record(path, plant.description)
-    where, d = record.source or "the record", plant.definition
-    counts = record.inputs.shape[1], record.outputs.shape[1]
-    if counts != (len(d.inputs), len(d.outputs)):
-        raise ValueError(
-            f"{where} has {counts[0]} inputs and {counts[1]} outputs; {rival.name} has "
-            f"{len(d.inputs)} and {len(d.outputs)}"
-        )
+    record = record_for(rival.box.plant.description, given)
     if initial_state == "auto" and not record.starts_at_initial_state:
         raise ValueError(
-            f"{where} does not say that it starts at rest, as rivals are compared: if it does, say "
-            "so with initial_state='known' (--initial-state known)"
+            f"{record.source or 'the record'} does not say that it starts at rest, which comparing "
+            "rivals needs: if it does, say so with initial_state='known' (--initial-state known)"
         )
     return record
 
@@ -380,23 +405,32 @@ def judged(rivals: Sequence[Rival], records: Sequence[Record], padded: int = 0) 
 
     Args:
         rivals: with the sensor and the sampling time of the records.
-        records: from rest.
+        records: from rest; of one with a gap in time, the part before the gap counts.
         padded: experiments without measurements that are added, up to this number, so that the
             programs of a campaign are compiled once.
     """
     fits, count = [unplayed(rival) for rival in rivals], 0
     if records:
+        whole = [_until_gap(record) for record in records]
         linear = np.zeros(records[0].inputs.shape[1], bool)
         for i, rival in enumerate(rivals):
-            experiments = experiments_of(rival.box.plant, records, True, linear)
+            experiments = experiments_of(rival.box.plant, whole, True, linear)
             experiments = _padded(experiments, padded)
             fits[i], count = fitted(rival, experiments), int(np.sum(experiments.valid))
     each = tuple(
         _judged(rival, fit, float(p), count)
         for rival, fit, p in zip(rivals, fits, probabilities(fits), strict=True)
     )
-    now = float(error_bound(probabilities(fits)))
-    return Discrimination(each, None, (now, np.nan), np.nan, tuple(rivals), tuple(fits))
+    return Discrimination(each, None, (np.nan, np.nan), np.nan, tuple(rivals), tuple(fits))
+
+
+def _until_gap(record: Record) -> Record:
+    """The part before the first gap in time: behind it the state is not known."""
+    part = parts_of(record)[0]
+    return replace(
+        record,
+        time=record.time[part], inputs=record.inputs[part], outputs=record.outputs[part],
+    )  # fmt: skip
 
 
 def _padded(experiments: Experiments, count: int) -> Experiments:
@@ -427,9 +461,10 @@ def with_experiment(found: Discrimination, steps: int, coast: int, seed: int) ->
     """The same with the experiment that tells the rivals apart, where a safe one is found."""
     starts = first_signals(found._rivals[0].box.plant, 1, steps, seed)[:, 0]
     made = discriminating(found._rivals, found._fits, starts, coast)
-    after, near = float(jnp.min(made.bounds)), float(made.nearness)
+    after, near = float(jnp.exp(jnp.min(made.log_bounds))), float(made.nearness)
     inputs = np.asarray(made.inputs) if np.isfinite(after) else None
-    bounds = (found.bounds[0], after)
+    p = jnp.asarray([rival.probability for rival in found.rivals])
+    bounds = (float(error_bound(p)), after)
     return Discrimination(found.rivals, inputs, bounds, near, found._rivals, found._fits)
 
 

@@ -8,8 +8,8 @@ searched again for every signal, and what earlier records tell of it counts.
 The rival with the largest evidence is the wrong one with a probability of at most the sum over
 all pairs of sqrt(p_i p_j) exp(-D_ij / 8), with their probabilities p before and the squared
 distance D (T. Kailath, The divergence and Bhattacharyya distance measures in signal selection,
-1967). The signal makes this bound small, on average over plants of each rival, and is safe for
-all of them.
+1967). This holds for two plants that are known. For two boxes it is an estimate, the mean over a
+few plants of each. The signal makes it small, and is safe for plants of all rivals.
 """
 
 from __future__ import annotations
@@ -42,20 +42,20 @@ class Discriminating(eqx.Module):
 
     Attributes:
         inputs: in the inputs' units.
-        bounds: of every start, on the probability that the wrong rival is chosen; infinite
-            where no safe signal was found.
+        log_bounds: of every start, the logarithm of the bound; infinite where no safe signal was
+            found.
         nearness: largest output over its critical level, on plants of all rivals, coast included.
     """
 
     inputs: Float[Array, "time input"]
-    bounds: Float[Array, " start"]
+    log_bounds: Float[Array, " start"]
     nearness: Float[Array, ""]
 
 
 def error_bound(probabilities: Float[Array, " rival"]) -> Float[Array, ""]:
-    """The bound before an experiment, from the rivals' probabilities."""
-    roots = jnp.sqrt(probabilities)
-    return (jnp.sum(roots) ** 2 - 1) / 2
+    """The bound before an experiment, or the probability that the likeliest rival is wrong."""
+    pairs = (jnp.sum(jnp.sqrt(probabilities)) ** 2 - 1) / 2
+    return jnp.minimum(pairs, 1 - jnp.max(probabilities))
 
 
 @eqx.filter_jit
@@ -93,30 +93,32 @@ def discriminating(
         all_seen = [seen(r, z, inputs) for r, z in zip(rivals, plants, strict=True)]
         return [jnp.concatenate([all_seen[j] for j in own]) for own in others]
 
-    def searched(inputs: Array, starts: list[Array], num_steps: int) -> list[Array]:
-        """For each rival, its plants nearest to those of the others."""
+    def told_apart(inputs: Array, starts: list[Array], num_steps: int) -> tuple[Array, list[Array]]:
+        """The bound's logarithm, and for each rival its plants nearest to those of the others.
+
+        The slope leaves out that the nearest plants move: there the distance is smallest.
+        """
+        outputs = targets(inputs)
+        fixed, own = jax.lax.stop_gradient((outputs, inputs))
 
         def of(rival: Rival, fit: Fit, target: Array, start: Array) -> Array:
             def residual(z: Array) -> Array:
-                return seen(rival, z[None], inputs)[0] - target
+                return seen(rival, z[None], own)[0] - target
 
             return nearest(residual, fit, start, num_steps)[0]
 
-        return [
+        near = [
             jax.vmap(of, (None, None, 0, 0))(*each)
-            for each in zip(rivals, fits, targets(inputs), starts, strict=True)
+            for each in zip(rivals, fits, fixed, starts, strict=True)
         ]
-
-    def log_bound(inputs: Array, near: list[Array]) -> Array:
-        """The bound's logarithm, where these are the nearest plants."""
         terms = []
-        for i, target in enumerate(targets(inputs)):
+        for i, target in enumerate(outputs):
             change = near[i] - fits[i].z[None]
             before = jnp.einsum("pi,ij,pj->p", change, fits[i].information, change)
             D = before + jnp.sum((seen(rivals[i], near[i], inputs) - target) ** 2, axis=1)
             pair = (log_p[i] + log_p[jnp.array(others[i])]) / 2
             terms.append(jnp.repeat(pair, _PLANTS) - D / 8)
-        return jax.nn.logsumexp(jnp.concatenate(terms)) - math.log(2 * _PLANTS)
+        return jax.nn.logsumexp(jnp.concatenate(terms)) - math.log(2 * _PLANTS), near
 
     def outputs(inputs: Array, count: int) -> Array:
         """Of possible plants of all rivals, coast included."""
@@ -135,9 +137,10 @@ def discriminating(
     def largest(inputs: Array) -> Array:
         return jnp.max(jax.vmap(lambda own: nearness(first, own))(outputs(inputs, JUDGES)))
 
-    def loss(latent: Array, near: list[Array]) -> Array:
+    def loss(latent: Array, near: list[Array]) -> tuple[Array, list[Array]]:
         inputs = middle + half * jnp.tanh(latent)
-        return log_bound(inputs, near) + settings.penalty_weight * beyond(inputs)
+        log_bound, near = told_apart(inputs, near, 1)
+        return log_bound + settings.penalty_weight * beyond(inputs), near
 
     adam = optimiser(settings)
     unmoved = [
@@ -149,8 +152,8 @@ def discriminating(
 
         def update(now: tuple, _: None) -> tuple[tuple, None]:
             latent, near, state = now
-            near = searched(middle + half * jnp.tanh(latent), near, 1)
-            change, state = adam.update(jax.grad(loss)(latent, near), state)
+            slope, near = jax.grad(loss, has_aux=True)(latent, near)
+            change, state = adam.update(slope, state)
             return (latent + change, near, state), None
 
         begin = (latent, unmoved, adam.init(latent))
@@ -162,12 +165,12 @@ def discriminating(
         sizes = jax.lax.map(lambda own: largest(middle + half * own), scaled)
         at = jnp.argmax(sizes < SAFE)  # the largest factor that is safe
         inputs = middle + half * scaled[at]
-        found = jnp.exp(log_bound(inputs, searched(inputs, unmoved, _STEPS)))
-        return inputs, jnp.where(sizes[at] < SAFE, found, jnp.inf), sizes[at]
+        log_bound, _ = told_apart(inputs, unmoved, _STEPS)
+        return inputs, jnp.where(sizes[at] < SAFE, log_bound, jnp.inf), sizes[at]
 
-    inputs, bounds, sizes = jax.lax.map(lambda own: line_search(search(own)), starts)
-    best = jnp.argmin(bounds)
-    return Discriminating(inputs[best], bounds, sizes[best])
+    inputs, log_bounds, sizes = jax.lax.map(lambda own: line_search(search(own)), starts)
+    best = jnp.argmin(log_bounds)
+    return Discriminating(inputs[best], log_bounds, sizes[best])
 
 
 def _possible(
@@ -175,8 +178,8 @@ def _possible(
 ) -> Float[Array, "plant quantity"]:
     """Plants that are possible: the best fit, and others drawn around it.
 
-    They are drawn as probable as they are, or lie so many standard deviations away, the first of
-    them on the axes.
+    They are drawn from the normal distribution of the fit, or lie at this distance in standard
+    deviations, the first of them on the axes.
     """
     size = len(fit.z)
     values, axes = jnp.linalg.eigh(fit.information)
