@@ -242,7 +242,8 @@ class Campaign:
         if self.result is not None and self.redesign and self.next is None:
             self.next = self._next(self.result)
         chosen = None if self.next is None else self.next.chosen
-        if self.next is not None and chosen is None and self.plant is not self.declared:
+        is_other = self.plant.description.hash != self.declared.description.hash
+        if self.next is not None and chosen is None and is_other:
             self.reason = self.next.decision  # nothing is known of the policy on this plant
             return None
         return self.policy if chosen is None else chosen.excitation

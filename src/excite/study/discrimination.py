@@ -31,6 +31,7 @@ from ..estimation.evidence import Fit, Rival, fitted, probabilities, unplayed
 from ..estimation.from_records import experiments_of, parts_of, sampled_as
 from ..estimation.identify import RecordLike, record_for, records_in
 from ..excitation import Replay
+from ..files import json_ready
 from ..information import require_noise
 from ..plant import AbstractPlant
 from ..plant.catalogue import PlantLike, plant_from
@@ -40,6 +41,7 @@ from ..report.numbers import digits_for, number
 from ..report.tables import html_table, text_table
 from ..rig.contract import Interval
 from ..training.checkpoint import Progress
+from ..training.design import designed_record
 from ..training.discrimination import discriminating, error_bound
 from ..training.redesign import first_signals
 from .next_experiment import COAST
@@ -174,10 +176,8 @@ class Discrimination:
         require_record_path(Path(path), overwrite)
         outputs = next(iter(self.responses.values()))
         plant = self._rivals[0].box.plant
-        time = np.arange(len(outputs)) * float(plant.dt)
         about = {"design": "discrimination", "rivals": list(self.responses)}
-        origin = {"starts_at_initial_state": True, "provenance": {"simulated": True, **about}}
-        record = Record.of_episode(time, self._played, outputs, origin)
+        record = designed_record(plant, jnp.asarray(self._played), jnp.asarray(outputs), about)
         write_record(path, record, plant.description)
 
     def plot(self) -> Figure:
@@ -190,12 +190,12 @@ class Discrimination:
 
     def to_dict(self) -> dict[str, Any]:
         """Rivals and decision as JSON-ready data."""
-        return {
+        content = {
             "rivals": [
                 {
                     "plant": r.name,
                     "probability": r.probability,
-                    "misfit_factor": _finite(r.misfit_factor),
+                    "misfit_factor": r.misfit_factor,
                     "explains": r.explains,
                     "estimate": {n: interval._asdict() for n, interval in r.estimate.items()},
                 }
@@ -204,9 +204,10 @@ class Discrimination:
             "chosen": None if self.chosen is None else self.chosen.name,
             "decision": self.decision,
             "num_steps": None if self.inputs is None else len(self.inputs),
-            "error_bound": {"now": _finite(self.bounds[0]), "after": _finite(self.bounds[1])},
-            "nearness": _finite(self.nearness),
+            "error_bound": {"now": self.bounds[0], "after": self.bounds[1]},
+            "nearness": self.nearness,
         }
+        return json_ready(content)
 
     header = ("rival", "probability", "residual / noise", "parameters of its own")
 
@@ -277,7 +278,7 @@ def discriminate(
         TypeError: for an argument of another type.
     """
     require_whole("steps", steps, 2, 10_000)
-    given = records_in(records, "records") if records != () else []
+    given = records_in(records, "records")
     require_whole("coast", coast, 0)
     require_whole("seed", seed, 0, LARGEST_SEED)
     if initial_state not in ("auto", "known"):
@@ -465,8 +466,4 @@ def with_experiment(found: Discrimination, steps: int, coast: int, seed: int) ->
     inputs = np.asarray(made.inputs) if np.isfinite(after) else None
     p = jnp.asarray([rival.probability for rival in found.rivals])
     bounds = (float(error_bound(p)), after)
-    return Discrimination(found.rivals, inputs, bounds, near, found._rivals, found._fits)
-
-
-def _finite(value: float) -> float | None:
-    return value if np.isfinite(value) else None
+    return replace(found, inputs=inputs, bounds=bounds, nearness=near)

@@ -42,6 +42,7 @@ from ..report.tables import html_table, text_table
 from ..rig.contract import Interval
 from ..simulation import response, run_episode
 from ..training.checkpoint import Progress
+from ..training.design import designed_record
 from ..training.redesign import JUDGES, Region, first_signals, redesigned
 from .targets import (
     Target,
@@ -267,11 +268,9 @@ class NextExperiment:
         if self.chosen is None:
             raise ValueError(f"there is no experiment to write: {self.decision}")
         params = self.plant.Params(*(k.estimate for k in self.known.values()))
-        outputs = np.asarray(response(self.plant, params, jnp.asarray(self.chosen.inputs)))
-        time = np.arange(len(outputs)) * float(self.plant.dt)
+        inputs = jnp.asarray(self.chosen.inputs)
         about = {"design": "next experiment", "candidate": self.chosen.name}
-        origin = {"starts_at_initial_state": True, "provenance": {"simulated": True, **about}}
-        return Record.of_episode(time, self.chosen.inputs, outputs, origin)
+        return designed_record(self.plant, inputs, response(self.plant, params, inputs), about)
 
     def save(self, path: str | Path, overwrite: bool = False) -> None:
         """Writes the inputs to be played (.csv, .mat); `excite run --input` plays the file.

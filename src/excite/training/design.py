@@ -226,7 +226,7 @@ def design(
         criterion=criterion,
         seed=seed,
         inputs=np.asarray(inputs),
-        record=_record(chosen, inputs, found),
+        record=designed_record(chosen, inputs, response(chosen, chosen.nominal, inputs), found),
         log_det_information=float(jax.vmap(d_optimality)(judged.information).mean()),
         violations=int(np.sum(judged.is_violation)),
         evaluations=count,
@@ -300,14 +300,23 @@ def _found(
     }  # fmt: skip
 
 
-def _record(
-    plant: AbstractPlant, inputs: Float[Array, "time input"], found: Mapping[str, object]
+def designed_record(
+    plant: AbstractPlant,
+    inputs: Float[Array, "time input"],
+    outputs: Float[Array, "sample output"],
+    found: Mapping[str, object],
 ) -> Record:
-    """The inputs, and the noise-free response of the nominal plant."""
-    outputs = np.asarray(response(plant, plant.nominal, inputs))
+    """A designed input with a noise-free response, as it is written to a file.
+
+    Args:
+        plant: whose sampling time holds.
+        inputs: in their units.
+        outputs: of the response, from rest.
+        found: how the input was found, JSON-ready.
+    """
     time = np.arange(len(outputs)) * float(plant.dt)
     origin = {
         "starts_at_initial_state": True,
         "provenance": {"excite": __version__, "simulated": True, **found},
     }
-    return Record.of_episode(time, np.asarray(inputs), outputs, origin)
+    return Record.of_episode(time, np.asarray(inputs), np.asarray(outputs), origin)

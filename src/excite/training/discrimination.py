@@ -26,8 +26,8 @@ from jaxtyping import Array, Float
 from ..environment.falsification import nearness
 from ..estimation.evidence import Fit, Rival, nearest, probabilities
 from ..safety import safe_input
-from .gradient import GradientSettings, mean_excess, optimiser
-from .redesign import FACTORS, JUDGES, SAFE
+from .gradient import GradientSettings, mean_excess
+from .redesign import JUDGES, SAFE, loudest_safe, searched
 from .redesign import SEARCH as REDESIGN
 
 SEARCH = dataclasses.replace(REDESIGN, num_updates=40)
@@ -76,8 +76,6 @@ def discriminating(
         settings: of the search by Adam, and of its penalty of outputs near a level.
     """
     first = rivals[0].box.plant
-    lower, upper = (x[None] for x in first.input_limits)
-    middle, half = (lower + upper) / 2, (upper - lower) / 2
     rest = jnp.tile(jnp.asarray(safe_input(first.definition)), (coast, 1))
     plants = [_possible(fit, _PLANTS) for fit in fits]
     judges = [_possible(fit, JUDGES, _WIDE) for fit in fits]
@@ -137,38 +135,21 @@ def discriminating(
     def largest(inputs: Array) -> Array:
         return jnp.max(jax.vmap(lambda own: nearness(first, own))(outputs(inputs, JUDGES)))
 
-    def loss(latent: Array, near: list[Array]) -> tuple[Array, list[Array]]:
-        inputs = middle + half * jnp.tanh(latent)
+    def loss(inputs: Array, near: list[Array]) -> tuple[Array, list[Array]]:
         log_bound, near = told_apart(inputs, near, 1)
         return log_bound + settings.penalty_weight * beyond(inputs), near
 
-    adam = optimiser(settings)
     unmoved = [
         jnp.tile(fit.z, (_PLANTS * len(own), 1)) for fit, own in zip(fits, others, strict=True)
     ]
 
-    def search(inputs: Array) -> Array:
-        latent = jnp.arctanh(jnp.clip((inputs - middle) / half, -0.98, 0.98))
-
-        def update(now: tuple, _: None) -> tuple[tuple, None]:
-            latent, near, state = now
-            slope, near = jax.grad(loss, has_aux=True)(latent, near)
-            change, state = adam.update(slope, state)
-            return (latent + change, near, state), None
-
-        begin = (latent, unmoved, adam.init(latent))
-        (latent, _, _), _ = jax.lax.scan(update, begin, length=settings.num_updates)
-        return jnp.tanh(latent)
-
-    def line_search(actions: Array) -> tuple[Array, Array, Array]:
-        scaled = jnp.clip(jnp.asarray(FACTORS)[:, None, None] * actions[None], -1, 1)
-        sizes = jax.lax.map(lambda own: largest(middle + half * own), scaled)
-        at = jnp.argmax(sizes < SAFE)  # the largest factor that is safe
-        inputs = middle + half * scaled[at]
+    def from_start(start: Array) -> tuple[Array, Array, Array]:
+        found = searched(first, loss, start, unmoved, settings)
+        inputs, size = loudest_safe(first, largest, found)
         log_bound, _ = told_apart(inputs, unmoved, _STEPS)
-        return inputs, jnp.where(sizes[at] < SAFE, log_bound, jnp.inf), sizes[at]
+        return inputs, jnp.where(size < SAFE, log_bound, jnp.inf), size
 
-    inputs, log_bounds, sizes = jax.lax.map(lambda own: line_search(search(own)), starts)
+    inputs, log_bounds, sizes = jax.lax.map(from_start, starts)
     best = jnp.argmin(log_bounds)
     return Discriminating(inputs[best], log_bounds, sizes[best])
 

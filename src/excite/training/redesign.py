@@ -10,13 +10,14 @@ average over some of them, and safe for all.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 from scipy.stats import chi2
 
 from ..environment.falsification import nearness
@@ -34,7 +35,7 @@ SAFE = 0.97  # of the critical level: largest output that is allowed
 SEARCH = GradientSettings(num_updates=100, learning_rate=0.15, margin=0.95, penalty_weight=100.0)
 
 _STARTS = 2  # of the search
-FACTORS = np.concatenate([np.linspace(1.15, 0.8, 15), np.geomspace(0.75, 0.02, 12)])
+_FACTORS = np.concatenate([np.linspace(1.15, 0.8, 15), np.geomspace(0.75, 0.02, 12)])
 
 
 class Region(eqx.Module):
@@ -120,8 +121,6 @@ def redesigned(
         coast: samples after a round's end in which it must be safe too.
         settings: of the search by Adam, and of its penalty of outputs near a level.
     """
-    lower, upper = (x[None, None] for x in plant.input_limits)
-    middle, half = (lower + upper) / 2, (upper - lower) / 2
     rest = jnp.tile(jnp.asarray(safe_input(plant.definition)), (coast, 1))
     points, judges = region.plants(plant, POINTS), region.plants(plant, JUDGES)
 
@@ -136,25 +135,10 @@ def redesigned(
     def beyond(params: Params, own: Float[Array, "time input"]) -> Array:
         return mean_excess(plant, outputs(params, own), settings.margin)
 
-    def loss(latent: Array) -> Array:
-        inputs = middle + half * jnp.tanh(latent)
+    def loss(inputs: Float[Array, "round time input"], _: None) -> tuple[Array, None]:
         unknown = jax.vmap(uncertainty, (0, None))(points, inputs)
         over = jax.vmap(jax.vmap(beyond, (None, 0)), (0, None))(points, inputs)
-        return jnp.mean(unknown) + settings.penalty_weight * jnp.mean(over)
-
-    adam = optimiser(settings)
-
-    def search(inputs: Array) -> Array:
-        latent = jnp.arctanh(jnp.clip((inputs - middle) / half, -0.98, 0.98))
-
-        def update(now: tuple, _: None) -> tuple[tuple, None]:
-            latent, state = now
-            change, state = adam.update(jax.grad(loss)(latent), state)
-            return (latent + change, state), None
-
-        length = settings.num_updates
-        (latent, _), _ = jax.lax.scan(update, (latent, adam.init(latent)), length=length)
-        return jnp.tanh(latent)
+        return jnp.mean(unknown) + settings.penalty_weight * jnp.mean(over), None
 
     def largest(inputs: Array) -> Array:
         def of(own: Array) -> Array:
@@ -162,14 +146,71 @@ def redesigned(
 
         return jnp.max(jax.vmap(of)(inputs))
 
-    def line_search(actions: Array) -> tuple[Array, Array, Array]:
-        scaled = jnp.clip(jnp.asarray(FACTORS)[:, None, None, None] * actions[None], -1, 1)
-        sizes = jax.lax.map(lambda own: largest(middle + half * own), scaled)
-        first = jnp.argmax(sizes < SAFE)  # the largest factor that is safe
-        inputs = middle + half * scaled[first]
+    def from_start(start: Array) -> tuple[Array, Array, Array]:
+        found = searched(plant, loss, start, None, settings)
+        inputs, size = loudest_safe(plant, largest, found)
         unknown = jnp.mean(jax.vmap(uncertainty, (0, None))(points, inputs))
-        return inputs, jnp.where(sizes[first] < SAFE, jnp.exp(unknown), jnp.inf), sizes[first]
+        return inputs, jnp.where(size < SAFE, jnp.exp(unknown), jnp.inf), size
 
-    inputs, shares, sizes = jax.vmap(lambda own: line_search(search(own)))(starts)
+    inputs, shares, sizes = jax.vmap(from_start)(starts)
     best = jnp.argmin(shares)
     return Redesigned(inputs[best], shares, sizes[best])
+
+
+def searched(
+    plant: AbstractPlant,
+    loss: Callable[[Array, PyTree], tuple[Array, PyTree]],
+    start: Float[Array, "*round time input"],
+    carried: PyTree,
+    settings: GradientSettings,
+) -> Float[Array, "*round time input"]:
+    """Inputs within the plant's limits for which a loss is small, by Adam.
+
+    Args:
+        plant: whose limits hold.
+        loss: of the inputs, and of what is carried from update to update; it returns both.
+        start: of the search, in the inputs' units.
+        carried: by the first update.
+        settings: of the search.
+    """
+    middle, half, adam = *_range(plant, start), optimiser(settings)
+    latent = jnp.arctanh(jnp.clip((start - middle) / half, -0.98, 0.98))
+
+    def of(latent: Array, carried: PyTree) -> tuple[Array, PyTree]:
+        return loss(middle + half * jnp.tanh(latent), carried)
+
+    def update(now: tuple, _: None) -> tuple[tuple, None]:
+        latent, carried, state = now
+        slope, carried = jax.grad(of, has_aux=True)(latent, carried)
+        change, state = adam.update(slope, state)
+        return (latent + change, carried, state), None
+
+    begin = (latent, carried, adam.init(latent))
+    (latent, _, _), _ = jax.lax.scan(update, begin, length=settings.num_updates)
+    return middle + half * jnp.tanh(latent)
+
+
+def loudest_safe(
+    plant: AbstractPlant,
+    largest: Callable[[Array], Float[Array, ""]],
+    inputs: Float[Array, "*round time input"],
+) -> tuple[Float[Array, "*round time input"], Float[Array, ""]]:
+    """The inputs, made larger or smaller until they are just safe, and the nearness there.
+
+    Args:
+        plant: whose limits hold.
+        largest: the largest output over its critical level under some inputs.
+        inputs: in their units.
+    """
+    middle, half = _range(plant, inputs)
+    factors = jnp.asarray(_FACTORS).reshape((-1,) + (1,) * inputs.ndim)
+    scaled = jnp.clip(factors * ((inputs - middle) / half)[None], -1, 1)
+    sizes = jax.lax.map(lambda own: largest(middle + half * own), scaled)
+    first = jnp.argmax(sizes < SAFE)  # the largest factor that is safe
+    return middle + half * scaled[first], sizes[first]
+
+
+def _range(plant: AbstractPlant, inputs: Array) -> tuple[Array, Array]:
+    """Middle and half of the inputs' limits, with the axes of some inputs."""
+    lower, upper = (x.reshape((1,) * (inputs.ndim - 1) + (-1,)) for x in plant.input_limits)
+    return (lower + upper) / 2, (upper - lower) / 2
