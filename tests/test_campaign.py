@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import re
 import signal
 import time
 from pathlib import Path
@@ -24,7 +25,8 @@ from excite.rig.contract import Interval, Sample
 from excite.simulation import response, run_episode
 from excite.study.campaign import REACHED
 from excite.study.campaign_on_rig import _paused
-from excite.study.targets import targets_from
+from excite.study.quantities import known_of, propagated
+from excite.study.targets import others_of, targets_from
 
 TRUE = {"J_p": 0.025, "K_pu": 0.0110, "D_p": 0.0011}
 EASY = {"J_p": "5%", "K_pu": "10%"}
@@ -49,7 +51,7 @@ def steady(steps: int = 60, size: float = 0.05) -> ex.Policy:
     [("1%", 0.01, True), (" 0.5 %", 0.005, True), ("1e-4", 1e-4, False), (2e-4, 2e-4, False)],
 )
 def test_a_target_is_a_share_of_the_estimate_or_a_number(given, half, is_relative):
-    (target,) = targets_from(Aero2().description, {"D_p": given})
+    (target,) = targets_from(Aero2(), {"D_p": given})
     assert (target.half, target.is_relative) == (pytest.approx(half), is_relative)
     allowed = half * 0.002 if is_relative else half
     assert target.share(-0.002, allowed) == pytest.approx(1)
@@ -69,8 +71,89 @@ def test_a_target_is_a_share_of_the_estimate_or_a_number(given, half, is_relativ
 )
 def test_a_target_that_is_not_allowed_is_one_sentence(given, words):
     with pytest.raises((ValueError, TypeError)) as error:
-        targets_from(Aero2().description, given)
+        targets_from(Aero2(), given)
     assert words in str(error.value)
+
+
+def frequency(params):
+    """Undamped, of the pitch; M_b, g and l_cm at their known values."""
+    return jnp.sqrt(1.15 * 9.81 * 0.0038 / params.J_p)
+
+
+def vector(params):
+    """No number."""
+    return jnp.stack([params.J_p, params.D_p])
+
+
+def damping_ratio(params):
+    """Of both parameters."""
+    return params.D_p / jnp.sqrt(params.J_p)
+
+
+@pytest.mark.parametrize(
+    ("given", "value", "name", "half"),
+    [
+        ("pitch@2:square", "0.1 deg", "pitch@2:square", math.radians(0.1)),
+        ("pitch@2s:square", "2e-3rad", "pitch@2s:square", 2e-3),
+        (frequency, "0.5%", "frequency", 0.005),
+        (f"{__file__}:frequency", 0.01, "frequency", 0.01),
+    ],
+)
+def test_a_target_may_be_a_function_or_a_prediction(given, value, name, half):
+    (target,) = targets_from(Aero2(), {given: value})
+    assert (target.name, target.half) == (name, pytest.approx(half))
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"yaw@2:square": 1.0}, "unknown output 'yaw'"),
+        ({"pitch@0:square": 1.0}, "the time must be a number of seconds above 0: got '0'"),
+        ({"pitch@soon:square": 1.0}, "above 0: got 'soon'"),
+        ({"pitch@2:aero2": 1.0}, "a prediction needs a signal that does not react: got 'aero2'"),
+        ({"pitch@2:none.csv": 1.0}, "none.csv"),
+        ({"pitch@2:square": "1 V"}, "is in 'rad', which 'V' is no other unit of"),
+        ({vector: 1.0}, "vector of 'aero2' is no "),
+        ({lambda params: 1.0 / params.c: 1.0}, "is no function of the parameters: AttributeError"),
+        ({lambda params: 3.0: 1.0}, "does not depend on the parameters"),
+        ({lambda params: params.J_p / 0.0: 1.0}, "no finite number"),
+        ({"nothing.py:frequency": 1.0}, "nothing.py: no such file"),
+        ({f"{__file__}:frequenz": 1.0}, "has no function 'frequenz'; it has"),
+        ({frequency: 1.0, f"{__file__}:frequency": 1.0}, "frequency has two targets"),
+    ],
+)
+def test_a_quantity_that_is_not_allowed_is_one_sentence(given, words):
+    with pytest.raises(ValueError, match=re.escape(words)) as error:
+        targets_from(Aero2(), given)
+    assert "\n" not in str(error.value)
+
+
+def test_the_interval_of_a_quantity_is_that_of_many_draws():
+    record = ex.simulate("aero2", "chirp", params=TRUE, seed=1)
+    result, plant = ex.identify(record, "aero2"), Aero2()
+    given = {damping_ratio: "1%", "pitch@3:square": 0.01, "D_p": "1%"}
+    targets = targets_from(plant, given)
+    known = known_of(plant, result, others_of(plant, targets))
+    assert list(known) == ["J_p", "K_pu", "D_p", "damping_ratio", "pitch@3:square"]
+    rng, center = np.random.default_rng(0), np.array(list(result.params.values()))
+    drawn = rng.multivariate_normal(center, result.covariance, 4000)
+    spread = [np.ptp(result.ci95(n)) / 2 / (HALF_95 * s) for n, s in
+              zip(result.params, np.sqrt(np.diag(result.covariance)), strict=True)]  # fmt: skip
+    for target in targets[:2]:
+        values = jax.vmap(lambda p, t=target: t.quantity(plant, plant.Params(*p)))(drawn)
+        expected = HALF_95 * np.std(np.asarray(values)) * spread[0]
+        assert known[target.name].ci95_half == pytest.approx(expected, rel=0.05)
+    size = dict(zip(result.params, center, strict=True))
+    ratio = size["D_p"] / math.sqrt(size["J_p"])
+    assert known["damping_ratio"].estimate == pytest.approx(ratio)
+
+
+def test_a_quantity_of_a_parameter_that_is_not_known_is_not_known():
+    covariance, halves = np.diag([1e-6, 1e-8, 0.0]), np.array([2e-3, 2e-4, np.inf])
+    quantities = [t.quantity for t in targets_from(Aero2(), {damping_ratio: 1.0, frequency: 1.0})]
+    found = propagated(quantities, Aero2(), Aero2().nominal, covariance, halves)
+    assert found["damping_ratio"].ci95_half == math.inf
+    assert 0 < found["frequency"].ci95_half < 1
 
 
 @pytest.mark.parametrize(
@@ -101,7 +184,8 @@ def test_a_plant_without_a_shipped_policy_needs_one():
 @pytest.fixture(scope="module")
 def asked() -> ex.Campaign:
     """A campaign of two rounds, with what `identify` makes of both."""
-    campaign = ex.Campaign("aero2", {"D_p": "0.001%"}, policy=steady(), rounds=2, redesign=False)
+    target = {"D_p": "0.001%", damping_ratio: "0.001%"}
+    campaign = ex.Campaign("aero2", target, policy=steady(), rounds=2, redesign=False)
     for seed in (1, 2):
         policy = campaign.ask()
         campaign.tell(ex.simulate("aero2", policy, params=TRUE, seed=seed))
@@ -111,7 +195,9 @@ def asked() -> ex.Campaign:
 def test_all_rounds_are_identified_together(asked):
     records = [ex.simulate("aero2", steady(), params=TRUE, seed=seed) for seed in (1, 2)]
     result = ex.identify(records, "aero2", initial_state="known")
-    for name, (estimate, half) in asked.rounds[-1].known.items():
+    known = dict(asked.rounds[-1].known)
+    assert known.pop("damping_ratio") == asked.known["damping_ratio"]
+    for name, (estimate, half) in known.items():
         low, high = result.ci95(name)
         assert estimate == pytest.approx(result.params[name], rel=1e-6)
         assert half == pytest.approx((high - low) / 2, rel=1e-4)
@@ -119,7 +205,7 @@ def test_all_rounds_are_identified_together(asked):
     assert asked.num_samples == 120
     assert asked.ask() is None
     assert asked.reason == "all rounds are played"
-    assert asked.rounds[0].decision.startswith("go on: D_p is")
+    assert asked.rounds[0].decision.startswith("go on: damping_ratio is")
     with pytest.raises(ValueError, match="the campaign has ended: all rounds are played"):
         asked.tell(records[0])
 
@@ -132,10 +218,13 @@ def test_knowledge_after_every_sample_is_the_cramer_rao_bound(asked):
     for count in (30, 60):
         information = experiment_information(Aero2(), params, inputs[0][:count])
         expected = HALF_95 * np.sqrt(np.diag(np.linalg.inv(information))) * np.array(params)
-        np.testing.assert_allclose(halves[count - 1], expected, rtol=1e-6)
+        np.testing.assert_allclose(halves[count - 1, :3], expected, rtol=1e-6)
     both = sum(experiment_information(Aero2(), params, u) for u in inputs)
     expected = HALF_95 * np.sqrt(np.diag(np.linalg.inv(both))) * np.array(params)
-    np.testing.assert_allclose(halves[-1], expected, rtol=1e-6)
+    np.testing.assert_allclose(halves[-1, :3], expected, rtol=1e-6)
+    slope = np.array([-0.5, 0.0, 1.0])  # of the logarithm of D_p / sqrt(J_p)
+    relative = HALF_95 * np.sqrt(slope @ np.linalg.inv(both) @ slope)
+    assert halves[-1, 3] == pytest.approx(relative * float(damping_ratio(params)), rel=1e-6)
 
 
 def test_the_table_says_what_was_asked_and_reached(asked):
@@ -189,7 +278,7 @@ def test_a_round_that_was_interrupted_does_not_count_in_the_budget():
 
 
 def test_a_share_of_nothing_is_infinite():
-    assert targets_from(Aero2().description, {"D_p": "1%"})[0].share(0.0, 1e-3) == math.inf
+    assert targets_from(Aero2(), {"D_p": "1%"})[0].share(0.0, 1e-3) == math.inf
 
 
 # ------------------------------------------------------------------------- what is expected
@@ -245,13 +334,14 @@ def test_a_round_ends_only_where_the_free_motion_after_it_is_safe(monkeypatch):
     monitor = campaign.monitor(waits=True)
     plant, fast = Aero2(), jnp.full((15, 1), 24.0)
     known = {name: Interval(value, 1e-9) for name, value in TRUE.items()}
+    sure = dataclasses.replace(monitor._live._estimate(0), information=1e9 * jnp.eye(3))
     params = plant.Params(**TRUE)
     outputs = np.asarray(response(plant, params, jnp.concatenate([fast, jnp.zeros((100, 1))])))
     level = plant.definition.outputs[0].critical_level or 0.0
     verdicts = []
     for k in range(15):
         sample = Sample(plant.description, 60, k, 0.1 * k, np.array(outputs[k]), np.array([24.0]))
-        monitor._live._latest = known
+        monitor._live._latest, monitor._live._kept = known, sure
         monitor._live._first = 1000  # no estimate but this one
         verdicts.append(monitor(sample))
         rest = jnp.concatenate([fast[:k], jnp.zeros((160 - k, 1))])

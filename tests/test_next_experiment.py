@@ -55,7 +55,7 @@ def found():
     """A redesign of two rounds, and where it began."""
     plant = Aero2()
     starts, goals = first_signals(plant, 2, STEPS), jnp.asarray([0.001, jnp.inf, 0.005])
-    return plant, starts, goals, redesigned(plant, region(), goals, starts, COAST)
+    return plant, starts, goals, redesigned(plant, region(), jnp.diag(1 / goals), starts, COAST)
 
 
 def uncertainty(plant, inputs, goals):
@@ -128,7 +128,7 @@ def candidate(name: str, samples: float, half: float, nearness: float) -> Candid
 
 
 def test_the_safe_candidate_that_reaches_the_targets_first_is_chosen():
-    targets = targets_from(Aero2().description, {"D_p": "1%"})
+    targets = targets_from(Aero2(), {"D_p": "1%"})
     slow, quick = candidate("slow", 9, 1e-6, 0.9), candidate("quick", 5, 2e-6, 0.9)
     unsafe = candidate("unsafe", 1, 1e-7, 1.2)
     never, nearer = candidate("never", np.inf, 3e-4, 0.5), candidate("nearer", np.inf, 2e-4, 0.5)

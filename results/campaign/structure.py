@@ -53,7 +53,10 @@ def played(rival, z, inputs, noise, valid):
 
 
 def designed(rivals, count, seed):
-    """Of each truth and plant: samples, rival that was chosen, its probability, nearness."""
+    """Of each truth and plant: rival that was chosen after each round, its probability, nearness.
+
+    Yields all rows so far after each truth.
+    """
     starts = first_signals(rivals[0].box.plant, 1, STEPS)[:, 0]
     prior = [unplayed(rival) for rival in rivals]
     begin = discriminating(rivals, prior, starts, COAST)
@@ -78,7 +81,7 @@ def designed(rivals, count, seed):
                     break
             rows.append({"truth": truth, "rounds": each, "nearness": near})
         print(NAMES[truth], summary(rows, truth), flush=True)
-    return rows
+        yield rows
 
 
 def summary(rows, truth):
@@ -101,7 +104,7 @@ def summary(rows, truth):
 
 def fixed(rivals, count, seed):
     """Of each fixed signal, truth and length, the share that is right."""
-    first, longest, table = rivals[0].box.plant, LENGTHS[-1], {}
+    first, table = rivals[0].box.plant, {}
     judges = [drawn(rival, 200, 1000 + i) for i, rival in enumerate(rivals)]
     fits = [jax.jit(jax.vmap(lambda data, own=own: fitted(own, data))) for own in rivals]
 
@@ -116,12 +119,11 @@ def fixed(rivals, count, seed):
 
     for name in FIXED:
         for length in LENGTHS:
-            signal = excitation_named(name, first).sequence(first, length, jax.random.key(0))
-            shape = jnp.pad(signal, ((0, longest - length), (0, 0)))
+            shape = excitation_named(name, {}, first).sequence(first, length, jax.random.key(0))
             factors = np.geomspace(5, 0.02, 60)
             factor = next(f for f in factors if largest(jnp.clip(f * shape, -24, 24)) < SAFE)
             inputs = jnp.clip(factor * shape, -24, 24)[None]
-            valid = (jnp.arange(longest + 1) <= length)[None, :, None]
+            valid = jnp.ones((1, length + 1, 1), bool)
             for truth, rival in enumerate(rivals):
                 data = [
                     played(rival, z, inputs, jax.random.normal(key, valid.shape), valid)
@@ -137,7 +139,7 @@ def fixed(rivals, count, seed):
                 table.setdefault(name, {}).setdefault(NAMES[truth], {})[length] = right
             right = [own[length] for own in table[name].values()]
             print(name, length, f"{factor:.3f}", right, flush=True)
-    return table
+            yield table
 
 
 def main():
@@ -153,12 +155,13 @@ def main():
     spread = given.spread if ":" in given.spread else float(given.spread)
     plants = [(with_sensor(plant_from(n), {"pitch": given.sd}), r) for n, r in RIVALS]
     rivals = rivals_from(plants, spread)
-    rows = designed(rivals, given.count, given.seed)
-    made = {"sd": given.sd, "spread": given.spread, "seed": given.seed}
-    made["designed"] = {name: summary(rows, i) for i, name in enumerate(NAMES)}
-    if given.fixed:
-        made["fixed"] = fixed(rivals, given.fixed, given.seed)
-    given.out.write_text(json.dumps(made, indent=1) + "\n")
+    made = {"sd": given.sd, "spread": given.spread, "seed": given.seed, "designed": {}}
+    for i, rows in enumerate(designed(rivals, given.count, given.seed)):
+        made["designed"][NAMES[i]] = summary(rows, i)
+        given.out.write_text(json.dumps(made, indent=1) + "\n")
+    for table in fixed(rivals, given.fixed, given.seed) if given.fixed else ():
+        made |= {"fixed": table, "plants_of_fixed": given.fixed}
+        given.out.write_text(json.dumps(made, indent=1) + "\n")
 
 
 if __name__ == "__main__":

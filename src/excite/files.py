@@ -10,6 +10,7 @@ import contextlib
 import csv
 import hashlib
 import importlib.util
+import inspect
 import io
 import json
 import math
@@ -19,7 +20,7 @@ import shutil
 import sys
 import tempfile
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
 
@@ -269,6 +270,23 @@ def class_at(path: Path, word: str, base: type, kind: str) -> Any:
         words = " or ".join(f"{path}:{name}" for name in own)
         raise ValueError(f"{path} is a file: name the {kind} in it as {words}")
     raise ValueError(f"{path} has no {kind} class {word!r}; it has {', '.join(own) or 'none'}")
+
+
+def function_at(path: Path, word: str) -> Callable[..., Any]:
+    """A function in a user's file. Importing the file runs its code.
+
+    Raises:
+        ValueError: for a file that cannot be imported, or without such a function.
+    """
+    if not path.is_file():
+        raise ValueError(f"{path}: no such file")
+    module = module_at(path)
+    found = getattr(module, word, None)
+    if callable(found) and not isinstance(found, type):
+        return found
+    functions = [n for n, part in vars(module).items() if inspect.isfunction(part)]
+    own = [n for n in functions if getattr(module, n).__module__ == module.__name__]
+    raise ValueError(f"{path} has no function {word!r}; it has {', '.join(own) or 'none'}")
 
 
 def module_at(path: Path) -> Any:

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from .next import TARGETS
+from .next import OF_TARGETS, TARGETS
 from .options import (
     COAST,
     NUMBERS,
@@ -33,8 +33,7 @@ from .options import (
     type=TARGETS,
     multiple=True,
     required=True,
-    help="Half of the 95 % interval to be reached, such as D_p=1%,J_p=0.5%, or a number in the "
-    "parameter's unit.",
+    help=f"{OF_TARGETS}.",
 )
 @click.option(
     "--rig",

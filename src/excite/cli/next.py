@@ -24,6 +24,12 @@ from .options import (
 )
 
 TARGETS = Assignments(str, "a percentage such as 1% or a number")
+OF_TARGETS = (
+    "Half of the 95 % interval to be reached: D_p=1%,J_p=0.5%, a number in the unit, or with "
+    "another unit. Also for a function of the parameters, path/to/file.py:function=1%, and for a "
+    "predicted output, pitch@2:step.csv=0.1deg: after 2 s of the inputs in a file, or of a signal "
+    "by name"
+)
 
 
 @click.command(name="next")
@@ -36,8 +42,7 @@ TARGETS = Assignments(str, "a percentage such as 1% or a number")
     "targets",
     type=TARGETS,
     multiple=True,
-    help="Half of the 95 % interval to be reached, such as D_p=1%,J_p=0.5%, or a number in the "
-    "parameter's unit; default half of what it is now, for each parameter.",
+    help=f"{OF_TARGETS}. Default half of what it is now, for each parameter.",
 )
 @click.option(
     "--prior",

@@ -53,6 +53,7 @@ class LiveEstimate:
         self._pool, self._fit = ThreadPoolExecutor(1), Future[Estimate]()
         self._fit.set_result(self._estimate(0))
         self._latest: dict[str, Interval] = {}
+        self._kept: Estimate | None = None
 
     def __call__(self, sample: Sample) -> None:
         """Takes one more sample, and starts the next fit if none is running."""
@@ -71,6 +72,11 @@ class LiveEstimate:
         """Estimate and 95 % interval by parameter; empty before the first fit."""
         return self._latest
 
+    @property
+    def estimate(self) -> Estimate | None:
+        """The latest successful fit; None before the first."""
+        return self._kept
+
     def close(self) -> None:
         """Waits for the running fit, then estimates from all samples."""
         self._pool.shutdown()
@@ -82,6 +88,7 @@ class LiveEstimate:
         if int(estimate.status) == Status.SUCCESSFUL:
             covariance, degrees = map(np.asarray, (estimate.covariance, estimate.degrees))
             half = half_95(covariance, degrees)
+            self._kept = estimate
             names = names_of(self._plant.definition.parameters)
             values = zip(map(float, estimate.params), map(float, half), strict=True)
             self._latest = {n: Interval(*v) for n, v in zip(names, values, strict=True)}

@@ -52,11 +52,20 @@ from .discrimination import Discrimination, RivalLike, judged, rivals_from, with
 from .falsify import trained_in
 from .monitor import Monitor
 from .next_experiment import COAST, REDESIGNED, NextExperiment, best_of, candidates, region_of
-from .targets import (
-    farthest,
+from .quantities import (
+    AbstractQuantity,
+    OneParameter,
     half_intervals,
     known_of,
+    require_defined,
+    slopes,
+)
+from .targets import (
+    TargetLike,
+    farthest,
     known_row,
+    others_of,
+    quantities_of,
     shares_of,
     targets_from,
 )
@@ -83,8 +92,8 @@ class Round:
         played: the policy, a redesigned signal, or one that tells rivals apart.
         ended: why, as a sentence.
         nearness: largest measured output over its critical level.
-        known: of each parameter, the estimate from this and all earlier rounds with half of its
-            95 % interval; empty where there is no estimate.
+        known: of each parameter and target, the estimate from this and all earlier rounds with half
+            of its 95 % interval; empty where there is no estimate.
         status: of that estimate.
         decision: what follows, and why.
     """
@@ -144,7 +153,7 @@ class Campaign:
         declared: the plant as it was given.
         plant: as identification knows it: the declared one, or the rival that was chosen.
         discrimination: of the rivals, when they were last compared; None where there are none.
-        targets: by parameter.
+        targets: what is to be known, and how precisely.
         policy: that is played in the first round.
         redesign: whether the policy is compared with redesigned signals in later rounds.
         spread: of the parameters before the campaign.
@@ -164,7 +173,7 @@ class Campaign:
     def __init__(
         self,
         plant: PlantLike,
-        target: Mapping[str, str | float],
+        target: TargetLike,
         *,
         policy: str | Path | Policy | None = None,
         spread: SpreadLike | None = None,
@@ -177,8 +186,11 @@ class Campaign:
 
         Args:
             plant: its name, `path/to/file.py:ClassName`, the plant or its class.
-            target: half of the 95 % interval by parameter: "1%" of the estimate, or a number in
-                the parameter's unit.
+            target: half of a 95 % interval by quantity: "1%" of the estimate, a number in the
+                quantity's unit, or with a unit, "0.1 deg". A quantity is a parameter; a function
+                of the parameters, or its file `path/to/file.py:function`; or an output that is
+                predicted for an experiment from rest, `pitch@2:step.csv` after 2 s of the inputs
+                in a file, or of a signal by name.
             policy: to be played, its name or file; default the plant's shipped policy for a
                 spread by a factor, or its usual one.
             spread: of the parameters; default that of the policy's training.
@@ -196,7 +208,7 @@ class Campaign:
         """
         self.declared = self.plant = plant_from(plant)
         description = self.plant.description
-        self.targets = targets_from(description, target)
+        self.targets = targets_from(self.plant, target)
         require_whole("rounds", rounds, 1, 1000)
         self.most_rounds = rounds
         self.policy = _policy(policy, description)
@@ -211,9 +223,12 @@ class Campaign:
         if rivals:
             self.discrimination = judged(rivals_from([self.plant, *rivals], self.spread), [])
             for rival in self.discrimination.rivals:
-                for name in [t.parameter for t in self.targets]:
+                for name in [t.name for t in self.targets if isinstance(t.quantity, OneParameter)]:
                     if name not in rival.estimate:
                         raise ValueError(f"rival {rival.name} has no parameter {name!r}, a target")
+            for own in self.discrimination.rival_plants:
+                for quantity in others_of(own, self.targets):
+                    require_defined(quantity, own)
         self.warnings = _warnings(self.policy, self.plant, self.spread)
         self.records: list[Record] = []
         self.rounds: list[Round] = []
@@ -257,7 +272,7 @@ class Campaign:
         """The candidates of the coming round; None where the estimate is not to be trusted."""
         if result.misfit_factor > 1 or result.held:
             return None
-        region, known = region_of(self.plant, result, self.spread), known_of(result)
+        region, known = region_of(self.plant, result, self.spread), self.known
         made = candidates(
             self.plant, region, self.targets, ("policy", self.policy),
             num_steps=self.policy.layout.num_steps, coast=self.coast, seed=len(self.rounds),
@@ -306,8 +321,8 @@ class Campaign:
                 status = structure if self.is_undecided else self._identify()
         sizes = np.abs(record.outputs) / critical_levels(d)[None]
         near = float(np.nanmax(sizes, initial=0.0))
-        known = {} if self.result is None else known_of(self.result)
-        shares = self.shares(known)
+        known = self.known
+        shares = shares_of(self.targets, known)
         if goes_on:
             self.reason = ""
         elif unsafe or near >= 1:
@@ -356,9 +371,14 @@ class Campaign:
         is_policy = self.result is None or "policy_hash" in record.metadata
         return "policy" if is_policy or not self.redesign else REDESIGNED
 
-    def shares(self, known: Mapping[str, Interval]) -> dict[str, float]:
-        """Of each target, half of the interval over that allowed; empty without an estimate."""
-        return shares_of(self.targets, known)
+    @property
+    def known(self) -> dict[str, Interval]:
+        """Of each parameter and target, the estimate and half of its 95 % interval.
+
+        It is that from all rounds; empty without one.
+        """
+        others = others_of(self.plant, self.targets)
+        return {} if self.result is None else known_of(self.plant, self.result, others)
 
     def _start(self) -> dict[str, float] | None:
         """Where the next identification begins."""
@@ -371,7 +391,7 @@ class Campaign:
     def monitor(self, waits: bool = False) -> Monitor:
         """A judge of the next round while it runs; see `Monitor`."""
         steps = self.policy.layout.num_steps
-        return Monitor(self.plant, self.result, self.shares, steps, self.coast, waits)
+        return Monitor(self.plant, self.result, self.targets, steps, self.coast, waits)
 
     @cached_property
     def expected(self) -> Expected:
@@ -380,13 +400,13 @@ class Campaign:
         keys = jax.random.split(jax.random.key(0), _PLANTS)
         excitation = PolicyExcitation.of(self.policy)
         episodes = run_episodes(self.plant, excitation, steps, self.spread, keys)
-        halves = _halves(self.plant, episodes.params, episodes.trajectory.inputs, self.most_rounds)
-        values = np.stack([np.asarray(v) for v in episodes.params], axis=-1)
-        names = list(self.plant.nominal._fields)
+        asked = [t.quantity for t in self.targets]
+        inputs = episodes.trajectory.inputs
+        outlook = _halves(self.plant, episodes.params, inputs, self.most_rounds, asked)
+        values, halves = map(np.asarray, outlook)
         shares = {
-            t.parameter: t.share(values[None, :, None, i], np.asarray(halves)[..., i])
-            for t in self.targets
-            for i in [names.index(t.parameter)]
+            t.name: t.share(values[None, :, None, i], halves[..., i])
+            for i, t in enumerate(self.targets)
         }
         worst = np.max(list(shares.values()), axis=0)  # round, plant, step
         is_reached = worst.transpose(1, 0, 2).reshape(_PLANTS, -1) <= 1
@@ -398,7 +418,7 @@ class Campaign:
         far = {name: share for name, share in self.expected.shares.items() if not share <= 1}
         if far:
             name, share = max(far.items(), key=lambda item: item[1])
-            target = next(t for t in self.targets if t.parameter == name)
+            target = next(t for t in self.targets if t.name == name)
             best = target.half * share
             told = f"{100 * best:.2g} %" if target.is_relative else f"{best:.2g}"
             raise ValueError(
@@ -419,7 +439,7 @@ class Campaign:
             "plant": self.plant.description.name,
             "plant_hash": self.declared.description.hash,
             "policy_hash": self.policy.hash,
-            "targets": {t.parameter: str(t) for t in self.targets},
+            "targets": {t.name: str(t) for t in self.targets},
             "spread": self.spread.setting,
             "most_rounds": self.most_rounds,
             "coast": self.coast,
@@ -436,9 +456,8 @@ class Campaign:
         }
 
     def _estimate(self) -> dict[str, dict[str, float]]:
-        """Of each parameter, the estimate from all rounds with half of its 95 % interval."""
-        known = {} if self.result is None else known_of(self.result)
-        return {name: interval._asdict() for name, interval in known.items()}
+        """What is known, as JSON-ready data."""
+        return {name: interval._asdict() for name, interval in self.known.items()}
 
     header = ("parameter", "estimate", "± 95 %", "relative", "target", "")
 
@@ -450,12 +469,13 @@ class Campaign:
         return f"{self.plant.description.name}: {self.reason or 'not ended'} ({played})"
 
     def rows(self) -> list[list[str]]:
-        """Rows of the table: one per parameter."""
+        """Rows of the table: one per parameter, and per other target."""
         known = self.rounds[-1].known if self.rounds else {}
-        shares, rows, d = self.shares(known), [], self.plant.description
-        for name in names_of(d.parameters):
-            reached = ("reached" if shares[name] <= 1 else "missed") if name in shares else ""
-            rows.append([*known_row(d, self.targets, known, name), reached])
+        shares, rows = shares_of(self.targets, known), []
+        for quantity in quantities_of(self.plant, self.targets):
+            share = shares.get(quantity.name)
+            reached = "" if share is None else "reached" if share <= 1 else "missed"
+            rows.append([*known_row(quantity, self.targets, known), reached])
         return rows
 
     def round_rows(self) -> list[list[str]]:
@@ -491,11 +511,11 @@ class Campaign:
         rounds = html_table("rounds", self.round_header, self.round_rows())
         return html_table(self.title, self.header, self.rows()) + rounds
 
-    def knowledge(self) -> tuple[Int[np.ndarray, " sample"], Float[np.ndarray, "sample param"]]:
-        """Half of the 95 % interval of each parameter after each sample, by the Cramér-Rao bound.
+    def knowledge(self) -> tuple[Int[np.ndarray, " sample"], Float[np.ndarray, "sample quantity"]]:
+        """Half of the 95 % intervals after each sample, by the Cramér-Rao bound.
 
-        At the final estimate, for the inputs that were played; infinite before a parameter is
-        identifiable.
+        Of each parameter, and of what else the targets are about, at the final estimate, for the
+        inputs that were played; infinite before a parameter is identifiable.
         """
         if self.result is None:
             raise ValueError("the campaign has no estimate yet")
@@ -505,7 +525,8 @@ class Campaign:
             inputs = jnp.asarray(record.inputs[:-1])
             parts.append(running_information(self.plant, params, inputs) + before[None])
             before = parts[-1][-1]
-        halves = half_intervals(self.plant, params, jnp.concatenate(parts))
+        quantities = quantities_of(self.plant, self.targets)
+        halves = half_intervals(quantities, self.plant, params, jnp.concatenate(parts))
         return np.arange(1, len(halves) + 1), np.asarray(halves)
 
     def plot(self) -> Figure:
@@ -513,10 +534,10 @@ class Campaign:
         from ..report.figures import knowledge_figure
 
         samples, halves = self.knowledge()
-        names = list(self.plant.nominal._fields)
-        known = known_of(self.result) if self.result is not None else {}
+        known = self.known
+        names = list(known)
         shares = {
-            t.parameter: t.share(known[t.parameter].estimate, halves[:, names.index(t.parameter)])
+            t.name: t.share(known[t.name].estimate, halves[:, names.index(t.name)])
             for t in self.targets
         }
         ends = np.cumsum([r.num_samples for r in self.rounds]).tolist()
@@ -529,15 +550,18 @@ def _halves(
     params: Params,
     inputs: Float[Array, "plant time input"],
     rounds: int,
-) -> Float[Array, "round plant time param"]:
-    """Half of each interval after every sample of every round, if all rounds were alike."""
+    quantities: Sequence[AbstractQuantity],
+) -> tuple[Float[Array, "plant quantity"], Float[Array, "round plant time quantity"]]:
+    """Values, and half of each interval after every sample of every round, if all were alike."""
 
-    def one(params: Params, inputs: Array) -> Array:
+    def one(params: Params, inputs: Array) -> tuple[Array, Array]:
         running = running_information(plant, params, inputs)
         before = jnp.arange(rounds)[:, None, None, None] * running[-1][None, None]
-        return half_intervals(plant, params, before + running[None])
+        values, _ = slopes(quantities, plant, params)
+        return values, half_intervals(quantities, plant, params, before + running[None])
 
-    return jnp.swapaxes(jax.vmap(one)(params, inputs), 0, 1)
+    values, halves = jax.vmap(one)(params, inputs)
+    return values, jnp.swapaxes(halves, 0, 1)
 
 
 def _policy(given: str | Path | Policy | None, plant: PlantDescription) -> Policy:

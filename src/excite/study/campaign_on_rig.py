@@ -32,6 +32,7 @@ from ..safety import Trip
 from ..training.checkpoint import Progress
 from .campaign import REACHED, WHOLE, Campaign, Round
 from .discrimination import RivalLike
+from .targets import TargetLike
 
 _OWN = {"campaign.json", ".lock"}  # files of a campaign without rounds
 _UNSAFE = (Trip.LEVEL, Trip.PREDICTED_LEVEL, Trip.UNEXPLAINED)  # others interrupt a campaign
@@ -39,7 +40,7 @@ _UNSAFE = (Trip.LEVEL, Trip.PREDICTED_LEVEL, Trip.UNEXPLAINED)  # others interru
 
 def campaign(
     plant: PlantLike,
-    target: Mapping[str, str | float],
+    target: TargetLike,
     rig: str | AbstractRig = "simulated",
     *,
     out: str | Path,

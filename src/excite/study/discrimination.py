@@ -114,6 +114,11 @@ class Discrimination:
         return {rival.name: rival.box.plant.description.hash for rival in self._rivals}
 
     @property
+    def rival_plants(self) -> tuple[AbstractPlant, ...]:
+        """The plant of each rival, with its nominal parameters."""
+        return tuple(rival.box.plant for rival in self._rivals)
+
+    @property
     def plant(self) -> AbstractPlant | None:
         """The plant of the chosen rival."""
         chosen = self.chosen

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..description import names_of
 from ..environment.falsification import nearness
-from ..estimation import NLS
+from ..estimation import NLS, Estimate
 from ..estimation.prior_knowledge import with_prior
 from ..estimation.result import Identification
+from ..information.identifiability import worst_seen
 from ..plant import AbstractPlant, Params
 from ..plant.contract import with_nominal
 from ..rig.contract import Interval, Sample
@@ -21,6 +23,8 @@ from ..rig.live_estimate import LiveEstimate
 from ..safety import safe_input
 from ..simulation import response
 from ..training.redesign import SAFE
+from .quantities import estimates, propagated, slopes
+from .targets import Target, others_of, shares_of
 
 _FIRST = 8  # samples before the first running estimate of a round
 
@@ -35,7 +39,7 @@ class Monitor:
         self,
         plant: AbstractPlant,
         before: Identification | None,
-        shares: Callable[[Mapping[str, Interval]], Mapping[str, float]],
+        targets: Sequence[Target],
         num_steps: int,
         coast: int,
         waits: bool,
@@ -45,7 +49,7 @@ class Monitor:
         Args:
             plant: as identification knows it.
             before: estimate from all earlier rounds.
-            shares: of what is known, half of each interval over that allowed.
+            targets: that end the round.
             num_steps: of the round.
             coast: samples of free motion after its end that must be safe.
             waits: whether a call waits for its estimate; otherwise it is computed beside the
@@ -56,23 +60,41 @@ class Monitor:
             _, prior, _ = with_prior(plant, before, plant.nominal, {}, {})
             estimator = dataclasses.replace(estimator, prior=prior)
             own = with_nominal(plant, dict(before.params))
-        self._plant, self._shares = plant, shares
+        self._plant, self._targets = plant, targets
+        self._others = others_of(plant, targets)
         self._live = LiveEstimate(own, num_steps, True, estimator, first=_FIRST, waits=waits)
         self._inputs = np.tile(safe_input(plant.definition), (num_steps + coast, 1))
         self._after(own.nominal)  # compiles, before the first sample
+        if self._others:
+            slopes(self._others, plant, own.nominal)
 
     def __call__(self, sample: Sample) -> bool:
         """Takes one more sample; whether every target is reached and ending now is safe."""
         self._live(sample)
-        known = self._live.latest
-        shares = self._shares(known)
-        is_enough = bool(shares) and max(shares.values()) <= 1
-        if is_enough:
-            values = jnp.asarray([known[name].estimate for name in self._plant.nominal._fields])
-            # As plain numbers they would be compiled into the program.
-            is_enough = self._after(self._plant.Params(*values)) < SAFE
+        is_enough = False
+        if (estimate := self._live.estimate) is not None:
+            known = self._known(estimate)
+            is_enough = max(shares_of(self._targets, known).values()) <= 1
+            is_enough = is_enough and self._after(estimates(known, self._plant)) < SAFE
         self._inputs[sample.k] = sample.input
         return is_enough
+
+    def _known(self, estimate: Estimate) -> dict[str, Interval]:
+        """What is known of every parameter and target.
+
+        A parameter that the samples do not determine is not known, as `identify` says it.
+        """
+        known, names = dict(self._live.latest), names_of(self._plant.definition.parameters)
+        information, free = np.asarray(estimate.information), np.ones(len(names), bool)
+        while (unseen := worst_seen(names, information, free)) is not None:
+            free[unseen[0]] = False
+            name = names[unseen[0]]
+            known[name] = known[name]._replace(ci95_half=np.inf)
+        if self._others:
+            halves = np.array([interval.ci95_half for interval in known.values()])
+            params, covariance = estimates(known, self._plant), np.asarray(estimate.covariance)
+            known |= propagated(self._others, self._plant, params, covariance, halves)
+        return known
 
     def _after(self, params: Params) -> float:
         """Largest output over its critical level if the round ended now."""

@@ -44,12 +44,21 @@ from ..simulation import response, run_episode
 from ..training.checkpoint import Progress
 from ..training.design import designed_record
 from ..training.redesign import JUDGES, Region, first_signals, redesigned
-from .targets import (
-    Target,
-    farthest,
+from .quantities import (
+    AbstractQuantity,
+    estimates,
     half_intervals,
     known_of,
+    parameters_of,
+    slopes,
+)
+from .targets import (
+    Target,
+    TargetLike,
+    farthest,
     known_row,
+    others_of,
+    quantities_of,
     relative_half,
     shares_of,
     targets_from,
@@ -72,7 +81,8 @@ class Candidate:
         name: `redesigned`, or that of the policy.
         excitation: to be played.
         inputs: on the estimated plant, in the inputs' units.
-        halves: half of the 95 % interval of each parameter after each sample.
+        halves: half of the 95 % interval after each sample, of each parameter and of what else the
+            targets are about.
         after: the same after the last one, with the estimate.
         samples: after which every target is reached; infinite where it is not.
         nearness: largest output over its critical level on the plants that are possible, coast
@@ -82,7 +92,7 @@ class Candidate:
     name: str
     excitation: Policy | Replay
     inputs: Float[np.ndarray, "time input"]
-    halves: Float[np.ndarray, "time param"]
+    halves: Float[np.ndarray, "time quantity"]
     after: Mapping[str, Interval]
     samples: float
     nearness: float
@@ -167,12 +177,10 @@ def candidates(
         inputs = jnp.asarray(np.resize(found[0].inputs, (num_steps, found[0].inputs.shape[1])))
         starts = jnp.concatenate([starts, jnp.broadcast_to(inputs, (1, *starts.shape[1:]))])
     params = plant.Params(*region.center)
-    size = np.asarray(relative_size(plant, params))
-    goals = np.full(len(size), np.inf)
-    for target in targets:
-        i = params._fields.index(target.parameter)
-        goals[i] = target.allowed(float(region.center[i])) / size[i]
-    made = redesigned(plant, region, jnp.asarray(goals), starts, coast)
+    values, slope = slopes([t.quantity for t in targets], plant, params)
+    allowed = [t.allowed(float(value)) for t, value in zip(targets, values, strict=True)]
+    asked = slope * relative_size(plant, params)[None] / jnp.asarray(allowed)[:, None]
+    made = redesigned(plant, region, asked, starts, coast)
     replay = Replay(made.inputs[0])
     redesign = _candidate(plant, region, targets, REDESIGNED, replay, num_steps, coast, seed)
     is_found = bool(jnp.isfinite(made.shares).any())
@@ -192,14 +200,15 @@ def _candidate(
     """What an excitation would bring."""
     own = PolicyExcitation.of(given) if isinstance(given, Policy) else given
     key = jax.random.key(seed)
-    inputs, halves, size = map(np.asarray, _outlook(plant, region, own, num_steps, coast, key))
-    center = np.asarray(region.center)
-    names = list(plant.nominal._fields)
+    quantities = quantities_of(plant, targets)
+    outlook = _outlook(plant, region, own, num_steps, coast, key, quantities)
+    inputs, values, halves, size = map(np.asarray, outlook)
     after = {
-        n: Interval(float(value), float(half))
-        for n, value, half in zip(names, center, halves[-1], strict=True)
+        q.name: Interval(float(value), float(half))
+        for q, value, half in zip(quantities, values, halves[-1], strict=True)
     }
-    shares = [t.share(center[i], halves[:, i]) for t in targets for i in [names.index(t.parameter)]]
+    names = list(after)
+    shares = [t.share(after[t.name].estimate, halves[:, names.index(t.name)]) for t in targets]
     is_reached = np.max(shares, axis=0) <= 1
     samples = float(np.argmax(is_reached) + 1) if is_reached.any() else np.inf
     return Candidate(name, given, inputs, halves, after, samples, float(size))
@@ -213,8 +222,14 @@ def _outlook(
     num_steps: int,
     coast: int,
     key: Array,
-) -> tuple[Float[Array, "time input"], Float[Array, "time param"], Float[Array, ""]]:
-    """Inputs on the estimated plant, what is known after each sample, and the nearness."""
+    quantities: Sequence[AbstractQuantity],
+) -> tuple[
+    Float[Array, "time input"],
+    Float[Array, " quantity"],
+    Float[Array, "time quantity"],
+    Float[Array, ""],
+]:
+    """Inputs on the estimated plant, values, their halves after each sample, the nearness."""
     whole, length = Coast.after(excitation, num_steps, coast)
     plants = region.plants(plant, JUDGES)
     keys = jax.random.split(key, JUDGES + 1)
@@ -222,7 +237,9 @@ def _outlook(
     inputs, params = runs.inputs[0, :num_steps], plant.Params(*region.center)
     information = region.information[None] + running_information(plant, params, inputs)
     sizes = jax.vmap(lambda outputs: nearness(plant, outputs))(runs.outputs)
-    return inputs, half_intervals(plant, params, information), jnp.max(sizes)
+    values, _ = slopes(quantities, plant, params)
+    halves = half_intervals(quantities, plant, params, information)
+    return inputs, values, halves, jnp.max(sizes)
 
 
 @dataclass(frozen=True, repr=False)
@@ -231,8 +248,9 @@ class NextExperiment:
 
     Attributes:
         plant: as identification knows it.
-        known: of each parameter, the estimate with half of its 95 % interval.
-        targets: by parameter.
+        known: of each parameter, and of what else the targets are about, the estimate with half of
+            its 95 % interval.
+        targets: what is asked.
         candidates: that were compared.
         chosen: the best safe one; None where none is safe.
     """
@@ -267,7 +285,7 @@ class NextExperiment:
         """
         if self.chosen is None:
             raise ValueError(f"there is no experiment to write: {self.decision}")
-        params = self.plant.Params(*(k.estimate for k in self.known.values()))
+        params = estimates(self.known, self.plant)
         inputs = jnp.asarray(self.chosen.inputs)
         about = {"design": "next experiment", "candidate": self.chosen.name}
         return designed_record(self.plant, inputs, response(self.plant, params, inputs), about)
@@ -292,8 +310,8 @@ class NextExperiment:
         names = list(self.known)
         shares = [
             {
-                t.parameter: np.asarray(
-                    t.share(self.known[t.parameter].estimate, c.halves[:, names.index(t.parameter)])
+                t.name: np.asarray(
+                    t.share(self.known[t.name].estimate, c.halves[:, names.index(t.name)])
                 )
                 for t in self.targets
             }
@@ -308,7 +326,7 @@ class NextExperiment:
         return {
             "plant": self.plant.description.name,
             "known": {name: interval._asdict() for name, interval in self.known.items()},
-            "targets": {t.parameter: str(t) for t in self.targets},
+            "targets": {t.name: str(t) for t in self.targets},
             "candidates": [c.to_dict() for c in self.candidates],
             "chosen": None if self.chosen is None else self.chosen.name,
             "decision": self.decision,
@@ -328,11 +346,10 @@ class NextExperiment:
 
     def rows(self) -> list[list[str]]:
         """Rows of the table of parameters: what is known now, and after each candidate."""
-        d = self.plant.description
         return [
-            [*known_row(d, self.targets, self.known, name),
-             *(relative_half(c.after[name]) for c in self.candidates)]
-            for name in self.known
+            [*known_row(quantity, self.targets, self.known),
+             *(relative_half(c.after[quantity.name]) for c in self.candidates)]
+            for quantity in quantities_of(self.plant, self.targets)
         ]  # fmt: skip
 
     candidate_header = ("candidate", "samples", "time", "targets reached after", "of the level")
@@ -367,7 +384,7 @@ class NextExperiment:
 def next_experiment(
     known: RecordLike | Sequence[RecordLike] | Identification,
     plant: PlantLike | None = None,
-    target: Mapping[str, str | float] | None = None,
+    target: TargetLike | None = None,
     *,
     prior: PriorLike | Sequence[PriorLike] | None = None,
     policy: str | Path | Policy | None = None,
@@ -396,8 +413,8 @@ def next_experiment(
         known: a record, its file, or several; or the result of `identify`, or its run folder.
         plant: a name, `path/to/file.py:ClassName`, a plant or its class; default that of the
             record, the result or the run folder.
-        target: half of the 95 % interval by parameter: "1%" of the estimate, or a number in the
-            parameter's unit; default half of what it is now, for each.
+        target: half of a 95 % interval by quantity, as for `Campaign`; default half of what it is
+            now, for each parameter.
         prior: as for `identify`, where records are given.
         policy: to compare with; its name or file.
         spread: of the parameters before the records.
@@ -424,7 +441,7 @@ def next_experiment(
     reach = Spread.of(spread)
     parts, own = _parts(known, plant, prior)
     d = own.description
-    targets = None if target is None else targets_from(d, target)
+    targets = None if target is None else targets_from(own, target)
     played = None
     if policy is not None:
         found = policy if isinstance(policy, Policy) else read_policy(policy)
@@ -436,24 +453,34 @@ def next_experiment(
         own = given.basis.plant  # sampled as the records are
     region = region_of(own, given, reach)
     _require_within(own, region, reach)
-    names = names_of(d.parameters)
-    half = np.asarray(half_intervals(own, own.Params(*region.center), region.information))
-    values = zip(names, np.asarray(region.center), half, strict=True)
-    now = {name: Interval(float(value), float(own)) for name, value, own in values}
-    usual = {name: known.ci95_half / 2 for name, known in now.items()}
-    targets = targets or targets_from(d, usual)
+    now = _known(own, region, parameters_of(d))
+    targets = targets or targets_from(own, {n: known.ci95_half / 2 for n, known in now.items()})
+    now = (
+        known_of(own, given, others_of(own, targets))
+        if isinstance(given, Identification)
+        else _known(own, region, quantities_of(own, targets))
+    )
     length = steps or (played[1].layout.num_steps if played else 200)
     progress("redesigning", 1, 2)
     made = candidates(
         own, region, targets, played, num_steps=length, coast=coast, ahead=ahead, seed=seed
     )
-    if isinstance(given, Identification):
-        now = known_of(given)
     progress("done", 2, 2)
     result = NextExperiment(own, now, targets, tuple(made), best_of(made, targets))
     if out is not None:
         result.save(out, overwrite)
     return result
+
+
+def _known(
+    plant: AbstractPlant, region: Region, quantities: Sequence[AbstractQuantity]
+) -> dict[str, Interval]:
+    """What is known of quantities of the region's plants."""
+    params = plant.Params(*region.center)
+    values, _ = slopes(quantities, plant, params)
+    halves = half_intervals(quantities, plant, params, region.information)
+    each = zip(quantities, values, halves, strict=True)
+    return {q.name: Interval(float(value), float(half)) for q, value, half in each}
 
 
 def _parts(

@@ -1,36 +1,47 @@
-"""How precisely parameters are to be known, and how precisely they are."""
+"""How precisely quantities are to be known, and how far they are from it."""
 
 from __future__ import annotations
 
+import contextlib
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
-from ..description import HALF_95, PlantDescription, as_number, by_name, names_of, unknown
-from ..estimation.result import Identification
-from ..information import relative_size
-from ..plant import AbstractPlant, Params
+from ..description import as_number, names_of, wrong_type
+from ..plant import AbstractPlant
+from ..record.units import unit_factor
 from ..report.numbers import digits_for, number
 from ..rig.contract import Interval
+from .quantities import AbstractQuantity, QuantityLike, parameters_of, quantity_of
+
+TargetLike: TypeAlias = Mapping[QuantityLike, str | float] | Mapping[str, str | float]
+"""Half of a 95 % interval by quantity: "1%" of the estimate, a number in the quantity's unit, or
+with a unit of its own, "0.1 deg"."""
+
+_NUMBER = re.compile(r"([-+]?[\d.]+(?:e[-+]?\d+)?)\s*(.*)", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
 class Target:
-    """How precisely a parameter is to be known.
+    """How precisely a quantity is to be known.
 
     Attributes:
-        parameter: its name.
-        half: half of the 95 % interval, in the parameter's unit or as a fraction of the estimate.
+        quantity: a parameter, a function of them, or a prediction.
+        half: half of the 95 % interval, in the quantity's unit or as a fraction of the estimate.
         is_relative: whether it is a fraction.
     """
 
-    parameter: str
+    quantity: AbstractQuantity
     half: float
     is_relative: bool
+
+    @property
+    def name(self) -> str:
+        """Of the quantity."""
+        return self.quantity.name
 
     def share(self, value: Any, half: Any) -> Any:
         """Half of an interval over that allowed; the target is reached at one."""
@@ -38,65 +49,70 @@ class Target:
             return np.divide(half, self.allowed(value))  # infinite for a share of nothing
 
     def allowed(self, value: Any) -> Any:
-        """Half of the interval that is allowed, in the parameter's unit."""
+        """Half of the interval that is allowed, in the quantity's unit."""
         return self.half * np.abs(value) if self.is_relative else self.half
 
     def __str__(self) -> str:
         return f"{100 * self.half:g} %" if self.is_relative else f"{self.half:g}"
 
 
-def targets_from(plant: PlantDescription, given: Mapping[str, str | float]) -> tuple[Target, ...]:
-    """Targets by parameter: `{"D_p": "1%"}` of the estimate, or a number in its unit.
+def targets_from(plant: AbstractPlant, given: TargetLike) -> tuple[Target, ...]:
+    """Targets by quantity, such as `{"D_p": "1%"}`; see `QuantityLike`.
 
     Raises:
-        ValueError: for an unknown parameter, a target that is not above 0, or none at all.
-        TypeError: for something else than a dict by name.
+        ValueError: for an unknown quantity, a target that is not above 0, two of the same name,
+            or none at all.
+        TypeError: for something else than a dict.
     """
-    found, names = [], names_of(plant.parameters)
-    for name, value in by_name("target", given, "a dict by parameter").items():
-        if name not in names:
-            raise unknown("parameter", name, names)
-        is_relative = isinstance(value, str) and value.strip().endswith("%")
-        text = value.strip().removesuffix("%") if isinstance(value, str) else value
-        try:
-            half = float(text) if isinstance(text, str) else as_number(f"target of {name}", text)
-        except ValueError:
-            half = float("nan")
-        if not 0 < half < float("inf"):
-            raise ValueError(
-                f"target of {name} must be a number above 0, or a percentage such as 1%: got "
-                f"{value!r}"
-            )
-        found.append(Target(name, half / 100 if is_relative else half, is_relative))
+    if not isinstance(given, Mapping) or not all(isinstance(n, str) or callable(n) for n in given):
+        raise wrong_type("target", given, "a dict by parameter")
+    found = []
+    for word, value in given.items():
+        quantity = quantity_of(plant, word)
+        if quantity.name in [t.name for t in found]:
+            raise ValueError(f"{quantity.name} has two targets")
+        found.append(Target(quantity, *_half(quantity, value)))
     if not found:
         raise ValueError("a target is needed, such as D_p=1%")
     return tuple(found)
 
 
-def known_of(result: Identification) -> dict[str, Interval]:
-    """Of each parameter, the estimate and half of its 95 % interval; infinite for a held one."""
-    found = {}
-    for name, value in result.params.items():
-        low, high = result.ci95(name)
-        half = float("inf") if name in result.held else (high - low) / 2
-        found[name] = Interval(float(value), half if half == half else float("inf"))
-    return found
+def _half(quantity: AbstractQuantity, value: str | float) -> tuple[float, bool]:
+    """Half of an interval, and whether it is a fraction of the estimate."""
+    what, half, unit = f"target of {quantity.name}", float("nan"), ""
+    if not isinstance(value, str):
+        half = as_number(what, value)
+    elif (found := _NUMBER.fullmatch(value.strip())) is not None:
+        with contextlib.suppress(ValueError):
+            half, unit = float(found[1]), found[2]
+    if not 0 < half < float("inf"):
+        raise ValueError(
+            f"{what} must be a number above 0, or a percentage such as 1%: got {value!r}"
+        )
+    if unit == "%":
+        return half / 100, True
+    try:
+        return half * (unit_factor("", unit, quantity.unit) if unit else 1.0), False
+    except ValueError:
+        raise ValueError(
+            f"{what} is in {quantity.unit or '1'!r}, which {unit!r} is no other unit of"
+        ) from None
 
 
-def half_intervals(
-    plant: AbstractPlant, params: Params, information: Float[Array, "*step param param"]
-) -> Float[Array, "*step param"]:
-    """Half of the 95 % intervals, in the parameters' units; infinite for singular information."""
-    inverse = jnp.linalg.inv(information)
-    variance = jnp.diagonal(inverse, axis1=-2, axis2=-1)
-    sound = jnp.isfinite(variance) & (variance > 0)
-    size = relative_size(plant, params).reshape((1,) * (variance.ndim - 1) + (-1,))
-    return HALF_95 * size * jnp.sqrt(jnp.where(sound, variance, jnp.inf))
+def quantities_of(plant: AbstractPlant, targets: Sequence[Target]) -> tuple[AbstractQuantity, ...]:
+    """All parameters of a plant, and what else the targets are about."""
+    return (*parameters_of(plant.description), *others_of(plant, targets))
+
+
+def others_of(plant: AbstractPlant, targets: Sequence[Target]) -> tuple[AbstractQuantity, ...]:
+    """What targets are about beside parameters."""
+    names = names_of(plant.definition.parameters)
+    return tuple(t.quantity for t in targets if t.name not in names)
 
 
 def shares_of(targets: Sequence[Target], known: Mapping[str, Interval]) -> dict[str, float]:
     """Of each target, half of the interval over that allowed; empty where nothing is known."""
-    return {t.parameter: float(t.share(*known[t.parameter])) for t in targets} if known else {}
+    return {t.name: float(t.share(*known[t.name])) for t in targets} if known else {}
 
 
 def farthest(shares: Mapping[str, float]) -> str:
@@ -108,14 +124,15 @@ def farthest(shares: Mapping[str, float]) -> str:
 
 
 def known_row(
-    plant: PlantDescription, targets: Sequence[Target], known: Mapping[str, Interval], name: str
+    quantity: AbstractQuantity, targets: Sequence[Target], known: Mapping[str, Interval]
 ) -> list[str]:
-    """Cells of a parameter: name, estimate, half of the interval, the same as a share, target."""
-    target = "".join(str(t) for t in targets if t.parameter == name)
+    """Cells of a quantity: name, estimate, half of the interval, the same as a share, target."""
+    name = quantity.name
+    target = "".join(str(t) for t in targets if t.name == name)
     if name not in known:
         return [name, "–", "–", "–", target]
     value, half = known[name]
-    shown = f"{number(value, digits_for(value, half))} {plant.parameter(name).unit}".rstrip()
+    shown = f"{number(value, digits_for(value, half))} {quantity.unit}".rstrip()
     return [name, shown, f"{half:.2g}", relative_half(known[name]), target]
 
 

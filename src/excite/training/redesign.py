@@ -103,7 +103,7 @@ def first_signals(
 def redesigned(
     plant: AbstractPlant,
     region: Region,
-    goals: Float[Array, " param"],
+    asked: Float[Array, "goal param"],
     starts: Float[Array, "start round time input"],
     coast: int,
     settings: GradientSettings = SEARCH,
@@ -111,12 +111,14 @@ def redesigned(
     """Signals of the coming rounds, each from rest, that bring the parameters to their goals.
 
     The criterion is A-optimality in units of the goals: the logarithm of the root of the summed
-    squares of standard deviation over goal, on average over the plants of the region.
+    squares of standard deviation over goal, on average over the plants of the region
+    (L-optimality in the parameters).
 
     Args:
         plant: with the sensor of the rounds.
         region: what is known before.
-        goals: relative standard deviation of each parameter; infinite for one that is not asked.
+        asked: of each goal, the derivative of its quantity with respect to relative changes of the
+            parameters, over the standard deviation that is to be reached.
         starts: of the search, side by side.
         coast: samples after a round's end in which it must be safe too.
         settings: of the search by Adam, and of its penalty of outputs near a level.
@@ -126,8 +128,8 @@ def redesigned(
 
     def uncertainty(params: Params, inputs: Float[Array, "round time input"]) -> Array:
         gained = jax.vmap(lambda own: experiment_information(plant, params, own))(inputs)
-        variance = jnp.diagonal(jnp.linalg.inv(region.information + jnp.sum(gained, axis=0)))
-        return 0.5 * jnp.log(jnp.sum(variance / goals**2))
+        covariance = jnp.linalg.inv(region.information + jnp.sum(gained, axis=0))
+        return 0.5 * jnp.log(jnp.einsum("gi,ij,gj->", asked, covariance, asked))
 
     def outputs(params: Params, own: Float[Array, "time input"]) -> Array:
         return response(plant, params, jnp.concatenate([own, rest]))
