@@ -17,7 +17,8 @@ from excite.information import experiment_information
 from excite.plant import Aero2, DCMotor
 from excite.rig.contract import Interval
 from excite.simulation import response
-from excite.study.next_experiment import Candidate, best_of, region_of
+from excite.study.knowledge import region_of
+from excite.study.next_experiment import Candidate, best_of
 from excite.study.targets import targets_from
 from excite.training.redesign import POINTS, SAFE, Region, first_signals, redesigned
 
@@ -167,7 +168,7 @@ def test_the_command_writes_a_signal_that_can_be_played(tmp_path):
         ({"steps": 1}, "steps must be a whole number from 2"),
         ({"ahead": 0}, "ahead must be a whole number from 1 to 20: got 0"),
         ({"policy": "dc_motor"}, "the policy has 2 outputs; the plant has 1"),
-        ({"prior": {"D_p": "normal:0.001:5%"}}, "is taken alone, without a prior"),
+        ({"prior": {"D_p": "normal:0.001:5%"}}, "a result has its prior"),
         ({"out": "next.txt"}, "next.txt"),
     ],
 )
@@ -186,8 +187,10 @@ def test_run_folders_are_taken_as_results(tmp_path):
     by_folder = region_of(Aero2(), tmp_path / "run", 0.3)
     by_result = region_of(Aero2(), result, 0.3)
     np.testing.assert_allclose(by_folder.information, by_result.information, rtol=1e-6)
-    with pytest.raises(ValueError, match="a run folder or a result is taken alone"):
-        ex.next_experiment([tmp_path / "run", record])
+    other = ex.simulate("aero2", "chirp", steps=60, seed=2)
+    both = ex.next_experiment([tmp_path / "run", other], steps=30, coast=20).known
+    alone = ex.next_experiment(other, steps=30, coast=20).known
+    assert both["J_p"].ci95_half < 0.85 * alone["J_p"].ci95_half
     with pytest.raises(ValueError, match=r"estimate\.json"):
         ex.next_experiment(tmp_path)
 

@@ -37,6 +37,7 @@ _PLACES = {
     "report": "report.html",
     "run": "rig.session",
     "next_experiment": "study.next_experiment",
+    "choose_experiments": "study.selection",
     "discriminate": "study.discrimination",
     "campaign": "study.campaign_on_rig",
     # nouns
@@ -141,6 +142,7 @@ if TYPE_CHECKING:
     from .study.falsify import falsify as falsify
     from .study.next_experiment import next_experiment as next_experiment
     from .study.run import run_study as run_study
+    from .study.selection import choose_experiments as choose_experiments
     from .study.spec import Study as Study
     from .study.spec import read_study as read_study
     from .study.train import train as train

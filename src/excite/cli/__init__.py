@@ -18,6 +18,7 @@ from .. import __version__
 from ..description import told
 from .benchmark import benchmark
 from .campaign import campaign
+from .choose import choose
 from .compare_plants import compare_plants
 from .completion import complete_names
 from .design import design
@@ -51,6 +52,7 @@ _SECTIONS: dict[str, dict[click.Command, str]] = {
     },
     "Design and train": {
         next_experiment: "excite next record.csv --target D_p=1% --steps 200 --out next.csv",
+        choose: "excite choose aero2 experiments.toml --target D_p=1% --rounds 3",
         discriminate: "excite discriminate aero2 aero2_lag,tau=0.05:0.25 --out next.csv",
         design: "excite design aero2 --out signal.csv",
         train: "excite train aero2 --out runs/first",

@@ -86,6 +86,39 @@ class Prior(eqx.Module):
             jax.scipy.linalg.block_diag(*[prior.root for prior in priors]),
         )
 
+    @classmethod
+    def product(cls, priors: Sequence[Prior]) -> Prior:
+        """Distributions of independent records as one; of one of them, itself.
+
+        Raises:
+            ValueError: where they contradict each other.
+        """
+        if len(priors) == 1:
+            return priors[0]
+        names = tuple(dict.fromkeys(name for prior in priors for name in prior.names))
+        kinds = {
+            n: k for prior in priors for n, k in zip(prior.names, prior.logarithmic, strict=True)
+        }
+        rows, means = [], []
+        for prior in priors:
+            root, place = np.asarray(prior.root), [names.index(name) for name in prior.names]
+            row = np.zeros((len(root), len(names)))
+            row[:, place] = root
+            rows.append(row)
+            means.append(root @ np.asarray(prior.mean))
+        W, v = np.concatenate(rows), np.concatenate(means)
+        mean = np.linalg.lstsq(W, v)[0]
+        more = len(v) - len(names)
+        if more and chi2_tail(more, float(np.sum((W @ mean - v) ** 2))) < RARE:
+            raise ValueError(
+                "the results contradict each other: their estimates differ by more than their "
+                "errors; identify their records together"
+            )
+        root = np.linalg.qr(W, mode="r")
+        return cls(
+            names, tuple(kinds[n] for n in names), jax.device_put(mean), jax.device_put(root)
+        )
+
     def residual(
         self, description_names: Sequence[str], values: Float[Array, " param"]
     ) -> Float[Array, " row"]:

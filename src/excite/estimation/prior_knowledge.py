@@ -63,10 +63,8 @@ def with_prior(
                     is_log = kind == "lognormal"
                     mean = math.log(a) if is_log else a
                     normal.append(Prior.normal([name], [mean], [[b**2]], [is_log]))
-        elif isinstance(one, Identification):
-            normal.append(_from_run(plant, one.summary(), "the result"))
-        elif isinstance(one, str | Path):
-            normal.append(_read(plant, Path(one)))
+        elif isinstance(one, Identification | str | Path):
+            normal.append(prior_of_run(plant, one))
         elif isinstance(one, Prior):
             _require_names(plant, one.names)
             normal.append(one)
@@ -120,8 +118,11 @@ def _parsed(name: str, text: object, plant: AbstractPlant) -> tuple[str, float, 
     return kind, first, second
 
 
-def _read(plant: AbstractPlant, path: Path) -> Prior:
-    """A prior from a run folder, or from a file with mean and covariance."""
+def prior_of_run(plant: AbstractPlant, given: Identification | str | Path) -> Prior:
+    """A prior from a result, a run folder, or a file with mean and covariance; else ValueError."""
+    if isinstance(given, Identification):
+        return _from_run(plant, given.summary(), "the result")
+    path = Path(given)
     if path.is_dir():
         return _from_run(plant, EstimateSummary.read(path / "estimate.json", _ADVICE), str(path))
     if not path.exists():

@@ -110,6 +110,36 @@ def knowledge_figure(
     return figure
 
 
+def selection_figure(
+    title: str,
+    spent: Float[np.ndarray, " experiment"],
+    names: Sequence[str],
+    shares: Mapping[str, Float[np.ndarray, " experiment"]],
+) -> matplotlib.figure.Figure:
+    """Half of the 95 % intervals over those asked for, after each of some experiments.
+
+    Args:
+        title: of the figure.
+        spent: cost before the first, and after each experiment.
+        names: of the experiments, in their order.
+        shares: by target, before the first and after each; reached at one.
+    """
+    figure, axes = new_figure(1)
+    axis = axes[0, 0]
+    for i, (name, share) in enumerate(shares.items()):
+        shown = np.where(np.isfinite(share), share, np.nan)
+        axis.plot(spent, shown, color=colour_of(i), marker="o", ms=4, lw=1.4, label=name)
+    axis.axhline(1, color="black", lw=0.8, ls="--", label="asked for")
+    axis.set(yscale="log", xlabel="cost", ylabel="95 % interval over the target")
+    for before, end, name in zip(spent[:-1], spent[1:], names, strict=True):
+        axis.axvline(end, color=GREY, lw=0.8, ls=":")
+        middle = ((before + end) / 2, 1.02)
+        axis.annotate(name, middle, xycoords=axis.get_xaxis_transform(), ha="center", fontsize=8)
+    add_legend(figure, axis)
+    add_title(figure, title)
+    return figure
+
+
 def candidates_figure(
     description: PlantDescription,
     time: Float[np.ndarray, " sample"],

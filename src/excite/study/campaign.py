@@ -50,8 +50,9 @@ from ..rig.loop import COMPLETE
 from ..safety import critical_levels
 from .discrimination import Discrimination, RivalLike, judged, rivals_from, with_experiment
 from .falsify import trained_in
+from .knowledge import region_of
 from .monitor import Monitor
-from .next_experiment import COAST, REDESIGNED, NextExperiment, best_of, candidates, region_of
+from .next_experiment import COAST, REDESIGNED, NextExperiment, best_of, candidates
 from .quantities import (
     AbstractQuantity,
     OneParameter,

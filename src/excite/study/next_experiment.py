@@ -21,35 +21,28 @@ from jaxtyping import Array, Float
 
 from ..description import (
     LARGEST_SEED,
-    Spread,
     SpreadLike,
-    names_of,
     require_whole,
 )
-from ..environment import prior_sd_of
 from ..environment.falsification import nearness
-from ..estimation.identify import RecordLike, identify, plant_named_by
-from ..estimation.prior_knowledge import PriorLike, with_prior
-from ..estimation.result import Identification
+from ..estimation.prior_knowledge import PriorLike
 from ..excitation import AbstractExcitation, Coast, PolicyExcitation, Replay
-from ..information import relative_size, running_information
+from ..information import running_information
 from ..plant import AbstractPlant
-from ..plant.catalogue import PlantLike, plant_from
+from ..plant.catalogue import PlantLike
 from ..policy import Policy, mismatch, read_policy
 from ..record import Record, require_record_path, write_record
-from ..report.rows import EstimateSummary
 from ..report.tables import html_table, text_table
 from ..rig.contract import Interval
 from ..simulation import response, run_episode
 from ..training.checkpoint import Progress
 from ..training.design import designed_record
 from ..training.redesign import JUDGES, Region, first_signals, redesigned
+from .knowledge import KnownLike, intervals_in, known_from
 from .quantities import (
     AbstractQuantity,
     estimates,
     half_intervals,
-    known_of,
-    parameters_of,
     slopes,
 )
 from .targets import (
@@ -58,6 +51,7 @@ from .targets import (
     farthest,
     known_row,
     others_of,
+    over_targets,
     quantities_of,
     relative_half,
     shares_of,
@@ -70,7 +64,7 @@ if TYPE_CHECKING:
 REDESIGNED = "redesigned"
 COAST = 100  # samples of free motion that must be safe, unless another number is given
 
-_SAFE = 0.99  # of the critical level: largest output of a candidate on the possible plants
+SAFE = 0.99  # of the critical level: largest output of a candidate on the possible plants
 
 
 @dataclass(frozen=True)
@@ -100,7 +94,7 @@ class Candidate:
     @property
     def is_safe(self) -> bool:
         """Whether no possible plant comes near to a critical level."""
-        return self.nearness < _SAFE
+        return self.nearness < SAFE
 
     def to_dict(self) -> dict[str, Any]:
         """What is predicted, as JSON-ready data."""
@@ -122,28 +116,6 @@ def best_of(candidates: Sequence[Candidate], targets: Sequence[Target]) -> Candi
     return min(
         safe, key=lambda c: (c.samples, max(shares_of(targets, c.after).values())), default=None
     )
-
-
-def region_of(
-    plant: AbstractPlant, known: Identification | str | Path, spread: SpreadLike
-) -> Region:
-    """The plants that an identification leaves possible, within the spread.
-
-    Args:
-        plant: whose parameters were estimated.
-        known: the result, or its run folder.
-        spread: of the parameters before; it is all that is known of one that was not estimated.
-    """
-    _, prior, center = with_prior(plant, known, plant.nominal, {}, {})
-    size = np.asarray(relative_size(plant, center))
-    information = np.eye(len(size)) / prior_sd_of(spread) ** 2
-    if prior is not None:
-        names = names_of(plant.definition.parameters)
-        index = [names.index(name) for name in prior.names]
-        unit = np.where(prior.logarithmic, 1.0, size[index])
-        root = np.asarray(prior.root) * unit[None]
-        information[np.ix_(index, index)] += root.T @ root
-    return Region(jnp.stack(list(center)), jnp.asarray(information))
 
 
 def candidates(
@@ -176,11 +148,8 @@ def candidates(
         found.append(_candidate(plant, region, targets, name, given, length, coast, seed))
         inputs = jnp.asarray(np.resize(found[0].inputs, (num_steps, found[0].inputs.shape[1])))
         starts = jnp.concatenate([starts, jnp.broadcast_to(inputs, (1, *starts.shape[1:]))])
-    params = plant.Params(*region.center)
-    values, slope = slopes([t.quantity for t in targets], plant, params)
-    allowed = [t.allowed(float(value)) for t, value in zip(targets, values, strict=True)]
-    asked = slope * relative_size(plant, params)[None] / jnp.asarray(allowed)[:, None]
-    made = redesigned(plant, region, asked, starts, coast)
+    asked = over_targets(plant, plant.Params(*region.center), targets)
+    made = redesigned(plant, region, jnp.asarray(asked), starts, coast)
     replay = Replay(made.inputs[0])
     redesign = _candidate(plant, region, targets, REDESIGNED, replay, num_steps, coast, seed)
     is_found = bool(jnp.isfinite(made.shares).any())
@@ -382,7 +351,7 @@ class NextExperiment:
 
 
 def next_experiment(
-    known: RecordLike | Sequence[RecordLike] | Identification,
+    known: KnownLike,
     plant: PlantLike | None = None,
     target: TargetLike | None = None,
     *,
@@ -410,7 +379,8 @@ def next_experiment(
         'redesigned'
 
     Args:
-        known: a record, its file, or several; or the result of `identify`, or its run folder.
+        known: a record or its file, a result of `identify` or its run folder, or several of these,
+            each record once.
         plant: a name, `path/to/file.py:ClassName`, a plant or its class; default that of the
             record, the result or the run folder.
         target: half of a 95 % interval by quantity, as for `Campaign`; default half of what it is
@@ -438,28 +408,20 @@ def next_experiment(
         require_whole("steps", steps, 2)
     if out is not None:
         require_record_path(Path(out), overwrite)
-    reach = Spread.of(spread)
-    parts, own = _parts(known, plant, prior)
-    d = own.description
-    targets = None if target is None else targets_from(own, target)
-    played = None
-    if policy is not None:
-        found = policy if isinstance(policy, Policy) else read_policy(policy)
-        mismatch(found, d)
-        played = ("policy" if isinstance(policy, Policy) else f"policy {policy}", found)
-    progress("estimating", 0, 2)
-    given = _estimate(parts, own, prior)
-    if isinstance(given, Identification) and given.basis is not None:
-        own = given.basis.plant  # sampled as the records are
-    region = region_of(own, given, reach)
-    _require_within(own, region, reach)
-    now = _known(own, region, parameters_of(d))
-    targets = targets or targets_from(own, {n: known.ci95_half / 2 for n, known in now.items()})
-    now = (
-        known_of(own, given, others_of(own, targets))
-        if isinstance(given, Identification)
-        else _known(own, region, quantities_of(own, targets))
+    found = (
+        None if policy is None else policy if isinstance(policy, Policy) else read_policy(policy)
     )
+    progress("estimating", 0, 2)
+    given = known_from(known, plant, prior, spread)
+    own, region = given.plant, given.region
+    played = None
+    if found is not None:
+        mismatch(found, own.description)
+        played = ("policy" if isinstance(policy, Policy) else f"policy {policy}", found)
+    now = intervals_in(own, region, ())
+    usual = {name: interval.ci95_half / 2 for name, interval in now.items()}
+    targets = targets_from(own, usual if target is None else target)
+    now = given.of(others_of(own, targets))
     length = steps or (played[1].layout.num_steps if played else 200)
     progress("redesigning", 1, 2)
     made = candidates(
@@ -470,73 +432,3 @@ def next_experiment(
     if out is not None:
         result.save(out, overwrite)
     return result
-
-
-def _known(
-    plant: AbstractPlant, region: Region, quantities: Sequence[AbstractQuantity]
-) -> dict[str, Interval]:
-    """What is known of quantities of the region's plants."""
-    params = plant.Params(*region.center)
-    values, _ = slopes(quantities, plant, params)
-    halves = half_intervals(quantities, plant, params, region.information)
-    each = zip(quantities, values, halves, strict=True)
-    return {q.name: Interval(float(value), float(half)) for q, value, half in each}
-
-
-def _parts(
-    known: RecordLike | Sequence[RecordLike] | Identification,
-    plant: PlantLike | None,
-    prior: PriorLike | Sequence[PriorLike] | None,
-) -> tuple[list[Any], AbstractPlant]:
-    """What is known, as a list, and the plant; ValueError for what cannot be used together."""
-    parts = [known] if isinstance(known, str | Path | Record | Identification) else list(known)
-    if not parts:
-        raise ValueError("no record is given")
-    if any(map(_is_result, parts)) and (len(parts) > 1 or prior is not None):
-        raise ValueError(
-            "a run folder or a result is taken alone, without a prior: identify its records "
-            "together with the others, or give the records"
-        )
-    if plant is not None:
-        return parts, plant_from(plant)
-    first = parts[0]
-    if isinstance(first, Identification):
-        return parts, plant_from(first.plant.name) if first.basis is None else first.basis.plant
-    if isinstance(first, str | Path) and Path(first).is_dir():
-        path = Path(first) / "estimate.json"
-        return parts, plant_from(EstimateSummary.read(path, "identify the records again").plant)
-    return parts, plant_from(plant_named_by(first))
-
-
-def _is_result(part: object) -> bool:
-    """Whether it is an identification or its run folder, and not a record."""
-    is_folder = isinstance(part, str | Path) and Path(part).is_dir()
-    return is_folder or isinstance(part, Identification)
-
-
-def _estimate(
-    parts: list[Any], plant: AbstractPlant, prior: PriorLike | Sequence[PriorLike] | None
-) -> Identification | Path:
-    """The parameters' estimate: a result, or the folder of one."""
-    if isinstance(parts[0], Identification):
-        return parts[0]
-    if _is_result(parts[0]):
-        return Path(parts[0])
-    result = identify(parts, plant, prior=prior)
-    if not result.is_usable:
-        raise ValueError(f"the records give no estimate ({result.status})")
-    return result
-
-
-def _require_within(plant: AbstractPlant, region: Region, spread: Spread) -> None:
-    """Raises ValueError where the spread excludes an estimate."""
-    sd = 1 / np.sqrt(np.diag(np.asarray(region.information)))
-    for i, parameter in enumerate(plant.definition.parameters):
-        value, nominal = float(region.center[i]), float(plant.nominal[i])
-        lower, upper = (spread.value(parameter, nominal, unit) for unit in (-1.0, 1.0))
-        slack = 4 * sd[i] * (value if parameter.positive else parameter.scale)
-        if not lower - slack <= value <= upper + slack:
-            raise ValueError(
-                f"the spread {spread} excludes the estimate of {parameter.name}, {value:.4g} "
-                f"{parameter.unit}: it allows {lower:.4g} to {upper:.4g}; give a wider spread"
-            )

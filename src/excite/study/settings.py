@@ -7,13 +7,18 @@ import json
 import math
 import re
 from collections.abc import Mapping
+from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import pydantic
+import tomlkit
+import tomlkit.exceptions
 from pydantic import BaseModel, ConfigDict, Field
 
 from ..description import Spread, unknown
+from ..policy import POLICY_ENDING
+from ..record.read import SIGNAL_ENDINGS
 
 _T = TypeVar("_T")
 
@@ -72,6 +77,24 @@ def checked(
         return pydantic.TypeAdapter(kind).validate_json(content, strict=True)
     except pydantic.ValidationError as error:
         raise ValueError(f"{where}: {sentence(error, tables)}") from None
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """The content of a TOML file; ValueError where it cannot be read."""
+    try:
+        return tomlkit.parse(path.read_text(encoding="utf-8")).unwrap()
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise ValueError(f"{path}: cannot be read ({reason})") from None
+    except tomlkit.exceptions.ParseError as error:
+        raise ValueError(f"{path}: not valid TOML: {error}") from None
+
+
+def excitation_beside(folder: Path, word: str) -> str:
+    """An excitation as it is written in a file of this folder: a file's name is relative to it."""
+    file = folder / word
+    is_file = file.suffix in (POLICY_ENDING, *SIGNAL_ENDINGS) and file.is_file()
+    return str(file) if is_file else word
 
 
 _ALLOWED = {

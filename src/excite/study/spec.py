@@ -9,8 +9,6 @@ from typing import Annotated, Any
 
 import jax
 import pydantic
-import tomlkit
-import tomlkit.exceptions
 from pydantic import Field
 
 from ..description import names_of, unknown, wrong_type
@@ -31,8 +29,6 @@ from ..plant.catalogue import (
     word_of,
 )
 from ..plant.uncertainty import Uncertainty
-from ..policy import POLICY_ENDING
-from ..record.read import SIGNAL_ENDINGS
 from ..training.settings import GradientSettings, PPOSettings
 from ..training.signals import CLAIRVOYANT, CLAIRVOYANT_STARTS
 from .agent import REWARD_TABLES, Agent, AgentSettings, DecisionSettings
@@ -45,6 +41,8 @@ from .settings import (
     Settings,
     SpreadSetting,
     checked,
+    excitation_beside,
+    read_toml,
     sentence,
 )
 
@@ -351,14 +349,7 @@ def read_study(path: str | Path) -> Study:
             exist (with the nearest that does), or a value that is not allowed.
     """
     path = study_path(path)
-    try:
-        content = tomlkit.parse(path.read_text(encoding="utf-8")).unwrap()
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise ValueError(f"{path}: cannot be read ({reason})") from None
-    except tomlkit.exceptions.ParseError as error:
-        raise ValueError(f"{path}: not valid TOML: {error}") from None
-    study = study_from(content, str(path))
+    study = study_from(read_toml(path), str(path))
     return _beside(study, path.parent).checked(str(path))
 
 
@@ -368,9 +359,7 @@ def _beside(study: Study, folder: Path) -> Study:
     if ":" in plant and (folder / plant.rpartition(":")[0]).is_file():
         plant = str(folder / plant)
     for method in methods.values():
-        file = folder / method["excitation"]
-        if file.suffix in (POLICY_ENDING, *SIGNAL_ENDINGS) and file.is_file():
-            method["excitation"] = str(file)
+        method["excitation"] = excitation_beside(folder, method["excitation"])
     return study.changed(plant=plant, methods=methods)
 
 

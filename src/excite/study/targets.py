@@ -9,13 +9,15 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
+from jaxtyping import Float
 
 from ..description import as_number, names_of, wrong_type
-from ..plant import AbstractPlant
+from ..information import relative_size
+from ..plant import AbstractPlant, Params
 from ..record.units import unit_factor
 from ..report.numbers import digits_for, number
 from ..rig.contract import Interval
-from .quantities import AbstractQuantity, QuantityLike, parameters_of, quantity_of
+from .quantities import AbstractQuantity, QuantityLike, parameters_of, quantity_of, slopes
 
 TargetLike: TypeAlias = Mapping[QuantityLike, str | float] | Mapping[str, str | float]
 """Half of a 95 % interval by quantity: "1%" of the estimate, a number in the quantity's unit, or
@@ -53,7 +55,7 @@ class Target:
         return self.half * np.abs(value) if self.is_relative else self.half
 
     def __str__(self) -> str:
-        return f"{100 * self.half:g} %" if self.is_relative else f"{self.half:g}"
+        return f"{100 * self.half:g} %" if self.is_relative else f"{self.half:.4g}"
 
 
 def targets_from(plant: AbstractPlant, given: TargetLike) -> tuple[Target, ...]:
@@ -108,6 +110,15 @@ def others_of(plant: AbstractPlant, targets: Sequence[Target]) -> tuple[Abstract
     """What targets are about beside parameters."""
     names = names_of(plant.definition.parameters)
     return tuple(t.quantity for t in targets if t.name not in names)
+
+
+def over_targets(
+    plant: AbstractPlant, params: Params, targets: Sequence[Target]
+) -> Float[np.ndarray, "target param"]:
+    """How each target's quantity moves with relative changes of the parameters, over its half."""
+    values, slope = slopes([t.quantity for t in targets], plant, params)
+    allowed = [t.allowed(float(value)) for t, value in zip(targets, values, strict=True)]
+    return np.asarray(slope * relative_size(plant, params)[None]) / np.array(allowed)[:, None]
 
 
 def shares_of(targets: Sequence[Target], known: Mapping[str, Interval]) -> dict[str, float]:

@@ -1,0 +1,162 @@
+"""What is known of a plant's parameters: from the spread, from records, or from earlier results."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from ..description import Spread, SpreadLike, names_of
+from ..environment import prior_sd_of
+from ..estimation.identify import RecordLike, identify, plant_named_by
+from ..estimation.prior import Prior
+from ..estimation.prior_knowledge import PriorLike, prior_of_run, with_prior
+from ..estimation.result import Identification
+from ..information import relative_size
+from ..plant import AbstractPlant
+from ..plant.catalogue import PlantLike, plant_from
+from ..record import Record
+from ..report.rows import EstimateSummary
+from ..rig.contract import Interval
+from ..training.redesign import Region
+from .quantities import AbstractQuantity, half_intervals, known_of, parameters_of, slopes
+
+KnownLike = RecordLike | Identification | Sequence[RecordLike | Identification]
+"""Records or their files, results of `identify` or their run folders, or several of these."""
+
+
+@dataclass(frozen=True)
+class Knowledge:
+    """What is known of a plant's parameters.
+
+    Attributes:
+        plant: sampled as the records are.
+        region: the parameters that are possible.
+        result: of identification, where there is one.
+    """
+
+    plant: AbstractPlant
+    region: Region
+    result: Identification | None = None
+
+    def of(self, others: Sequence[AbstractQuantity]) -> dict[str, Interval]:
+        """Of each parameter, and of other quantities, the estimate and half of its interval."""
+        if self.result is not None:
+            return known_of(self.plant, self.result, others)
+        return intervals_in(self.plant, self.region, others)
+
+
+def intervals_in(
+    plant: AbstractPlant, region: Region, others: Sequence[AbstractQuantity]
+) -> dict[str, Interval]:
+    """Of each parameter, and of other quantities, value and half of the interval in a region."""
+    params, quantities = plant.Params(*region.center), (*parameters_of(plant.description), *others)
+    values, _ = slopes(quantities, plant, params)
+    halves = half_intervals(quantities, plant, params, region.information)
+    each = zip(quantities, values, halves, strict=True)
+    return {q.name: Interval(float(value), float(half)) for q, value, half in each}
+
+
+def known_before(plant: AbstractPlant, spread: SpreadLike) -> Knowledge:
+    """What is known before the first record: the spread."""
+    center = jnp.stack([jnp.asarray(value, float) for value in plant.nominal])
+    return Knowledge(plant, Region(center, jnp.eye(len(center)) / prior_sd_of(spread) ** 2))
+
+
+def known_from(
+    known: KnownLike,
+    plant: PlantLike | None,
+    prior: PriorLike | Sequence[PriorLike] | None,
+    spread: SpreadLike,
+) -> Knowledge:
+    """What records and earlier results tell together.
+
+    Records are identified together; the results of other records count as what was known before.
+
+    Args:
+        known: records and results, each record once.
+        plant: default that of the first of them.
+        prior: as for `identify`, where only records are given.
+        spread: of the parameters before.
+
+    Raises:
+        ValueError: for records of another plant, results that contradict each other, and an
+            estimate outside the spread.
+    """
+    is_one = isinstance(known, str | Path | Record | Identification)
+    parts: list[Any] = [known] if is_one else list(known)
+    if not parts:
+        raise ValueError("no record is given")
+    results = [part for part in parts if _is_result(part)]
+    records = [part for part in parts if not _is_result(part)]
+    if results and prior is not None:
+        raise ValueError("a result has its prior: a prior is given with records alone")
+    own, reach = plant_from(plant) if plant is not None else _plant_of(parts[0]), Spread.of(spread)
+    before = Prior.product([prior_of_run(own, part) for part in results]) if results else None
+    result = None
+    if records:
+        result = identify(records, own, prior=prior if before is None else before)
+        if not result.is_usable:
+            raise ValueError(f"the records give no estimate ({result.status})")
+    elif len(results) == 1 and isinstance(results[0], Identification):
+        result = results[0]
+    if result is not None and result.basis is not None:
+        own = result.basis.plant  # sampled as the records are
+    found = Knowledge(own, region_of(own, result or before or {}, reach), result)
+    _require_within(found, reach)
+    return found
+
+
+def region_of(plant: AbstractPlant, known: PriorLike, spread: SpreadLike) -> Region:
+    """The plants that an identification leaves possible, within the spread.
+
+    Args:
+        plant: whose parameters were estimated.
+        known: the result, its run folder, or a normal distribution.
+        spread: of the parameters before; it is all that is known of one that was not estimated.
+    """
+    _, prior, center = with_prior(plant, known, plant.nominal, {}, {})
+    size = np.asarray(relative_size(plant, center))
+    information = np.eye(len(size)) / prior_sd_of(spread) ** 2
+    if prior is not None:
+        names = names_of(plant.definition.parameters)
+        index = [names.index(name) for name in prior.names]
+        unit = np.where(prior.logarithmic, 1.0, size[index])
+        root = np.asarray(prior.root) * unit[None]
+        information[np.ix_(index, index)] += root.T @ root
+    return Region(jnp.stack(list(center)), jnp.asarray(information))
+
+
+def _plant_of(part: Any) -> AbstractPlant:
+    """The plant of a record, a result or a run folder."""
+    if isinstance(part, Identification):
+        return plant_from(part.plant.name) if part.basis is None else part.basis.plant
+    if _is_result(part):
+        path = Path(part) / "estimate.json"
+        return plant_from(EstimateSummary.read(path, "identify the records again").plant)
+    return plant_from(plant_named_by(part))
+
+
+def _is_result(part: object) -> bool:
+    """Whether it is an identification or its run folder, and not a record."""
+    is_folder = isinstance(part, str | Path) and Path(part).is_dir()
+    return is_folder or isinstance(part, Identification)
+
+
+def _require_within(known: Knowledge, spread: Spread) -> None:
+    """Raises ValueError where the spread excludes an estimate."""
+    plant, region = known.plant, known.region
+    sd = 1 / np.sqrt(np.diag(np.asarray(region.information)))
+    for i, parameter in enumerate(plant.definition.parameters):
+        value, nominal = float(region.center[i]), float(plant.nominal[i])
+        lower, upper = (spread.value(parameter, nominal, unit) for unit in (-1.0, 1.0))
+        slack = 4 * sd[i] * (value if parameter.positive else parameter.scale)
+        if not lower - slack <= value <= upper + slack:
+            raise ValueError(
+                f"the spread {spread} excludes the estimate of {parameter.name}, {value:.4g} "
+                f"{parameter.unit}: it allows {lower:.4g} to {upper:.4g}; give a wider spread"
+            )
