@@ -17,7 +17,7 @@ from commands import excite
 
 import excite as ex
 from excite.description import HALF_95
-from excite.files import locked_folder
+from excite.files import locked_folder, read_columns
 from excite.information import experiment_information
 from excite.plant import Aero2, draw_params
 from excite.policy import Layout
@@ -423,6 +423,26 @@ def test_every_round_has_its_own_noise_and_the_same_plant(played):
     saved = json.loads((folder / "campaign.json").read_text())
     assert saved["num_samples"] == made.num_samples
     assert len(saved["rounds"]) == 2
+
+
+@pytest.mark.science
+def test_a_campaign_is_reported_and_its_estimate_is_a_run(played):
+    folder, made = played
+    page = ex.report(folder)
+    for words in ("aero2: all rounds are played", "0.3 %", "missed", "Round 2: inputs", "factor:3"):
+        assert words in page
+    assert page.count("<svg") == 3
+    known = read_columns(folder / "knowledge.csv", ["sample", "J_p", "K_pu", "D_p"])
+    np.testing.assert_allclose(known["D_p"], made.knowledge()[1][:, 2])
+    found = ex.next_experiment(folder / "estimate", spread="factor:3", steps=30, coast=20)
+    for name, interval in found.known.items():
+        assert interval.estimate == pytest.approx(made.known[name].estimate, rel=1e-6)
+    assert "every target" not in ex.report(folder / "estimate")
+    (folder / "knowledge.csv").write_text("sample\n1\n")
+    assert ex.report(folder).count("<svg") == 2  # without what was known
+    (folder / "knowledge.csv").write_text("sample\nmany\n")
+    with pytest.raises(ValueError, match=r"knowledge\.csv"):
+        ex.report(folder)
 
 
 @pytest.mark.science

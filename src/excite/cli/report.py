@@ -17,8 +17,8 @@ from .options import OUT_FILE, json_option, progress_bar, show_json
 def report(runs: tuple[Path, ...], out: Path, overwrite: bool, as_json: bool) -> None:
     """Write one self-contained page of figures, tables and provenance.
 
-    RUN is a run folder of `excite identify` or `excite study run`, or a record with its
-    sidecar; several are shown side by side.
+    RUN is a run folder of `excite identify`, `excite campaign` or `excite study run`, or a
+    record with its sidecar; several are shown side by side.
     """
     from ..report.html import report as verb
 

@@ -12,6 +12,7 @@ from .. import __version__
 from ..description import path_from, wrong_type
 from ..files import require_new_file, write_bytes
 from ..record.figure import MAX_POINTS, at_most
+from .sections.campaign import read_campaign
 from .sections.elements import Marker, Run, Section, paragraph, text
 from .sections.experiment import Experiment, comparison, read_experiment
 from .sections.record import read_recorded
@@ -25,6 +26,7 @@ _TOO_LARGE = f"This page is larger than {MAX_BYTES / 1e6:g} MB: several pages ar
 _STYLE = Path(__file__).with_name("page.css")
 _KINDS: dict[str, Callable[[Marker], Run]] = {
     "excite identification": read_experiment,
+    "excite campaign": read_campaign,
     "excite study": read_study_run,
 }
 _DRAWING = threading.Lock()  # Matplotlib's settings are global
@@ -38,7 +40,7 @@ def report_html(
     Lines of long records are thinned to their extremes, more so where the page gets large.
 
     Args:
-        runs: folders of `excite identify` and `excite study run`, and records
+        runs: folders of `excite identify`, `excite campaign` and `excite study run`, and records
              (.csv, .mat) with their sidecar.
         progress: called with what is drawn, how many are done, and the total.
 
@@ -71,8 +73,8 @@ def report(
         '<!DOCTYPE html>'
 
     Args:
-        runs: one or several folders of `excite identify` and `excite study run`, and records
-            with their sidecar.
+        runs: one or several folders of `excite identify`, `excite campaign` and `excite study
+            run`, and records with their sidecar.
         out: file to write, .html.
         overwrite: whether the file may exist.
         progress: called with what is drawn, how many are done, and the total.

@@ -441,6 +441,7 @@ class Campaign:
             "plant_hash": self.declared.description.hash,
             "policy_hash": self.policy.hash,
             "targets": {t.name: str(t) for t in self.targets},
+            "allowed": self._allowed(),
             "spread": self.spread.setting,
             "most_rounds": self.most_rounds,
             "coast": self.coast,
@@ -455,6 +456,11 @@ class Campaign:
             "num_samples": self.num_samples,
             "rounds": [r.to_dict() for r in self.rounds],
         }
+
+    def _allowed(self) -> dict[str, float]:
+        """Of each target, half of the interval that is allowed; empty without an estimate."""
+        known = self.known
+        return {t.name: float(t.allowed(known[t.name].estimate)) for t in self.targets if known}
 
     def _estimate(self) -> dict[str, dict[str, float]]:
         """What is known, as JSON-ready data."""

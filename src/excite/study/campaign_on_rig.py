@@ -20,7 +20,7 @@ from ..description import (
     wrong_type,
 )
 from ..excitation import Replay
-from ..files import locked_folder, read_json, write_json
+from ..files import csv_text, locked_folder, read_json, write_bytes, write_json
 from ..plant.catalogue import PlantLike
 from ..policy import Policy
 from ..record import Record, read_record
@@ -34,7 +34,7 @@ from .campaign import REACHED, WHOLE, Campaign, Round
 from .discrimination import RivalLike
 from .targets import TargetLike
 
-_OWN = {"campaign.json", ".lock"}  # files of a campaign without rounds
+_OWN = {"campaign.json", "run.json", ".lock"}  # files of a campaign without rounds
 _UNSAFE = (Trip.LEVEL, Trip.PREDICTED_LEVEL, Trip.UNEXPLAINED)  # others interrupt a campaign
 
 
@@ -251,9 +251,16 @@ class _Folder:
         return self.root / f"round-{index + 1:02}.csv"
 
     def write(self, made: Campaign) -> None:
-        """Settings, and what every round brought."""
+        """Settings, what every round brought, and at the end what was known and the estimate."""
         about = {"excite": __version__, "settings": dict(self.settings)}
         write_json(self.root / "campaign.json", {**about, **made.to_dict()})
+        marker = {"kind": "excite campaign", "excite": __version__, "command": ""}
+        write_json(self.root / "run.json", {**marker, "plant": made.plant.description.to_dict()})
+        if (made.reason or made.interrupted) and made.result is not None:
+            samples, halves = made.knowledge()
+            columns = {"sample": samples, **dict(zip(made.known, halves.T, strict=True))}
+            write_bytes(self.root / "knowledge.csv", csv_text(columns).encode())
+            made.result.save(self.root / "estimate", overwrite=True)
 
     def resume(self, made: Campaign, on_round: Callable[[Round], None]) -> None:
         """Takes the rounds that were played before; one that was hardly begun is played again."""

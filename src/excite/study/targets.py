@@ -55,7 +55,9 @@ class Target:
         return self.half * np.abs(value) if self.is_relative else self.half
 
     def __str__(self) -> str:
-        return f"{100 * self.half:g} %" if self.is_relative else f"{self.half:.4g}"
+        if self.is_relative:
+            return f"{100 * self.half:g} %"
+        return f"{self.half:.4g} {self.quantity.unit}".rstrip()
 
 
 def targets_from(plant: AbstractPlant, given: TargetLike) -> tuple[Target, ...]:

@@ -1,0 +1,174 @@
+"""A campaign: what was known after each sample, and what was decided after each round."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ...description import PlantDescription, names_of
+from ...files import read_columns, read_json
+from ...record import Record
+from ...record.figure import episode_figure
+from ..figures import knowledge_figure
+from ..numbers import digits_for, number
+from .elements import (
+    Marker,
+    Run,
+    Section,
+    bullets,
+    command,
+    facts,
+    figure,
+    folded,
+    heading,
+    paragraph,
+    plant_facts,
+    record_in,
+    signals_table,
+    table,
+    understood,
+)
+
+_MAX_RECORDS = 6  # drawn of one campaign
+_ADVICE = "'excite campaign' writes it again"
+_SETTINGS = ("policy_hash", "spread", "most_rounds", "coast", "redesign")
+
+
+@dataclass(frozen=True)
+class CampaignRun(Run):
+    """The folder of a campaign.
+
+    Attributes:
+        marker: the content of `run.json`, and the folder.
+        content: of `campaign.json`.
+        knowledge: sample, and half of the 95 % interval after it by quantity; empty without an
+            estimate.
+        records: of the rounds.
+    """
+
+    marker: Marker
+    content: Mapping[str, Any]
+    knowledge: Mapping[str, np.ndarray]
+    records: Sequence[Record]
+
+    def section(self, name: str) -> Section:
+        """The section of a campaign."""
+        d, c = self.marker.plant, self.content
+        with understood(self.marker.folder / "campaign.json", _ADVICE):
+            ended = str(c["reason"] or c["interrupted"] or "not ended")
+            parts = [
+                paragraph(f"Expected before the first round: {c['expected']}.")
+                if c["expected"]
+                else "",
+                bullets(c["warnings"]),
+                heading("What is known"),
+                table(*_known(d, c)),
+                self._knowledge(name),
+                heading("Rounds"),
+                table(*_rounds(c["rounds"]), labels=2),
+                _rivals(c["structure"]),
+                heading("Measured"),
+                signals_table(d, self.records) if self.records else paragraph("Nothing yet."),
+                *(
+                    figure(
+                        episode_figure(d, record),
+                        f"{name}-round{i}",
+                        f"Round {i}: inputs and outputs.",
+                    )
+                    for i, record in enumerate(self.records[:_MAX_RECORDS], 1)
+                ),
+                heading("Settings and provenance"),
+                facts(
+                    [
+                        *((key, c[key]) for key in _SETTINGS),
+                        *((key, value) for key, value in c["settings"].items() if key not in c),
+                    ]
+                ),
+                command(self.marker.command, _likely_command(self)),
+                folded("The plant", plant_facts(d)),
+            ]
+        title = f"{d.name}: {ended} ({c['num_samples']} samples in {len(c['rounds'])} rounds)"
+        return Section(title, self.marker.folder, "".join(parts))
+
+    def _knowledge(self, name: str) -> str:
+        """The figure of what was known after each sample; nothing without an estimate."""
+        if not self.knowledge:
+            return ""
+        samples, allowed = self.knowledge["sample"], self.content["allowed"]
+        shares = {n: self.knowledge[n] / half for n, half in allowed.items()}
+        ends = np.cumsum([r["num_samples"] for r in self.content["rounds"]]).tolist()
+        drawn = knowledge_figure("", samples.astype(int), shares, ends)
+        return figure(
+            drawn,
+            f"{name}-known",
+            "Half of each 95 % interval over the one asked for, by the Cramér-Rao bound at the "
+            "final estimate, for the inputs that were played. Rounds end at the dotted lines.",
+        )
+
+
+def read_campaign(marker: Marker) -> CampaignRun:
+    """The campaign in a folder.
+
+    Raises:
+        ValueError: for a file that is damaged or missing.
+    """
+    folder = marker.folder
+    content = read_json(folder / "campaign.json", "rounds", "estimate", "allowed", advice=_ADVICE)
+    path = folder / "knowledge.csv"
+    knowledge = read_columns(path, ["sample"], _ADVICE) if path.is_file() else {}
+    with understood(folder / "campaign.json", _ADVICE):
+        if not content["estimate"] or not {*content["allowed"]} <= {
+            *knowledge
+        }:  # of other targets, before a new run
+            knowledge = {}
+        count = len(content["rounds"])
+    paths = [folder / f"round-{i:02}.csv" for i in range(1, count + 1)]
+    return CampaignRun(marker, content, knowledge, [record_in(p, marker.plant) for p in paths])
+
+
+def _known(d: PlantDescription, c: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
+    """What is known of every parameter and target, and what was asked."""
+    units, rows = {p.name: p.unit for p in d.parameters}, []
+    for name in dict.fromkeys([*names_of(d.parameters), *c["targets"]]):
+        known, target = c["estimate"].get(name), c["targets"].get(name, "")
+        cells = ["–", "–", "–"]
+        if known is not None:
+            value, half = known["estimate"], known["ci95_half"]
+            cells[0] = number(value, digits_for(value, half or np.inf))
+            if half is not None:
+                cells[1] = f"{half:.2g}"
+                cells[2] = f"{number(100 * half / abs(value), 2)} %" if value else "–"
+        reached = ""
+        if target and known is not None:
+            is_reached = known["ci95_half"] is not None and known["ci95_half"] <= c["allowed"][name]
+            reached = "reached" if is_reached else "missed"
+        rows.append([name, units.get(name, ""), *cells, target, reached])
+    return ["quantity", "unit", "estimate", "± 95 %", "relative", "target", ""], rows
+
+
+def _rounds(rounds: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[list[str]]]:
+    """What every round played, how near it came to a level, and what was decided."""
+    rows = [
+        [str(i), r["played"], str(r["num_samples"]), f"{100 * r['nearness']:.0f} %", r["ended"],
+         r["decision"]]
+        for i, r in enumerate(rounds, 1)
+    ]  # fmt: skip
+    return ["round", "played", "samples", "of the level", "ended", "decision"], rows
+
+
+def _rivals(structure: Mapping[str, Any] | None) -> str:
+    """The rivals when they were last compared; nothing without rivals."""
+    if structure is None:
+        return ""
+    rows = [[r["plant"], f"{r['probability']:.4f}"] for r in structure["rivals"]]
+    return heading("Which plant") + table(["rival", "probability"], rows, labels=1)
+
+
+def _likely_command(campaign: CampaignRun) -> str:
+    """The command that made it, as far as the folder tells."""
+    c = campaign.content
+    target = ",".join(f"{n}={t.replace(' %', '%')}" for n, t in c["targets"].items())
+    return f"excite campaign {campaign.marker.plant.name} --target {target} --out FOLDER"
