@@ -387,6 +387,18 @@ def test_a_spread_beyond_that_of_the_policy_is_a_warning():
     assert ex.Campaign("aero2", EASY, policy=steady(), spread="factor:2").warnings == ()
 
 
+@pytest.mark.parametrize(("noise", "is_explained"), [(2e-4, True), (4e-4, False)])
+def test_with_rivals_a_residual_larger_than_the_declared_noise_is_not_explained(
+    noise, is_explained
+):
+    campaign: Any = ex.Campaign("aero2", EASY, policy=steady())
+    record = ex.simulate("aero2", steady(), params=TRUE, noise={"pitch": noise}, seed=1)
+    campaign.result = ex.identify(record, "aero2")
+    assert campaign._is_explained()  # white, and the noise may be declared too small
+    campaign.discrimination = "rivals"
+    assert campaign._is_explained() == is_explained
+
+
 def test_a_record_that_was_followed_by_another_ends_nothing():
     campaign = ex.Campaign("aero2", EASY, policy=ex.read_policy("aero2"), redesign=False)
     record = ex.simulate("aero2", campaign.ask(), params=TRUE, seed=1)

@@ -25,6 +25,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..description import (
+    RARE,
     PlantDescription,
     Spread,
     SpreadLike,
@@ -35,6 +36,7 @@ from ..description import (
 )
 from ..environment import run_episodes
 from ..estimation import Status
+from ..estimation.diagnosis import chi2_tail
 from ..estimation.identify import RecordLike, identify
 from ..estimation.result import Identification
 from ..excitation import PolicyExcitation, Replay
@@ -315,8 +317,7 @@ class Campaign:
         count, status = len(record.time) - 1, structure
         if not self.is_undecided:
             status = self._identify()
-            is_explained = self.result is not None and self.result.misfit_factor <= 1
-            is_doubtful = status != Status.SUCCESSFUL.sentence or not is_explained
+            is_doubtful = status != Status.SUCCESSFUL.sentence or not self._is_explained()
             if self.discrimination is not None and not structure and is_doubtful:
                 structure = self._compare()  # the record may contradict an earlier choice
                 status = structure if self.is_undecided else self._identify()
@@ -362,6 +363,19 @@ class Campaign:
             return str(error)
         self.result = result if result.is_usable else self.result
         return result.status
+
+    def _is_explained(self) -> bool:
+        """Whether the residual of all records is noise, of the declared size where there are rivals.
+
+        Without rivals the declared size may be wrong, and nothing else could be chosen.
+        """
+        if self.result is None or self.result.misfit_factor > 1:
+            return False
+        if self.discrimination is None:
+            return True
+        sd = np.asarray(self.plant.sensor.sd)[None]
+        sizes = np.concatenate([f.computed["residual"] / sd for f in self.result.fitted]) ** 2
+        return chi2_tail(int(np.isfinite(sizes).sum()), float(np.nansum(sizes))) > RARE
 
     def _played(self, record: Record) -> str:
         """The name of what a round played."""

@@ -120,13 +120,12 @@ def read_campaign(marker: Marker) -> CampaignRun:
     path = folder / "knowledge.csv"
     knowledge = read_columns(path, ["sample"], _ADVICE) if path.is_file() else {}
     with understood(folder / "campaign.json", _ADVICE):
-        if not content["estimate"] or not {*content["allowed"]} <= {
-            *knowledge
-        }:  # of other targets, before a new run
-            knowledge = {}
+        # It may be of an earlier command, with other targets.
+        is_shown = content["estimate"] and {*content["allowed"]} <= {*knowledge}
         count = len(content["rounds"])
     paths = [folder / f"round-{i:02}.csv" for i in range(1, count + 1)]
-    return CampaignRun(marker, content, knowledge, [record_in(p, marker.plant) for p in paths])
+    records = [record_in(path, marker.plant) for path in paths]
+    return CampaignRun(marker, content, knowledge if is_shown else {}, records)
 
 
 def _known(d: PlantDescription, c: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
