@@ -48,9 +48,27 @@ addEventListener("DOMContentLoaded", () => {
 """
 
 
+def write_campaign(run: Path, decisions: list[str], reason: str = "") -> None:
+    """A campaign after some rounds."""
+    known = {"D_p": {"estimate": 1e-3, "ci95_half": 1e-5}}
+    round_ = {"num_samples": 40, "played": "policy", "ended": "complete", "nearness": 0.5}
+    write_json(run / "campaign.json", {
+        "reason": reason, "interrupted": "", "targets": {"D_p": "1 %"}, "allowed": {"D_p": 1e-5},
+        "estimate": known, "rounds": [{**round_, "decision": told} for told in decisions],
+    })  # fmt: skip
+
+
 @pytest.fixture(scope="module")
-def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    folder = tmp_path_factory.mktemp("runs")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("runs")
+
+
+@pytest.fixture(scope="module")
+def address(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    campaign = folder / "the_campaign"
+    campaign.mkdir()
+    about = {"kind": "excite campaign", "plant": Aero2().description.to_dict()}
+    write_json(campaign / "run.json", about)
     run = folder / "a_study"
     (run / "seeds" / "agent" / "0").mkdir(parents=True)
     write_json(run / "run.json", {"kind": "excite study", "plant": {"name": "aero2"}})
@@ -321,6 +339,19 @@ def test_runs_are_looked_at(address: str, page: Page):
     expect(page.locator("#run-view td").first).to_have_text("1")
     assert page.locator("#run-view img").count() == 0  # what looks like a picture is text
     assert page.locator("#run-view canvas").count() == 3
+    require_no_sideways_scroll(page)
+
+
+def test_a_campaign_is_followed_while_it_runs(address: str, folder: Path, page: Page):
+    write_campaign(folder / "the_campaign", ["go on: D_p is 3 times as uncertain as asked"])
+    page.goto(f"{address}/#runs")
+    page.get_by_role("button", name="the_campaign").click()
+    shown = page.get_by_role("region", name="Rounds").locator("tbody tr")
+    expect(shown).to_have_count(1)
+    expect(page.locator("#run-view")).to_contain_text("Not finished")
+    write_campaign(folder / "the_campaign", ["go on", "end"], "every target is reached")
+    expect(shown).to_have_count(2, timeout=WAIT)
+    expect(page.get_by_role("link", name="Report")).to_be_visible()
     require_no_sideways_scroll(page)
 
 

@@ -9,6 +9,7 @@ import os
 import pickle
 import re
 import shlex
+import shutil
 import signal
 import socket
 import subprocess
@@ -33,6 +34,7 @@ from starlette.requests import Request
 from starlette.testclient import TestClient
 
 from excite.files import write_json
+from excite.plant import Aero2
 from excite.record import READ_ENDINGS
 from excite.record.bags import BAG_ENDINGS
 from excite.report.html import report_html
@@ -684,6 +686,32 @@ def test_the_run_folder_is_listed_as_it_is(page: TestClient, runs: Path):
     assert content["files"] == ["run.json", "table.md"]
     served_file = page.get("/api/run/file", params={"name": "some/study", "file": "table.md"})
     assert served_file.headers["content-disposition"].startswith("attachment")
+
+
+def test_a_campaign_is_shown_with_what_is_known_and_its_rounds(page: TestClient, runs: Path):
+    folder = runs / "known"
+    folder.mkdir()
+    marker = {"kind": "excite campaign", "plant": Aero2().description.to_dict()}
+    (folder / "run.json").write_text(json.dumps(marker))
+    told = {"num_samples": 40, "played": "policy", "ended": "complete", "nearness": 0.5,
+            "decision": "go on: D_p is 3 times as uncertain as asked"}  # fmt: skip
+    content = {
+        "reason": "", "interrupted": "", "targets": {"D_p": "1 %"}, "allowed": {"D_p": 1e-5},
+        "estimate": {"D_p": {"estimate": 1e-3, "ci95_half": 3e-5}}, "rounds": [told],
+    }  # fmt: skip
+    (folder / "campaign.json").write_text(json.dumps(content))
+    shown = page.get("/api/run", params={"name": "known"}).json()
+    assert not shown["is_finished"]
+    assert shown["kind"] == "campaign"
+    assert shown["campaign"]["rounds"]["rows"][0][:4] == ["1", "policy", "40", "50 %"]
+    [row] = [row for row in shown["campaign"]["known"]["rows"] if row[0] == "D_p"]
+    assert row[-2:] == ["1 %", "missed"]
+    content["reason"] = "every target is reached"
+    (folder / "campaign.json").write_text(json.dumps(content))
+    assert page.get("/api/run", params={"name": "known"}).json()["is_finished"]
+    (folder / "campaign.json").write_text('{"rounds": 3}')
+    assert page.get("/api/run", params={"name": "known"}).json()["campaign"] == {}
+    shutil.rmtree(folder)
 
 
 @pytest.mark.parametrize(

@@ -365,7 +365,7 @@ class Campaign:
         return result.status
 
     def _is_explained(self) -> bool:
-        """Whether the residual of all records is noise, of the declared size where there are rivals.
+        """Whether the residual is noise, of the declared size where there are rivals.
 
         Without rivals the declared size may be wrong, and nothing else could be chosen.
         """

@@ -12,12 +12,15 @@ import math
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse
 from starlette.routing import Route
 
+from ..description import PlantDescription
 from ..files import folder_word
+from ..report.sections.campaign import known_table, rounds_table
 from .requests import RefusedError, without_folders
 
 _TYPES = {
@@ -127,7 +130,8 @@ def _summary(name: str, run: Path) -> dict[str, object]:
         "plant": str(plant.get("name", "")) if isinstance(plant, dict) else "",
         "command": without_folders(str(marker.get("command") or "")),
         "title": str(study.get("title") or study.get("name") or ""),
-        "is_finished": any(_is_inside(run / f, run) for f in ("table.json", "estimate.json")),
+        "is_finished": bool(_json(run, "campaign.json").get("reason"))
+        or any(_is_inside(run / f, run) for f in ("table.json", "estimate.json")),
     }
 
 
@@ -138,10 +142,24 @@ def _content(run: Path) -> dict[str, object]:
         **_summary(run.name, run),
         **_table(_text(run, "table.md")),
         "estimate": _json(run, "estimate.json"),
+        "campaign": _campaign(run),
         "curves": _curves(run),
         "figures": [name for name in files if name.endswith(".png")],
         "files": [name for name in files if not name.endswith(".png")],
     }
+
+
+def _campaign(run: Path) -> dict[str, object]:
+    """Tables of a campaign: what is known, and its rounds; empty where there is none."""
+    content: dict[str, Any] = _json(run, "campaign.json")
+    marker: dict[str, Any] = _json(run, "run.json")
+    try:
+        plant = PlantDescription.from_dict(marker["plant"])
+        tables = known_table(plant, content), rounds_table(content["rounds"])
+    except (LookupError, TypeError, AttributeError, ArithmeticError, ValueError):
+        return {}
+    known, rounds = ({"header": header, "rows": rows} for header, rows in tables)
+    return {"known": known, "rounds": rounds, "interrupted": str(content.get("interrupted", ""))}
 
 
 def _table(text: str) -> dict[str, object]:

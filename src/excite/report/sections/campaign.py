@@ -65,10 +65,10 @@ class CampaignRun(Run):
                 else "",
                 bullets(c["warnings"]),
                 heading("What is known"),
-                table(*_known(d, c)),
+                table(*known_table(d, c)),
                 self._knowledge(name),
                 heading("Rounds"),
-                table(*_rounds(c["rounds"]), labels=2),
+                table(*rounds_table(c["rounds"])),
                 _rivals(c["structure"]),
                 heading("Measured"),
                 signals_table(d, self.records) if self.records else paragraph("Nothing yet."),
@@ -128,7 +128,7 @@ def read_campaign(marker: Marker) -> CampaignRun:
     return CampaignRun(marker, content, knowledge if is_shown else {}, records)
 
 
-def _known(d: PlantDescription, c: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
+def known_table(d: PlantDescription, c: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
     """What is known of every parameter and target, and what was asked."""
     units, rows = {p.name: p.unit for p in d.parameters}, []
     for name in dict.fromkeys([*names_of(d.parameters), *c["targets"]]):
@@ -148,7 +148,7 @@ def _known(d: PlantDescription, c: Mapping[str, Any]) -> tuple[list[str], list[l
     return ["quantity", "unit", "estimate", "± 95 %", "relative", "target", ""], rows
 
 
-def _rounds(rounds: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[list[str]]]:
+def rounds_table(rounds: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[list[str]]]:
     """What every round played, how near it came to a level, and what was decided."""
     rows = [
         [str(i), r["played"], str(r["num_samples"]), f"{100 * r['nearness']:.0f} %", r["ended"],

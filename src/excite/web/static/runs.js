@@ -33,7 +33,8 @@ async function show(run, button) {
       table(estimate, content.estimate);
       card.append(el("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Table of parameters" }, estimate), el("ul", {}, ...(content.estimate.verdict ?? []).map((text) => el("li", {}, text))));
     }
-    if (content.rows.length) card.append(rows(content));
+    if (content.rows.length) card.append(rows(content, "Table of the study"));
+    if (content.campaign.known) card.append(rows(content.campaign.known, "What is known"), el("h3", {}, "Rounds"), rows(content.campaign.rounds, "Rounds"));
     card.append(...content.notes.map((note) => el("p", { class: "hint" }, note)));
     const link = (file) => download(address(file), file), isPolicy = (file) => file.endsWith(".safetensors");
     const policies = content.files.filter(isPolicy), others = content.files.filter((file) => !isPolicy(file));
@@ -41,8 +42,10 @@ async function show(run, button) {
     if (!content.is_finished) card.append(el("p", {}, "Not finished. To resume, rerun the command in the folder where it was started: ", el("code", {}, content.command || "the same command")));
     card.append(el("p", { class: "row downloads" }, ...report, ...others.map(link)));
     if (policies.length) card.append(el("details", { open: policies.length < 4 }, el("summary", {}, `Policies (${policies.length})`), el("p", { class: "row downloads" }, ...policies.map(link))));
+    const isFollowed = content.kind === "campaign" && !content.is_finished && !content.campaign.interrupted;
+    if (isFollowed) setTimeout(() => chosen === run.name && !section.hidden && show(run, button), 2000);
     view.replaceChildren(card);
-    if (view.getBoundingClientRect().top > innerHeight / 2) view.scrollIntoView();
+    if (!isFollowed && view.getBoundingClientRect().top > innerHeight / 2) view.scrollIntoView();
     if (content.curves.length) {
       const learnt = el("section", { class: "card" }, el("h2", {}, "Learning curves"), el("div", { class: "plots small" }));
       view.append(learnt);
@@ -56,7 +59,7 @@ async function show(run, button) {
   }
 }
 
-const rows = ({ header, rows: cells }) => el("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Table of the study" },
+const rows = ({ header, rows: cells }, name) => el("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": name },
   el("table", {},
     el("thead", {}, el("tr", {}, ...header.map((text) => el("th", { scope: "col" }, text)))),
     el("tbody", {}, ...cells.map((row) => el("tr", {}, ...row.map((text, i) => (i ? el("td", {}, text) : el("th", { scope: "row" }, text))))))));
