@@ -3,14 +3,15 @@
     python results/campaign/compare.py --out results/campaign/compare.json
     python results/campaign/compare.py --sd 0.002 --out results/campaign/compare_noisy.json
 
-`aero2`, J_p, K_pu and D_p anywhere within a factor of three. All methods see the same plants, and
-every round begins at rest. A target is reached at the first sample at which the relative standard
-error of every parameter (Cramér-Rao bound at the true parameters) is below it. What a method
-decides between rounds follows from estimates of noisy records.
+Parameters anywhere within the spread of the policy's training, by default `aero2-wide` with a
+factor of three. All methods see the same plants, and every round begins at rest. A target is
+reached at the first sample at which the relative standard error of every parameter (Cramér-Rao
+bound at the true parameters) is below it. What a method decides between rounds follows from
+estimates of noisy records.
 
 - campaign: the policy, then the better of policy and redesigned signal, as `excite campaign`
 - repeated: one signal again and again, safe for the whole spread: designed by gradient, or a
-  classical one whose options were tuned
+  classical one whose options were tuned, `loop-NAME` around a position loop
 - redesign: a robust signal of 25 samples, then signals of 25, 50, 50, ... samples, each
   redesigned for what is known
 """
@@ -24,11 +25,12 @@ import jax.numpy as jnp
 import numpy as np
 
 import excite as ex
-from excite.description import HALF_95, names_of
+from excite.description import HALF_95
 from excite.environment import prior_sd_of
 from excite.environment.falsification import nearness
 from excite.estimation import NLS, Experiments, Status
-from excite.excitation import PolicyExcitation
+from excite.excitation import PolicyExcitation, Replay
+from excite.excitation.catalogue import excitation_named
 from excite.files import write_json
 from excite.information import running_information
 from excite.plant import draw_params
@@ -39,7 +41,7 @@ from excite.study.next_experiment import best_of, candidates
 from excite.study.targets import targets_from
 from excite.training.redesign import Region, first_signals, redesigned
 
-SPREAD, TARGETS, MOST, SEED = "factor:3", (0.005, 0.001), 480, 4000
+MOST, SEED = 480, 4000  # samples of a campaign
 SHORT, LONG = 25, 50  # rounds of the redesign alone
 
 
@@ -75,12 +77,12 @@ def estimated(plant, inputs, measured, valid, start):
 class Known:
     """What the records of one plant tell: a region, from the rounds so far."""
 
-    def __init__(self, plant, params, key, length):
-        """Nothing is known but the spread."""
+    def __init__(self, plant, params, key, length, spread, target):
+        """Nothing is known but the spread; `target` is the last standard error asked for."""
         count = len(params)
-        self.plant, self.params, self.key = plant, params, key
+        self.plant, self.params, self.key, self.target = plant, params, key, target
         self.rounds, self.length, self.sizes = [], length, []
-        self.before = jnp.eye(count) / prior_sd_of(SPREAD) ** 2
+        self.before = jnp.eye(count) / prior_sd_of(spread) ** 2
         self.region = Region(jnp.stack(list(plant.nominal)), self.before)
         self.information = []
 
@@ -95,7 +97,9 @@ class Known:
         if is_last:
             return
         most = -(-MOST // LONG) + 1
-        pads = [np.zeros((most, self.length + n, 1)) for n in (0, 1, 1)]
+        (_, inputs), (_, outputs) = (x.shape for x in self.rounds[0])
+        sizes = (0, inputs), (1, outputs), (1, outputs)
+        pads = [np.zeros((most, self.length + n, width)) for n, width in sizes]
         for i, (u, y) in enumerate(self.rounds):
             pads[0][i, : len(u)], pads[1][i, : len(y)], pads[2][i, : len(y)] = u, y, 1
         given = jnp.asarray(pads[0]), jnp.asarray(pads[1]), jnp.asarray(pads[2]) > 0
@@ -116,24 +120,28 @@ class Known:
     def is_done(self):
         """Whether every target is reached, or the samples are used up."""
         errors = self.errors
-        return errors[-1] <= min(TARGETS) or len(errors) >= MOST
+        return errors[-1] <= self.target or len(errors) >= MOST
 
 
-def repeated(plant, params, keys, signal, coast):
-    """One signal again and again."""
-    for own, key in zip(params, keys, strict=True):
-        known = Known(plant, own, key, len(signal))
+def inputs_of(plant, excitation, steps):
+    """The inputs of an excitation on a plant, from rest."""
+    return eqx.filter_jit(lambda own, key: run_episode(plant, own, excitation, steps, key).inputs)
+
+
+def repeated(begin, plant, play, coast):
+    """One excitation again and again."""
+    for known in begin(1):
         while not known.information or not known.is_done:
-            known.play(signal, coast, is_last=True)
+            key = jax.random.fold_in(known.key, len(known.information))
+            known.play(play(known.params, key), coast, is_last=True)
         yield known
 
 
-def by_redesign(plant, params, keys, first, coast):
+def by_redesign(begin, plant, first, coast):
     """A robust signal, then redesigned ones."""
     starts = {n: first_signals(plant, 1, n) for n in (SHORT, LONG)}
-    asked = jnp.eye(len(plant.nominal)) / min(TARGETS)
-    for own, key in zip(params, keys, strict=True):
-        known = Known(plant, own, key, LONG)
+    for known in begin(LONG):
+        asked = jnp.eye(len(plant.nominal)) / known.target
         known.play(first, coast)
         while not known.is_done:
             n = SHORT if len(known.rounds) == 1 else LONG
@@ -144,17 +152,17 @@ def by_redesign(plant, params, keys, first, coast):
         yield known
 
 
-def by_campaign(plant, params, keys, policy, coast):
+def by_campaign(begin, plant, policy, coast):
     """The policy, then the better of policy and redesigned signal."""
     steps = policy.layout.num_steps
-    targets = targets_from(
-        plant,
-        {n: f"{100 * HALF_95 * min(TARGETS)}%" for n in names_of(plant.definition.parameters)},
-    )
-    excitation = PolicyExcitation.of(policy)
-    play = eqx.filter_jit(lambda own, key: run_episode(plant, own, excitation, steps, key).inputs)
-    for own, key in zip(params, keys, strict=True):
-        known = Known(plant, own, key, steps)
+    play = inputs_of(plant, PolicyExcitation.of(policy), steps)
+    for known in begin(steps):
+        own, key = known.params, known.key
+        half = HALF_95 * known.target
+        targets = targets_from(
+            plant, {p.name: half * p.scale if not p.positive else f"{100 * half}%"
+                    for p in plant.definition.parameters},
+        )  # fmt: skip
         known.play(play(own, key), coast)
         while not known.is_done:
             seed = len(known.rounds)
@@ -169,10 +177,10 @@ def by_campaign(plant, params, keys, policy, coast):
         yield known
 
 
-def row(made):
+def row(made, targets):
     """Samples until each target, missed plants, and nearness of all whole rounds."""
     made, found = list(made), {}
-    for target in TARGETS:
+    for target in targets:
         reached = [known.errors <= target for known in made]
         first = np.array([r.argmax() + 1.0 if r.any() else np.inf for r in reached])
         first = np.where(first <= MOST, first, np.inf)
@@ -188,37 +196,49 @@ def row(made):
 def main():
     """Prints and writes a row for each method."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--sd", type=float, default=0.0002, help="of the noise [rad]")
+    parser.add_argument("--policy", default="aero2-wide")
+    parser.add_argument("--sd", type=float, help="noise of every output, in its unit")
+    parser.add_argument("--targets", default="0.005,0.001", help="relative standard errors")
+    parser.add_argument("--signals", default="robust,multisine,chirp,prbs", help="to be repeated")
     parser.add_argument("--plants", type=int, default=200)
     parser.add_argument("--out", type=Path, required=True)
     asked = parser.parse_args()
-    policy = ex.read_policy("aero2-wide")
-    coast, noise = policy.provenance["coast"], {"pitch": asked.sd}
-    plant = with_sensor(plant_from("aero2"), noise)
+    policy = ex.read_policy(asked.policy)
+    plant = plant_from(policy.plant.name)
+    noise = {o.name: asked.sd for o in plant.definition.outputs} if asked.sd else {}
+    plant = with_sensor(plant, noise)
+    spread, coast = policy.provenance["spread"], policy.provenance["coast"]
+    steps, targets = policy.layout.num_steps, [float(t) for t in asked.targets.split(",")]
     keys = jax.random.split(jax.random.key(SEED), asked.plants)
-    params = [draw_params(plant, key, SPREAD) for key in keys]
-    steps = policy.layout.num_steps
+    params = [draw_params(plant, key, spread) for key in keys]
+
+    def begin(length):
+        return [Known(plant, *each, length, spread, min(targets))
+                for each in zip(params, keys, strict=True)]  # fmt: skip
 
     def design(kind, steps):
-        made = ex.design("aero2", kind, steps=steps, spread=SPREAD, coast=coast, noise=noise,
-                         trials=None if kind == "robust" else 200)  # fmt: skip
+        made = ex.design(policy.plant.name, kind, steps=steps, spread=spread, coast=coast,
+                         noise=noise, trials=None if kind == "robust" else 200)  # fmt: skip
         print(made, flush=True)
-        return jnp.asarray(made.inputs)
+        if made.tuned is None:
+            return Replay(jnp.asarray(made.inputs))
+        return excitation_named(kind, made.tuned.options, plant)
 
-    table = {"sd": asked.sd, "spread": SPREAD, "plants": asked.plants, "seed": SEED, "rows": {}}
-    methods = {
-        "campaign": lambda: by_campaign(plant, params, keys, policy, coast),
-        "redesign alone": lambda: by_redesign(plant, params, keys, design("robust", SHORT), coast),
-        **{
-            f"{kind} of {n} samples, repeated": lambda kind=kind, n=n: repeated(
-                plant, params, keys, design(kind, n), coast
-            )
-            for kind, n in (("robust", steps), ("robust", steps // 2), ("multisine", steps),
-                            ("chirp", steps), ("prbs", steps))
-        },
-    }  # fmt: skip
+    def signal(kind, steps):
+        return repeated(begin, plant, inputs_of(plant, design(kind, steps), steps), coast)
+
+    kinds = asked.signals.split(",")
+    methods = {"campaign": lambda: by_campaign(begin, plant, policy, coast)}
+    if "robust" in kinds:
+        methods["redesign alone"] = lambda: by_redesign(
+            begin, plant, design("robust", SHORT).inputs, coast
+        )
+    for kind in kinds:
+        methods[f"{kind} of {steps} samples, repeated"] = lambda kind=kind: signal(kind, steps)
+    table = {"policy_hash": policy.hash, "noise": noise, "spread": spread, "plants": asked.plants,
+             "seed": SEED, "rows": {}}  # fmt: skip
     for name, method in methods.items():
-        table["rows"][name] = row(method())
+        table["rows"][name] = row(method(), targets)
         print(name, table["rows"][name], flush=True)
         write_json(asked.out, table)
 

@@ -31,6 +31,23 @@ def test_the_page_says_how_many_samples_are_needed_and_that_no_level_was_reached
         assert cells == [*shown, f"{own['missed']}/{found['plants']}"]
 
 
+def test_the_page_says_how_often_the_true_rival_is_found_with_much_noise():
+    found = json.loads((FOLDER / "structure_noisy.json").read_text())
+    designed = found["designed"].values()
+    table = PAGE[PAGE.index("| designed after every round") :].partition("\n\n")[0]
+    lines = {line.split("|")[1].strip(): line for line in table.splitlines()}
+    assert sum(row["decided_wrong"] for row in designed) == 0
+    assert sum(row["undecided"] for row in designed) == 27
+    for count in ("20", "40", "60", "80"):
+        least = min(row["right_after"][count] for row in designed)
+        assert f"| {least:.3g} |" in lines["designed after every round"]
+    for name, rows in found["fixed"].items():
+        shown = [float(cell) for cell in lines[name].split("|")[2:-1]]
+        lengths = ("20", "40", "60", "80", "120", "160", "200")
+        assert shown == [min(row[n] for row in rows.values()) for n in lengths]
+    assert max(row["largest_nearness"] for row in designed) < 1
+
+
 def test_intervals_hold_where_a_round_ends_by_its_own_estimate():
     found = json.loads((FOLDER / "coverage.json").read_text())
     shown = [f"{value:.1f}" for value in found["coverage_percent"].values()]
