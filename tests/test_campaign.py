@@ -25,6 +25,7 @@ from excite.rig.contract import Interval, Sample
 from excite.simulation import response, run_episode
 from excite.study.campaign import REACHED
 from excite.study.campaign_on_rig import _paused
+from excite.study.monitor import Monitor
 from excite.study.quantities import known_of, propagated
 from excite.study.targets import others_of, targets_from
 
@@ -352,6 +353,25 @@ def test_a_round_ends_only_where_the_free_motion_after_it_is_safe(monkeypatch):
     assert traces == 1  # nothing is compiled while a round runs
     assert np.abs(outputs[14]).max() < level  # what would happen, and has not
     monitor.close()
+
+
+def test_a_later_round_leaves_room_for_the_error_of_the_noise():
+    plant = Aero2()
+    before = ex.identify(ex.simulate("aero2", steady(), params=TRUE, seed=1), "aero2")
+    targets = targets_from(plant, {"J_p": "1%"})
+    for earlier, share, is_enough in (
+        (None, 0.99, True),
+        (before, 0.99, False),
+        (before, 0.8, True),
+    ):
+        monitor = Monitor(plant, earlier, targets, 60, 20, waits=True)
+        half = 0.01 * share * TRUE["J_p"]
+        known = {name: Interval(value, half) for name, value in TRUE.items()}
+        sure = dataclasses.replace(monitor._live._estimate(0), information=1e9 * jnp.eye(3))
+        monitor._live._latest, monitor._live._kept, monitor._live._first = known, sure, 1000
+        sample = Sample(plant.description, 60, 19, 1.9, np.zeros(1), np.zeros(1))
+        assert monitor(sample) == is_enough  # one standard error of 20 samples is 16 %
+        monitor.close()
 
 
 def test_one_process_at_a_time_works_in_a_folder(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -62,6 +63,7 @@ class Monitor:
             own = with_nominal(plant, dict(before.params))
         self._plant, self._targets = plant, targets
         self._others = others_of(plant, targets)
+        self._is_later, self._num_outputs = before is not None, len(plant.definition.outputs)
         self._live = LiveEstimate(own, num_steps, True, estimator, first=_FIRST, waits=waits)
         self._inputs = np.tile(safe_input(plant.definition), (num_steps + coast, 1))
         self._after(own.nominal)  # compiles, before the first sample
@@ -74,10 +76,18 @@ class Monitor:
         is_enough = False
         if (estimate := self._live.estimate) is not None:
             known = self._known(estimate)
-            is_enough = max(shares_of(self._targets, known).values()) <= 1
+            is_enough = max(shares_of(self._targets, known).values()) <= self._enough(sample.k + 1)
             is_enough = is_enough and self._after(estimates(known, self._plant)) < SAFE
         self._inputs[sample.k] = sample.input
         return is_enough
+
+    def _enough(self, count: int) -> float:
+        """Share of the allowed intervals that ends the round after so many samples.
+
+        The size of the noise is that of this round's residual. With earlier records it may be
+        larger, so that a later round leaves room for one standard error of it.
+        """
+        return 1 - 1 / math.sqrt(2 * count * self._num_outputs) if self._is_later else 1.0
 
     def _known(self, estimate: Estimate) -> dict[str, Interval]:
         """What is known of every parameter and target.
