@@ -27,6 +27,7 @@ _PLACES = {
     # verbs
     "simulate": "simulation",
     "information": "information",
+    "information_gain": "estimation.information_gain",
     "identify": "estimation.identify",
     "compare_plants": "estimation.comparison",
     "design": "training.design",
@@ -121,6 +122,7 @@ if TYPE_CHECKING:
     from .estimation.catalogue import estimators as estimators
     from .estimation.comparison import compare_plants as compare_plants
     from .estimation.identify import identify as identify
+    from .estimation.information_gain import information_gain as information_gain
     from .estimation.result import Identification as Identification
     from .excitation.catalogue import excitations as excitations
     from .information import information as information

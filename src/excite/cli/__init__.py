@@ -26,6 +26,7 @@ from .discriminate import discriminate
 from .doctor import doctor
 from .export import export
 from .falsify import falsify
+from .gain import gain
 from .identify import identify
 from .information import information
 from .next import next_experiment
@@ -47,6 +48,7 @@ _SECTIONS: dict[str, dict[click.Command, str]] = {
         plants: "excite plants aero2",
         simulate: "excite simulate aero2 --excitation chirp --out record.csv --plot record.png",
         information: "excite information aero2 --excitation multisine",
+        gain: "excite gain aero2 --excitation multisine --spread 0.3",
         identify: "excite identify record.csv --plant aero2 --plot fit.png",
         policies: "excite policies",
     },

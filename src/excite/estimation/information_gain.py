@@ -1,0 +1,360 @@
+"""Expected information gain: what an experiment is expected to tell of the parameters, in nats.
+
+The gain is the mean, over plants drawn from a prior and over their records h, of
+
+    log p(h | theta) - log p(h),
+
+the mutual information of parameters and record (D. Lindley, On a measure of the information
+provided by an experiment, 1956). The evidence p(h) is an average over the prior, and is found by
+sampling. With samples from the prior, the true parameters among them or not, the estimate is a
+lower or an upper bound (sequential prior-contrastive estimation, and nested Monte Carlo; A. Foster
+et al., Deep adaptive design, 2021). These bounds are loose where the gain is near the logarithm of
+the number of samples, which the lower one cannot exceed. Samples from a distribution near the
+posterior, found from the record alone, bring both close together (A. Foster et al., A unified
+stochastic gradient approach to designing Bayesian-optimal experiments, 2020).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import ndtr
+from jaxtyping import Array, Float, Key, PRNGKeyArray
+
+from ..description import LARGEST_SEED, Spread, SpreadLike, names_of, require_whole
+from ..excitation import AbstractExcitation
+from ..excitation.catalogue import ExcitationLike
+from ..information import require_noise
+from ..plant import AbstractPlant, Params
+from ..plant.catalogue import PlantLike
+from ..report.tables import html_table, text_table
+from ..simulation import Experiment, response, run_episode
+from .evidence import Fit, nearest
+from .prior import Prior
+from .prior_knowledge import PriorLike, with_prior
+
+Progress = Callable[[str, int, int], None]
+
+_STEPS, _STARTS = 30, 8  # of the search for the most probable parameters
+_WIDE, _SHARES = 2.0, (0.5, 0.375, 0.125)  # of the proposal: normal, a wider one, the prior
+_CHUNK = 16  # records at a time
+_BLOCK = 1000  # samples at a time
+_NEAR_CAP = 1.0  # nats below the largest value of a lower bound, at which it says little
+_FEW = 10.0  # effective samples
+
+
+class PriorPlants(eqx.Module):
+    """Parameters as functions of independent standard normal coordinates z.
+
+    Attributes:
+        plant: has the parameters.
+        normal: distribution of some parameters, or of their logarithms; None for none.
+        spread: of the others, which are uniform in their box.
+    """
+
+    plant: AbstractPlant
+    normal: Prior | None
+    spread: Spread = eqx.field(static=True)
+
+    def params(self, z: Float[Array, " param"]) -> Params:
+        """The parameters at some coordinates, in their units."""
+        d, values = self.plant.definition, {}
+        names = () if self.normal is None else self.normal.names
+        if self.normal is not None:
+            index = np.array([names_of(d.parameters).index(name) for name in names])
+            drawn = self.normal.mean + jnp.linalg.solve(self.normal.root, z[index])
+            parts = zip(names, self.normal.logarithmic, drawn, strict=True)
+            values = {n: jnp.exp(v) if is_log else v for n, is_log, v in parts}
+        for i, parameter in enumerate(d.parameters):
+            if parameter.name not in values:
+                unit, nominal = 2 * ndtr(z[i]) - 1, self.plant.nominal[i]
+                values[parameter.name] = self.spread.value(parameter, nominal, unit)
+        return self.plant.Params(**values)
+
+
+class Gains(eqx.Module):
+    """The gain of each of some records.
+
+    Attributes:
+        laplace: Kullback-Leibler divergence of the posterior's normal approximation from the
+            prior; an estimate, no bound.
+        lower, upper: differences whose means bound the expected gain.
+        effective: number of effective samples of the evidence.
+    """
+
+    laplace: Float[Array, "*record"]
+    lower: Float[Array, "*record"]
+    upper: Float[Array, "*record"]
+    effective: Float[Array, "*record"]
+
+
+@eqx.filter_jit
+def gains(
+    prior: PriorPlants,
+    excitation: AbstractExcitation,
+    num_steps: int,
+    keys: Key[Array, " record"],
+    num_samples: int,
+    from_prior: bool,
+) -> Gains:
+    """The gain of one record for each key.
+
+    Args:
+        prior: from which the true plants are drawn, with the sensor of the experiment.
+        excitation: proposes the inputs.
+        num_steps: of the experiment.
+        keys: of plants, noise and samples.
+        num_samples: of the evidence of each record.
+        from_prior: whether these are drawn from the prior, not near the posterior.
+    """
+    plant, sd = prior.plant, prior.plant.sensor.sd
+    count = len(plant.nominal)
+    unknown = Fit(jnp.zeros(count), jnp.eye(count), jnp.zeros(()), jnp.zeros(()))
+
+    def of(key: PRNGKeyArray) -> Gains:
+        true_key, run_key, start_key, sample_key = jax.random.split(key, 4)
+        true = jax.random.normal(true_key, (count,), float)
+        run = run_episode(plant, prior.params(true), excitation, num_steps, run_key)
+
+        def residual(z: Array) -> Array:
+            outputs = response(plant, prior.params(z), run.inputs)
+            return ((run.measured - outputs) / sd[None]).ravel()
+
+        def log_likelihood(z: Array) -> Array:
+            found = -0.5 * jnp.sum(residual(z) ** 2)
+            return jnp.where(jnp.isfinite(found), found, -jnp.inf)
+
+        drawn = jax.random.normal(start_key, (_STARTS - 1, count), float)
+        starts = jnp.concatenate([unknown.z[None], drawn])
+        ends, costs = jax.vmap(lambda z: nearest(residual, unknown, z, _STEPS))(starts)
+        center = ends[jnp.argmin(costs)]
+        S = jax.jacfwd(residual)(center)
+        information = S.T @ S + unknown.information
+        log_det = jnp.linalg.slogdet(information)[1]
+        trace = jnp.trace(jnp.linalg.inv(information))
+        laplace = 0.5 * (trace + center @ center - count + log_det)
+        root = jnp.linalg.cholesky(jnp.linalg.inv(information))
+        shares = (0.0, 0.0, 1.0) if from_prior else _SHARES
+
+        def log_proposal(z: Array) -> Array:
+            change = z - center
+            form, log_size = change @ information @ change, 0.5 * log_det
+            parts = jnp.stack(
+                [
+                    -0.5 * form + log_size,
+                    -0.5 * form / _WIDE**2 + log_size - count * math.log(_WIDE),
+                    -0.5 * z @ z,
+                ]
+            )
+            return jax.nn.logsumexp(parts, b=jnp.array(shares))
+
+        def log_weight(z: Array) -> Array:
+            return log_likelihood(z) - 0.5 * z @ z - log_proposal(z)
+
+        def block(carry: tuple[Array, Array], key: PRNGKeyArray) -> tuple[tuple, None]:
+            kind_key, value_key = jax.random.split(key)
+            z = jax.random.normal(value_key, (size, count), float)
+            kind = jax.random.choice(kind_key, 3, (size,), p=jnp.array(shares))
+            near = center[None] + jnp.where(kind == 1, _WIDE, 1.0)[:, None] * (z @ root.T)
+            weights = jax.vmap(log_weight)(jnp.where((kind == 2)[:, None], z, near))
+            total = jnp.logaddexp(carry[0], jax.nn.logsumexp(weights))
+            squares = jnp.logaddexp(carry[1], jax.nn.logsumexp(2 * weights))
+            return (total, squares), None
+
+        size = min(num_samples, _BLOCK)
+        blocks = jax.random.split(sample_key, -(-num_samples // size))
+        nothing = jnp.asarray(-jnp.inf)
+        (total, squares), _ = jax.lax.scan(block, (nothing, nothing), blocks)
+        number, own = len(blocks) * size, log_likelihood(true)
+        with_own = jnp.logaddexp(total, log_weight(true))
+        lower = own - (with_own - math.log(number + 1))
+        upper = own - (total - math.log(number))
+        return Gains(laplace, lower, upper, jnp.exp(2 * total - squares))
+
+    return jax.lax.map(of, keys, batch_size=_CHUNK)
+
+
+@dataclass(frozen=True)
+class Mean:
+    """A mean and its standard error [nats]."""
+
+    value: float
+    std_error: float
+
+    @classmethod
+    def of(cls, values: Float[np.ndarray, " record"]) -> Mean:
+        """Of some independent values."""
+        return cls(float(np.mean(values)), float(np.std(values, ddof=1) / math.sqrt(len(values))))
+
+    def __str__(self) -> str:
+        return f"{self.value:.3f} ± {self.std_error:.3f}"
+
+
+@dataclass(frozen=True, repr=False)
+class InformationGain:
+    """What an experiment is expected to tell of the parameters; the result of `information_gain`.
+
+    Attributes:
+        plant, excitation: their names.
+        num_steps: of the experiment.
+        prior: of the parameters, in words.
+        lower, upper: bounds on the expected gain, each with its standard error [nats].
+        laplace: the same by normal approximations of the posteriors: an estimate, no bound.
+        num_plants, num_samples: plants with a record each, and samples of each evidence.
+        from_prior: whether the samples were drawn from the prior.
+        few: records whose evidence has fewer than 10 effective samples.
+        warnings: sentences on the bounds, and on the policy.
+    """
+
+    plant: str
+    excitation: str
+    num_steps: int
+    prior: str
+    lower: Mean
+    upper: Mean
+    laplace: Mean
+    num_plants: int
+    num_samples: int
+    from_prior: bool
+    few: int
+    warnings: tuple[str, ...]
+
+    header = ("", "nats", "standard error")
+
+    def rows(self) -> list[list[str]]:
+        """Rows of the table."""
+        kind = "prior" if self.from_prior else "near the posterior"
+        about = f"{self.num_samples} samples, {kind}"
+        given = {f"lower bound, {about}": self.lower, f"upper bound, {about}": self.upper,
+                 "by normal approximations": self.laplace}  # fmt: skip
+        return [[n, f"{m.value:.3f}", f"{m.std_error:.3f}"] for n, m in given.items()]
+
+    @property
+    def title(self) -> str:
+        """Of the table."""
+        return (
+            f"{self.plant}, {self.excitation}, {self.num_steps} steps: expected information gain, "
+            f"prior {self.prior}, {self.num_plants} plants"
+        )
+
+    def __repr__(self) -> str:
+        """The table that `excite gain` prints."""
+        return text_table(self.title, self.header, self.rows()).rstrip("\n")
+
+    def _repr_html_(self) -> str:
+        """The same for a notebook."""
+        return html_table(self.title, self.header, self.rows())
+
+    def to_dict(self) -> dict[str, Any]:
+        """The result as JSON-ready data."""
+        means = {name: getattr(self, name) for name in ("lower", "upper", "laplace")}
+        return {
+            **{name: getattr(self, name) for name in ("plant", "excitation", "num_steps", "prior")},
+            **{name: {"nats": m.value, "std_error": m.std_error} for name, m in means.items()},
+            **{name: getattr(self, name) for name in ("num_plants", "num_samples", "from_prior")},
+            "few_effective_samples": self.few,
+            "warnings": list(self.warnings),
+        }
+
+
+def information_gain(
+    plant: PlantLike,
+    excitation: ExcitationLike | None = None,
+    *,
+    options: Mapping[str, object] | None = None,
+    steps: int | None = None,
+    prior: PriorLike | Sequence[PriorLike] | None = None,
+    spread: SpreadLike = 0.3,
+    noise: Mapping[str, float] | None = None,
+    resolution: Mapping[str, float] | None = None,
+    plants: int = 256,
+    samples: int = 1000,
+    from_prior: bool = False,
+    seed: int = 0,
+    progress: Progress = lambda *_: None,
+) -> InformationGain:
+    """What an experiment is expected to tell of the parameters, in nats.
+
+        >>> import excite as ex
+        >>> found = ex.information_gain("aero2", steps=60, spread=0.3, plants=16, samples=200)
+        >>> found.lower.value > 1
+        True
+
+    Args:
+        plant: as for `simulate`, and so are `excitation`, `options`, `steps`, `noise` and
+            `resolution`. An encoder's step counts as noise of its own standard deviation.
+        prior: normal and lognormal distributions of parameters, as for `identify`, or an earlier
+            run.
+        spread: of parameters without such a distribution: uniform, in the logarithm for a factor
+            (`factor:3`).
+        plants: that are drawn, each with a record.
+        samples: of the evidence of each record.
+        from_prior: draws these samples from the prior: the usual figure of benchmarks, which
+            can only be compared for the same number of samples.
+        seed: of plants, noise and samples.
+        progress: called with a text, how much is done, and the total.
+
+    Raises:
+        ValueError: as `simulate`, for a sensor without noise, and for a uniform prior: give its
+            range as the spread.
+        TypeError: for an argument of another type.
+    """
+    require_whole("plants", plants, 2, 1_000_000)
+    require_whole("samples", samples, 1, 100_000_000)
+    require_whole("seed", seed, 0, LARGEST_SEED)
+    e = Experiment.of(
+        plant, excitation, options=options, steps=steps, noise=noise, resolution=resolution,
+        seed=seed,
+    )  # fmt: skip
+    require_noise(e.plant)
+    reach, normal, words = Spread.of(spread), None, str(Spread.of(spread))
+    if prior is not None:
+        bounded, normal, _ = with_prior(e.plant, prior, e.plant.nominal, {}, {})
+        if bounded is not e.plant:
+            raise ValueError("a uniform prior is given as the spread")
+        names = () if normal is None else normal.names
+        rest = [n for n in names_of(e.plant.definition.parameters) if n not in names]
+        words = f"normal in {', '.join(names)}" + f", others {reach}" * bool(rest)
+    population = PriorPlants(e.plant, normal, reach)
+    keys = jax.random.split(jax.random.key(seed), plants)
+    parts = []
+    for first in range(0, plants, 4 * _CHUNK):
+        progress(f"{first} of {plants} plants", first, plants)
+        own = keys[first : first + 4 * _CHUNK]
+        parts.append(gains(population, e.excitation, e.num_steps, own, samples, from_prior))
+    progress("done", plants, plants)
+    found = jax.tree.map(lambda *rows: np.concatenate([np.asarray(r) for r in rows]), *parts)
+    number = -(-samples // min(samples, _BLOCK)) * min(samples, _BLOCK)
+    lower, upper, laplace = (Mean.of(v) for v in (found.lower, found.upper, found.laplace))
+    few = int(np.sum(found.effective < _FEW))
+    warnings = list(e.warnings)
+    if from_prior and lower.value > math.log(number + 1) - _NEAR_CAP:
+        warnings.append(
+            f"the lower bound is near its largest value, log({number} + 1) = "
+            f"{math.log(number + 1):.2f}: take more samples"
+        )
+    if few:
+        warnings.append(
+            f"the evidence of {few} of {plants} records has fewer than {_FEW:g} effective samples"
+        )
+    return InformationGain(
+        plant=e.plant.definition.name,
+        excitation=e.name,
+        num_steps=e.num_steps,
+        prior=words,
+        lower=lower,
+        upper=upper,
+        laplace=laplace,
+        num_plants=plants,
+        num_samples=number,
+        from_prior=from_prior,
+        few=few,
+        warnings=tuple(warnings),
+    )
