@@ -86,6 +86,31 @@ def vector(params):
     return jnp.stack([params.J_p, params.D_p])
 
 
+def missing(params):
+    """Of a parameter that the plant does not have."""
+    return 1.0 / params.c
+
+
+def leaving(params):
+    """Ends the process."""
+    raise SystemExit(3)
+
+
+def constant(params):
+    """Does not depend on the parameters."""
+    return 3.0
+
+
+def infinite(params):
+    """No finite number."""
+    return params.J_p / 0.0
+
+
+def D_p(params):  # noqa: N802
+    """A function with the name of a parameter."""
+    return 3 * params.J_p
+
+
 def damping_ratio(params):
     """Of both parameters."""
     return params.D_p / jnp.sqrt(params.J_p)
@@ -109,15 +134,24 @@ def test_a_target_may_be_a_function_or_a_prediction(given, value, name, half):
     ("given", "words"),
     [
         ({"yaw@2:square": 1.0}, "unknown output 'yaw'"),
-        ({"pitch@0:square": 1.0}, "the time must be a number of seconds above 0: got '0'"),
-        ({"pitch@soon:square": 1.0}, "above 0: got 'soon'"),
+        (
+            {"pitch@0:square": 1.0},
+            "the time must be a number of seconds from 0.1 to 100000: got '0'",
+        ),
+        ({"pitch@soon:square": 1.0}, "to 100000: got 'soon'"),
         ({"pitch@2:aero2": 1.0}, "a prediction needs a signal that does not react: got 'aero2'"),
         ({"pitch@2:none.csv": 1.0}, "none.csv"),
-        ({"pitch@2:square": "1 V"}, "is in 'rad', which 'V' is no other unit of"),
-        ({vector: 1.0}, "vector of 'aero2' is no "),
-        ({lambda params: 1.0 / params.c: 1.0}, "is no function of the parameters: AttributeError"),
-        ({lambda params: 3.0: 1.0}, "does not depend on the parameters"),
-        ({lambda params: params.J_p / 0.0: 1.0}, "no finite number"),
+        ({"pitch@2:square": "1 V"}, "cannot be in 'V': the unit is 'rad'"),
+        ({"pitch@2": 1.0}, "'pitch@2' is no quantity: a prediction is OUTPUT@SECONDS:SIGNAL"),
+        ({"own.py": 1.0}, "a function path/to/file.py:function"),
+        ({"pitch@2:sqare": 1.0}, "pitch@2:sqare: unknown excitation 'sqare'"),
+        ({vector: 1.0}, "vector of 'aero2' must be one number: got 2"),
+        ({missing: 1.0}, "one number with jax.numpy from the parameters: AttributeError"),
+        ({leaving: 1.0}, "one number with jax.numpy from the parameters: SystemExit"),
+        ({constant: 1.0}, "has no slope at the nominal parameters"),
+        ({infinite: 1.0}, "no finite number"),
+        ({lambda params: params.J_p: 1.0}, "a function needs a name of its own: got '<lambda>'"),
+        ({D_p: 1.0}, "a function needs a name of its own: got 'D_p'"),
         ({"nothing.py:frequency": 1.0}, "nothing.py: no such file"),
         ({f"{__file__}:frequenz": 1.0}, "has no function 'frequenz'; it has"),
         ({frequency: 1.0, f"{__file__}:frequency": 1.0}, "frequency has two targets"),

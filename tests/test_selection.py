@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import math
 import re
 
 import jax.numpy as jnp
@@ -79,6 +80,9 @@ def test_independent_distributions_multiply():
     np.testing.assert_allclose(np.asarray(made.root).T @ np.asarray(made.root), P, rtol=1e-9)
     np.testing.assert_allclose(made.mean, np.linalg.solve(P, h), rtol=1e-9)
     assert Prior.product([a]) is a
+    linear = Prior.normal(["D_p"], [9.0], [[0.01]])
+    with pytest.raises(ValueError, match="D_p has a normal and a lognormal distribution"):
+        Prior.product([a, linear])
     far = Prior.normal(["D_p"], [9.0], [[0.01]], [True])
     with pytest.raises(ValueError, match="the results contradict each other"):
         Prior.product([a, far])
@@ -100,6 +104,30 @@ def test_results_of_several_runs_tell_as_much_as_their_records_together(records,
         np.testing.assert_array_less(np.abs(np.log(found.center / both.center)), 0.2 * error)
         own = np.sqrt(np.diag(np.linalg.inv(np.asarray(found.information))))
         np.testing.assert_allclose(own, error, rtol=0.2)
+
+
+def test_what_cannot_be_combined_is_one_sentence(records, tmp_path):
+    result = ex.identify(records[0])
+    other = ex.simulate("aero2", params={"D_p": 0.002}, seed=3, options={"amplitude": 2.0})
+    lag = ex.identify(ex.simulate("aero2_lag", seed=1, options={"amplitude": 2.0}))
+    for known, words in [
+        ([result, other], "the records contradict the earlier results in D_p"),
+        ([records[0], records[0]], "is given twice: give each record and each result once"),
+        ([records[0], lag], "a result is of plant 'aero2_lag', and not of 'aero2'"),
+    ]:
+        with pytest.raises(ValueError, match=re.escape(words)):
+            known_from(known, None, None, "factor:3")
+
+
+def test_a_plant_that_does_not_explain_the_records_is_told_and_the_given_one_stays():
+    record = ex.simulate("aero2_lag", seed=1, options={"amplitude": 2.0})
+    found = known_from(record, "aero2", None, "factor:3")
+    assert found.plant.definition.name == "aero2"
+    assert "times the declared noise: the plant may be wrong" in found.warnings[0]
+    heavier = Aero2().changed(m=1.2)
+    result = ex.identify(ex.simulate(heavier, seed=1), heavier)
+    assert known_from(result, None, None, 0.3).plant.constants.m == 1.2
+    assert known_from(result, Aero2(), None, 0.3).plant.constants.m == Aero2().constants.m
 
 
 # --------------------------------------------------------------------------------- selection
@@ -144,11 +172,23 @@ def test_costs_and_numbers_are_kept(records):
     assert found.cost <= 33
     assert sum(counts.values()) == 3  # one of 20 s, two of 6 s
     poor = ex.choose_experiments("aero2", given, TARGET, known=records[0], budget=1, coast=50)
-    assert poor.decision == "no experiment is within the budget"
+    assert poor.decision == "no experiment is chosen: each costs too much, or tells nothing"
     assert poor.after == poor.known
     loud = {"loud": given["loud"]}
     none = ex.choose_experiments("aero2", loud, TARGET, known=records[0], coast=50)
     assert none.decision == "no experiment is safe"
+
+
+def test_what_is_known_before_the_first_record_may_be_a_prior():
+    prior = {"D_p": "lognormal:0.00104:1%"}
+    found = ex.choose_experiments("aero2", EXPERIMENTS, TARGET, prior=prior, spread=0.1, coast=50)
+    assert found.known["D_p"].ci95_half == pytest.approx(1.96 * 0.01 * 0.00104, rel=0.03)
+    wide = ex.choose_experiments("aero2", EXPERIMENTS, TARGET, spread=0.1, coast=50)
+    assert wide.known["D_p"].ci95_half > 4 * found.known["D_p"].ci95_half
+    easy = ex.choose_experiments(
+        "aero2", EXPERIMENTS, {"D_p": "5%"}, prior=prior, spread=0.1, coast=50
+    )
+    assert easy.decision == "every target is reached"
 
 
 def test_an_output_that_is_not_measured_tells_nothing():
@@ -174,6 +214,11 @@ def test_an_output_that_is_not_measured_tells_nothing():
         ({"a": {"constants": {"M": 1.0}}}, "experiment 'a': unknown aero2 constant 'M'"),
         ({"a": {"outputs": ["yaw"]}}, "experiment 'a': unknown aero2 output 'yaw'"),
         ({"a": {"outputs": []}}, "experiment 'a': it measures no output"),
+        ({"a": {"constants": {"m": -1.0}}}, "constant m must be finite, with the sign of 1.07"),
+        ({"a": {"constants": {"m": math.inf}}}, "constant m must be finite"),
+        ({"a": {"excitation": 5}}, "experiment 'a': excitation must be"),
+        ({"a": {"steps": 2_000_000}}, "experiment 'a': steps must be a whole number from 2"),
+        ({"a": {"cost": "4"}}, "a: cost must be a number, got"),
         ({"a": {"cost": 0.0}}, "experiment 'a': cost must be a number above 0: got 0.0"),
         ({"a": {"most": -1}}, "experiment 'a': most must be a whole number from 0 to 1000"),
         ({"a": {"noise": {"pitch": 0.0}}}, "experiment 'a': a sensor without noise"),

@@ -23,6 +23,7 @@ from .options import (
     progress_bar,
     show_json,
 )
+from .simulate import show_warnings
 
 
 @click.command(name="choose")
@@ -99,6 +100,7 @@ def choose(
             plant, experiments, merged(targets), known=known or None, prior=given_priors(prior),
             progress=progress, **options,
         )  # fmt: skip
+    show_warnings(found.warnings)
     if plot is not None:
         from ..record.figure import save
 

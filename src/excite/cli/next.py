@@ -22,6 +22,7 @@ from .options import (
     progress_bar,
     show_json,
 )
+from .simulate import show_warnings
 
 TARGETS = Assignments(str, "a percentage such as 1% or a number")
 OF_TARGETS = (
@@ -33,7 +34,7 @@ OF_TARGETS = (
 
 
 @click.command(name="next")
-@click.argument("known", nargs=-1, required=True, type=OUT_FILE, metavar="RECORD...|RUN")
+@click.argument("known", nargs=-1, required=True, type=OUT_FILE, metavar="RECORD|RUN...")
 @click.option(
     "--plant", help="Name, or path/to/file.py:ClassName; default the plant the sidecar names."
 )
@@ -97,9 +98,9 @@ def next_experiment(
 ) -> None:
     """What the records tell of the parameters, and which experiment to make next.
 
-    RECORD... are records of one plant, from rest or as their sidecars say; RUN is the run folder
-    of excite identify. A signal is redesigned for the plants that are still possible, and
-    compared with a policy. Exit code 1 where no experiment is safe.
+    Records of one plant, from rest or as their sidecars say, and run folders of excite identify
+    or excite campaign, of other records. A signal is redesigned for the plants that are still
+    possible, and compared with a policy. Exit code 1 where no experiment is safe.
     """
     from ..study.next_experiment import next_experiment as verb
 
@@ -108,6 +109,7 @@ def next_experiment(
             known, target=merged(targets) or None, prior=given_priors(prior), progress=progress,
             **options,
         )  # fmt: skip
+    show_warnings(found.warnings)
     if plot is not None:
         from ..record.figure import save
 

@@ -22,6 +22,7 @@ from ..description import RARE, Parameter
 from ..plant import AbstractPlant, Params
 from .diagnosis import chi2_tail
 
+_CONTRADICTED = "the data contradict the prior of {}"
 _LITTLE = 0.9  # of a prior's standard deviation; data that leave more of it tell little
 
 
@@ -96,9 +97,11 @@ class Prior(eqx.Module):
         if len(priors) == 1:
             return priors[0]
         names = tuple(dict.fromkeys(name for prior in priors for name in prior.names))
-        kinds = {
-            n: k for prior in priors for n, k in zip(prior.names, prior.logarithmic, strict=True)
-        }
+        kinds: dict[str, bool] = {}
+        for prior in priors:
+            for name, kind in zip(prior.names, prior.logarithmic, strict=True):
+                if kinds.setdefault(name, kind) != kind:
+                    raise ValueError(f"{name} has a normal and a lognormal distribution: give one")
         rows, means = [], []
         for prior in priors:
             root, place = np.asarray(prior.root), [names.index(name) for name in prior.names]
@@ -107,7 +110,8 @@ class Prior(eqx.Module):
             rows.append(row)
             means.append(root @ np.asarray(prior.mean))
         W, v = np.concatenate(rows), np.concatenate(means)
-        mean = np.linalg.lstsq(W, v)[0]
+        size = np.linalg.norm(W, axis=0)
+        mean = np.linalg.lstsq(W / size[None], v)[0] / size
         more = len(v) - len(names)
         if more and chi2_tail(more, float(np.sum((W @ mean - v) ** 2))) < RARE:
             raise ValueError(
@@ -133,6 +137,13 @@ class Prior(eqx.Module):
         parts = zip(self.names, self.logarithmic, np.asarray(self.mean).tolist(), strict=True)
         return {name: math.exp(mean) if is_log else mean for name, is_log, mean in parts}
 
+    def contradicted(self, values: Mapping[str, float], sd: Mapping[str, float]) -> list[str]:
+        """Names of parameters in which the data contradict the distribution; see `verdict`."""
+        start = _CONTRADICTED.format("")
+        return [
+            told.removeprefix(start) for told in self.verdict(values, sd) if told.startswith(start)
+        ]
+
     def verdict(self, values: Mapping[str, float], sd: Mapping[str, float]) -> tuple[str, ...]:
         """Sentences where the data contradict the prior, or tell little beyond it.
 
@@ -151,7 +162,7 @@ class Prior(eqx.Module):
             # The variance of what the data move is the prior's less the estimate's.
             gained = spread**2 - after**2
             if gained > 0 and chi2_tail(1, moved**2 / gained) < RARE:
-                told.append(f"the data contradict the prior of {name}")
+                told.append(_CONTRADICTED.format(name))
             elif after > _LITTLE * spread:
                 told.append(
                     f"the estimate of {name} is that of its prior; the data hardly change it"

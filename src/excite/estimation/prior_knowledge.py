@@ -118,11 +118,17 @@ def _parsed(name: str, text: object, plant: AbstractPlant) -> tuple[str, float, 
     return kind, first, second
 
 
+def run_with_estimate(path: Path) -> Path:
+    """The run folder of an identification: that of a campaign is inside its folder."""
+    inside = path / "estimate"
+    return inside if (path / "campaign.json").is_file() and inside.is_dir() else path
+
+
 def prior_of_run(plant: AbstractPlant, given: Identification | str | Path) -> Prior:
     """A prior from a result, a run folder, or a file with mean and covariance; else ValueError."""
     if isinstance(given, Identification):
         return _from_run(plant, given.summary(), "the result")
-    path = Path(given)
+    path = run_with_estimate(Path(given))
     if path.is_dir():
         return _from_run(plant, EstimateSummary.read(path / "estimate.json", _ADVICE), str(path))
     if not path.exists():

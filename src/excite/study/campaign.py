@@ -456,6 +456,7 @@ class Campaign:
             "policy_hash": self.policy.hash,
             "targets": {t.name: str(t) for t in self.targets},
             "allowed": self._allowed(),
+            "units": {q.name: q.unit for q in quantities_of(self.plant, self.targets)},
             "spread": self.spread.setting,
             "most_rounds": self.most_rounds,
             "coast": self.coast,

@@ -10,11 +10,11 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ..description import Spread, SpreadLike, names_of
+from ..description import Spread, SpreadLike, names_of, wrong_type
 from ..environment import prior_sd_of
 from ..estimation.identify import RecordLike, identify, plant_named_by
 from ..estimation.prior import Prior
-from ..estimation.prior_knowledge import PriorLike, prior_of_run, with_prior
+from ..estimation.prior_knowledge import PriorLike, prior_of_run, run_with_estimate, with_prior
 from ..estimation.result import Identification
 from ..information import relative_size
 from ..plant import AbstractPlant
@@ -29,6 +29,9 @@ KnownLike = RecordLike | Identification | Sequence[RecordLike | Identification]
 """Records or their files, results of `identify` or their run folders, or several of these."""
 
 
+_LARGE = 2.0  # root mean square of a residual over the declared noise
+
+
 @dataclass(frozen=True)
 class Knowledge:
     """What is known of a plant's parameters.
@@ -37,11 +40,13 @@ class Knowledge:
         plant: sampled as the records are.
         region: the parameters that are possible.
         result: of identification, where there is one.
+        warnings: sentences, where the plant does not explain the records.
     """
 
     plant: AbstractPlant
     region: Region
     result: Identification | None = None
+    warnings: tuple[str, ...] = ()
 
     def of(self, others: Sequence[AbstractQuantity]) -> dict[str, Interval]:
         """Of each parameter, and of other quantities, the estimate and half of its interval."""
@@ -61,10 +66,11 @@ def intervals_in(
     return {q.name: Interval(float(value), float(half)) for q, value, half in each}
 
 
-def known_before(plant: AbstractPlant, spread: SpreadLike) -> Knowledge:
-    """What is known before the first record: the spread."""
-    center = jnp.stack([jnp.asarray(value, float) for value in plant.nominal])
-    return Knowledge(plant, Region(center, jnp.eye(len(center)) / prior_sd_of(spread) ** 2))
+def known_before(
+    plant: AbstractPlant, prior: PriorLike | Sequence[PriorLike], spread: SpreadLike
+) -> Knowledge:
+    """What is known before the first record: a prior, of other parameters the spread."""
+    return Knowledge(plant, region_of(plant, prior, spread))
 
 
 def known_from(
@@ -84,34 +90,66 @@ def known_from(
         spread: of the parameters before.
 
     Raises:
-        ValueError: for records of another plant, results that contradict each other, and an
-            estimate outside the spread.
+        ValueError: for results of another plant, records and results that contradict each other,
+            a record or a result that is given twice, and an estimate outside the spread.
+        TypeError: for something else than records and results.
     """
     is_one = isinstance(known, str | Path | Record | Identification)
+    if not is_one and not isinstance(known, Sequence):
+        raise wrong_type("known", known, "a record, a result, a run folder, or several")
     parts: list[Any] = [known] if is_one else list(known)
     if not parts:
         raise ValueError("no record is given")
+    named = [str(Path(p).resolve()) if isinstance(p, str | Path) else str(id(p)) for p in parts]
+    for part, name in zip(parts, named, strict=True):
+        if named.count(name) > 1:
+            raise ValueError(f"{part} is given twice: give each record and each result once")
     results = [part for part in parts if _is_result(part)]
     records = [part for part in parts if not _is_result(part)]
     if results and prior is not None:
         raise ValueError("a result has its prior: a prior is given with records alone")
     own, reach = plant_from(plant) if plant is not None else _plant_of(parts[0]), Spread.of(spread)
+    for part in results:
+        name = _plant_of(part).definition.name
+        if name != own.definition.name:
+            raise ValueError(f"a result is of plant {name!r}, and not of {own.definition.name!r}")
     before = Prior.product([prior_of_run(own, part) for part in results]) if results else None
     result = None
     if records:
         result = identify(records, own, prior=prior if before is None else before)
         if not result.is_usable:
             raise ValueError(f"the records give no estimate ({result.status})")
+        if before is not None and (told := before.contradicted(result.params, result.std_error)):
+            raise ValueError(
+                f"the records contradict the earlier results in {', '.join(told)}: identify all "
+                "records together, and see whether the plant explains them"
+            )
     elif len(results) == 1 and isinstance(results[0], Identification):
         result = results[0]
-    if result is not None and result.basis is not None:
-        own = result.basis.plant  # sampled as the records are
-    found = Knowledge(own, region_of(own, result or before or {}, reach), result)
+    if result is not None and result.basis is not None:  # sampled as the records are
+        own = result.basis.plant if plant is None else own.changed(dt=result.basis.plant.dt)
+    region = region_of(own, result or before or {}, reach)
+    found = Knowledge(own, region, result, _warnings(result))
     _require_within(found, reach)
     return found
 
 
-def region_of(plant: AbstractPlant, known: PriorLike, spread: SpreadLike) -> Region:
+def _warnings(result: Identification | None) -> tuple[str, ...]:
+    """Sentences, where the plant does not explain the records."""
+    if result is None or result.basis is None:
+        return ()
+    sd = np.asarray(result.basis.plant.sensor.sd)
+    residual = np.concatenate([part.computed["residual"] for part in result.fitted])
+    size = float(np.nanmax(np.sqrt(np.nanmean((residual / sd[None]) ** 2, axis=0))))
+    why = "the plant may be wrong, and what is predicted too good"
+    if size > _LARGE:
+        return (f"the residual is {size:.2g} times the declared noise: {why}",)
+    return (f"the residual follows the input: {why}",) * (result.misfit_factor > 1)
+
+
+def region_of(
+    plant: AbstractPlant, known: PriorLike | Sequence[PriorLike], spread: SpreadLike
+) -> Region:
     """The plants that an identification leaves possible, within the spread.
 
     Args:
@@ -136,7 +174,7 @@ def _plant_of(part: Any) -> AbstractPlant:
     if isinstance(part, Identification):
         return plant_from(part.plant.name) if part.basis is None else part.basis.plant
     if _is_result(part):
-        path = Path(part) / "estimate.json"
+        path = run_with_estimate(Path(part)) / "estimate.json"
         return plant_from(EstimateSummary.read(path, "identify the records again").plant)
     return plant_from(plant_named_by(part))
 

@@ -43,6 +43,7 @@ from .quantities import (
     AbstractQuantity,
     estimates,
     half_intervals,
+    require_defined,
     slopes,
 )
 from .targets import (
@@ -64,7 +65,7 @@ if TYPE_CHECKING:
 REDESIGNED = "redesigned"
 COAST = 100  # samples of free motion that must be safe, unless another number is given
 
-SAFE = 0.99  # of the critical level: largest output of a candidate on the possible plants
+LARGEST = 0.99  # of the critical level: largest output of a candidate on the possible plants
 
 
 @dataclass(frozen=True)
@@ -94,7 +95,7 @@ class Candidate:
     @property
     def is_safe(self) -> bool:
         """Whether no possible plant comes near to a critical level."""
-        return self.nearness < SAFE
+        return self.nearness < LARGEST
 
     def to_dict(self) -> dict[str, Any]:
         """What is predicted, as JSON-ready data."""
@@ -222,6 +223,7 @@ class NextExperiment:
         targets: what is asked.
         candidates: that were compared.
         chosen: the best safe one; None where none is safe.
+        warnings: sentences, where the plant does not explain the records.
     """
 
     plant: AbstractPlant
@@ -229,6 +231,7 @@ class NextExperiment:
     targets: tuple[Target, ...]
     candidates: tuple[Candidate, ...]
     chosen: Candidate | None
+    warnings: tuple[str, ...] = ()
 
     @property
     def decision(self) -> str:
@@ -239,7 +242,8 @@ class NextExperiment:
         if self.chosen is None:
             return f"{farthest(shares)}; no candidate is safe on all plants that are possible"
         if np.isfinite(self.chosen.samples):
-            told = f"every target is reached after {self.chosen.samples:.0f} samples"
+            count = round(self.chosen.samples)
+            told = f"every target is reached after {count} sample{'s' * (count != 1)}"
         else:
             left = shares_of(self.targets, self.chosen.after)
             told = f"afterwards {farthest(left)}"
@@ -299,6 +303,7 @@ class NextExperiment:
             "candidates": [c.to_dict() for c in self.candidates],
             "chosen": None if self.chosen is None else self.chosen.name,
             "decision": self.decision,
+            "warnings": list(self.warnings),
         }
 
     @property
@@ -421,6 +426,8 @@ def next_experiment(
     now = intervals_in(own, region, ())
     usual = {name: interval.ci95_half / 2 for name, interval in now.items()}
     targets = targets_from(own, usual if target is None else target)
+    for quantity in others_of(own, targets):
+        require_defined(quantity, own, own.Params(*region.center))
     now = given.of(others_of(own, targets))
     length = steps or (played[1].layout.num_steps if played else 200)
     progress("redesigning", 1, 2)
@@ -428,7 +435,8 @@ def next_experiment(
         own, region, targets, played, num_steps=length, coast=coast, ahead=ahead, seed=seed
     )
     progress("done", 2, 2)
-    result = NextExperiment(own, now, targets, tuple(made), best_of(made, targets))
+    best = best_of(made, targets)
+    result = NextExperiment(own, now, targets, tuple(made), best, given.warnings)
     if out is not None:
         result.save(out, overwrite)
     return result

@@ -33,6 +33,7 @@ QuantityLike: TypeAlias = str | Callable[[Any], Any]
 """A parameter's name, a function of the parameters, `path/to/file.py:function`, or a prediction
 `OUTPUT@SECONDS:SIGNAL` such as `pitch@2:step.csv`."""
 
+_LONGEST = 1_000_000  # samples of a prediction
 _PREDICTION = re.compile(r"(?P<output>[^@:]+)@(?P<time>[^:]+):(?P<signal>.+)")
 
 
@@ -71,8 +72,11 @@ class FunctionOfParameters(AbstractQuantity):
     function: Callable[[Params], Any] = eqx.field(static=True)
 
     def __call__(self, plant: AbstractPlant, params: Params) -> Float[Array, ""]:
-        """Its value."""
-        return jnp.asarray(self.function(params), float)
+        """Its value; ValueError where it is not one number."""
+        value = jnp.asarray(self.function(params), float)
+        if value.shape:
+            raise ValueError(f"got an array of shape {value.shape}")
+        return value
 
 
 class PredictedOutput(AbstractQuantity):
@@ -105,7 +109,7 @@ def quantity_of(plant: AbstractPlant, given: QuantityLike) -> AbstractQuantity:
         ValueError: for an unknown name, a file without such a function, a function that gives no
             finite number at the nominal parameters, and an experiment that is too short.
     """
-    if callable(given):
+    if not isinstance(given, str):
         return _function(plant, getattr(given, "__name__", type(given).__name__), given)
     d = plant.description
     if (found := _PREDICTION.fullmatch(given)) is not None:
@@ -113,6 +117,11 @@ def quantity_of(plant: AbstractPlant, given: QuantityLike) -> AbstractQuantity:
     path, colon, word = given.rpartition(":")
     if colon and path.endswith(".py"):
         return _function(plant, word, function_at(Path(path), word))
+    if "@" in given or given.endswith((".py", ".py:")):
+        raise ValueError(
+            f"{given!r} is no quantity: a prediction is OUTPUT@SECONDS:SIGNAL, such as "
+            "pitch@2:step.csv, a function path/to/file.py:function"
+        )
     if given not in names_of(d.parameters):
         raise unknown("parameter", given, names_of(d.parameters))
     return OneParameter(given, d.parameter(given).unit)
@@ -122,22 +131,38 @@ def _function(
     plant: AbstractPlant, name: str, function: Callable[[Params], Any]
 ) -> FunctionOfParameters:
     """A user's function; its attribute `unit` is that of the number, if there is one."""
+    if name in names_of(plant.definition.parameters) or name == "<lambda>":
+        raise ValueError(f"a function needs a name of its own: got {name!r}")
     found = FunctionOfParameters(name, str(getattr(function, "unit", "")), function)
     require_defined(found, plant)
     return found
 
 
-def require_defined(quantity: AbstractQuantity, plant: AbstractPlant) -> None:
-    """Raises ValueError unless the quantity is a finite number that depends on the parameters."""
-    where = f"{quantity.name} of {plant.definition.name!r}"
+def require_defined(
+    quantity: AbstractQuantity, plant: AbstractPlant, params: Params | None = None
+) -> None:
+    """Raises ValueError unless the quantity is a finite number with a slope.
+
+    Args:
+        quantity: of the plant.
+        plant: whose parameters are meant.
+        params: default the nominal ones.
+    """
+    where, at = f"{quantity.name} of {plant.definition.name!r}", "the nominal parameters"
+    if params is not None:
+        at = "the estimate"
     try:
-        value, slope = map(np.asarray, slopes((quantity,), plant, plant.nominal))
-    except Exception as error:  # of the user's function
-        raise ValueError(f"{where} is no function of the parameters: {told(error)}") from error
-    if value.shape != (1,) or not (np.isfinite(value).all() and np.isfinite(slope).all()):
-        raise ValueError(f"{where} is no finite number at the nominal parameters: got {value[0]}")
+        value, slope = map(np.asarray, slopes((quantity,), plant, params or plant.nominal))
+    except BaseException as error:  # of the user's function, also sys.exit
+        if isinstance(error, KeyboardInterrupt):
+            raise
+        raise ValueError(
+            f"{where} must compute one number with jax.numpy from the parameters: {told(error)}"
+        ) from error
+    if not (np.isfinite(value).all() and np.isfinite(slope).all()):
+        raise ValueError(f"{where} is no finite number, or has no finite slope, at {at}")
     if not np.any(slope):
-        raise ValueError(f"{where} does not depend on the parameters")
+        raise ValueError(f"{where} has no slope at {at}: its interval cannot be told")
 
 
 def _prediction(
@@ -152,12 +177,21 @@ def _prediction(
         count = round(float(time.strip().removesuffix("s")) / dt)
     except (ValueError, OverflowError):
         count = 0
-    if not 0 < count <= 1_000_000:
-        raise ValueError(f"{name}: the time must be a number of seconds above 0: got {time!r}")
-    excitation = excitation_named(signal, {}, plant)
+    if not 0 < count <= _LONGEST:
+        raise ValueError(
+            f"{name}: the time must be a number of seconds from {dt:g} to {_LONGEST * dt:g}: got "
+            f"{time!r}"
+        )
+    try:
+        excitation = excitation_named(signal, {}, plant)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from None
     if not isinstance(excitation, AbstractSignal):
         raise ValueError(f"{name}: a prediction needs a signal that does not react: got {signal!r}")
-    inputs = excitation.sequence(plant, count, jax.random.key(0))
+    try:
+        inputs = excitation.sequence(plant, count, jax.random.key(0))
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from None
     found = PredictedOutput(name, d.outputs[names.index(output)].unit, names.index(output), inputs)
     require_defined(found, plant)
     return found

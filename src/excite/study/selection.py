@@ -44,7 +44,8 @@ from ..simulation import Experiment, run_episode
 from ..training.checkpoint import Progress
 from ..training.redesign import JUDGES, POINTS, Region
 from .knowledge import KnownLike, intervals_in, known_before, known_from
-from .next_experiment import COAST, SAFE
+from .next_experiment import COAST, LARGEST
+from .quantities import require_defined
 from .settings import Settings, excitation_beside, read_toml, sentence
 from .targets import (
     Target,
@@ -77,7 +78,9 @@ class PlannedExperiment(Settings):
         most: times that it can be made.
     """
 
-    model_config = pydantic.ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
+    model_config = pydantic.ConfigDict(
+        extra="forbid", frozen=True, strict=True, arbitrary_types_allowed=True
+    )
 
     excitation: Any = "chirp"
     options: dict[str, Any] = {}
@@ -88,6 +91,8 @@ class PlannedExperiment(Settings):
     cost: float | None = None
     most: int | None = None
 
+
+_SHOWN = 12  # names of an order
 
 ExperimentsLike = Mapping[str, PlannedExperiment | Mapping[str, Any]] | str | Path
 """Experiments by name, or a TOML file with a table `[experiments.NAME]` for each."""
@@ -117,7 +122,7 @@ class Option:
     @property
     def is_safe(self) -> bool:
         """Whether no possible plant comes near to a critical level."""
-        return self.nearness < SAFE
+        return self.nearness < LARGEST
 
 
 @dataclass(frozen=True, repr=False)
@@ -132,6 +137,7 @@ class Selection:
         options: the experiments that can be made.
         order: names of the chosen experiments, the most informative first.
         then: what is known after each of them.
+        warnings: sentences, where the plant does not explain the records.
     """
 
     plant: AbstractPlant
@@ -140,6 +146,7 @@ class Selection:
     options: tuple[Option, ...]
     order: tuple[str, ...]
     then: tuple[Mapping[str, Interval], ...]
+    warnings: tuple[str, ...] = ()
 
     @property
     def cost(self) -> float:
@@ -154,9 +161,12 @@ class Selection:
     @property
     def decision(self) -> str:
         """What to make first, and what all of it brings, as a sentence."""
+        if max(shares_of(self.targets, self.known).values()) <= 1:
+            return "every target is reached"
         if not self.order:
-            safe = any(option.is_safe for option in self.options)
-            return "no experiment is within the budget" if safe else "no experiment is safe"
+            if not any(option.is_safe for option in self.options):
+                return "no experiment is safe"
+            return "no experiment is chosen: each costs too much, or tells nothing"
         each = [max(shares_of(self.targets, known).values()) for known in self.then]
         reached = next((i for i, share in enumerate(each, 1) if share <= 1), None)
         if reached is None:
@@ -190,6 +200,7 @@ class Selection:
             "after": plain(self.after),
             "cost": self.cost,
             "decision": self.decision,
+            "warnings": list(self.warnings),
         }
 
     header = ("parameter", "estimate", "± 95 %", "relative", "target", "after all")
@@ -222,10 +233,16 @@ class Selection:
             [
                 text_table(title, self.header, self.rows()),
                 text_table("experiments", self.option_header, self.option_rows()),
-                f"in this order: {', '.join(self.order) or 'none'}; cost {self.cost:g}",
+                f"in this order: {self._shown_order()}; cost {self.cost:g}",
                 textwrap.fill(self.decision, 80),
             ]
         )
+
+    def _shown_order(self) -> str:
+        """The first names of the order."""
+        more = len(self.order) - _SHOWN
+        told = ", ".join(self.order[:_SHOWN]) or "none"
+        return told + f", and {more} more" * (more > 0)
 
     def _repr_html_(self) -> str:
         """The same for a notebook."""
@@ -273,7 +290,7 @@ def choose_experiments(
         experiments: that can be made; see `PlannedExperiment`.
         target: half of a 95 % interval by quantity, as for `Campaign`.
         known: as for `next_experiment`; default nothing but the spread.
-        prior: as for `identify`, where records are given.
+        prior: as for `identify`; without records normal distributions alone.
         spread: of the parameters before the records.
         rounds: experiments together, at most; default one, or as many as the budget allows.
         budget: costs together, at most.
@@ -296,8 +313,11 @@ def choose_experiments(
     for name, one in planned.items():
         _experiment(before, name, one)  # a wrong one is told before records are identified
     progress("estimating", 0, len(planned) + 1)
-    if known is None:
-        given = known_before(before, spread)
+    if known is None and prior is not None:
+        given = known_before(before, prior, spread)
+        plants = given.region.plants(before, JUDGES)
+    elif known is None:
+        given = known_before(before, {}, spread)
         keys = jax.random.split(jax.random.key(seed), JUDGES)
         drawn = jax.vmap(lambda key: draw_params(before, key, spread))(keys)
         plants = jax.tree.map(lambda a, b: jnp.append(floats(a), b), before.nominal, drawn)
@@ -306,6 +326,8 @@ def choose_experiments(
         plants = given.region.plants(given.plant, JUDGES)
     own, region = given.plant, given.region
     targets = targets_from(own, target)
+    for quantity in others_of(own, targets):
+        require_defined(quantity, own, own.Params(*region.center))
     each = [_experiment(own, name, one) for name, one in planned.items()]
     gains, sizes = [], []
     for i, (name, experiment) in enumerate(zip(planned, each, strict=True)):
@@ -320,7 +342,7 @@ def choose_experiments(
     only = 1 if rounds is None and budget is None else rounds
     limit = only or 1000
     most = np.array([
-        0 if size >= SAFE else limit if one.most is None else min(one.most, limit)
+        0 if size >= LARGEST else limit if one.most is None else min(one.most, limit)
         for one, size in zip(planned.values(), sizes, strict=True)
     ])  # fmt: skip
     asked = over_targets(own, own.Params(*region.center), targets)
@@ -340,8 +362,9 @@ def choose_experiments(
     then = [after(order[: i + 1]) for i in range(len(order))]
     progress("done", len(each) + 1, len(each) + 1)
     return Selection(
-        own, targets, given.of(others), tuple(options), tuple(names[i] for i in order), tuple(then)
-    )
+        own, targets, given.of(others), tuple(options), tuple(names[i] for i in order),
+        tuple(then), given.warnings,
+    )  # fmt: skip
 
 
 def _planned(given: ExperimentsLike) -> dict[str, PlannedExperiment]:
@@ -384,9 +407,14 @@ def _experiment(
     d = plant.description
     constants, outputs = names_of(d.constants), names_of(d.outputs)
     try:
-        for word in given.constants:
+        for word, value in given.constants.items():
             if word not in constants:
                 raise unknown(f"{d.name} constant", word, constants)
+            usual = d.constants[constants.index(word)].value
+            if not np.isfinite(value) or value * usual < 0:
+                raise ValueError(
+                    f"constant {word} must be finite, with the sign of {usual:g}: got {value!r}"
+                )
         for word in given.outputs or ():
             if word not in outputs:
                 raise unknown(f"{d.name} output", word, outputs)
@@ -396,13 +424,15 @@ def _experiment(
             raise ValueError(f"cost must be a number above 0: got {given.cost!r}")
         if given.most is not None:
             require_whole("most", given.most, 0, 1000)
+        if given.steps is not None:
+            require_whole("steps", given.steps, 2, 1_000_000)
         own = plant.changed(**{word: floats(value) for word, value in given.constants.items()})
         made = Experiment.of(
             own, given.excitation, options=given.options, steps=given.steps, noise=given.noise
         )
         require_noise(made.plant)
     except (ValueError, TypeError) as error:
-        raise type(error)(f"experiment {name!r}: {error}") from None
+        raise ValueError(f"experiment {name!r}: {error}") from None
     measured = [given.outputs is None or word in given.outputs for word in outputs]
     return made, np.array(measured)
 

@@ -69,7 +69,7 @@ def targets_from(plant: AbstractPlant, given: TargetLike) -> tuple[Target, ...]:
         TypeError: for something else than a dict.
     """
     if not isinstance(given, Mapping) or not all(isinstance(n, str) or callable(n) for n in given):
-        raise wrong_type("target", given, "a dict by parameter")
+        raise wrong_type("target", given, "a dict by parameter, function or prediction")
     found = []
     for word, value in given.items():
         quantity = quantity_of(plant, word)
@@ -99,7 +99,7 @@ def _half(quantity: AbstractQuantity, value: str | float) -> tuple[float, bool]:
         return half * (unit_factor("", unit, quantity.unit) if unit else 1.0), False
     except ValueError:
         raise ValueError(
-            f"{what} is in {quantity.unit or '1'!r}, which {unit!r} is no other unit of"
+            f"{what} cannot be in {unit!r}: the unit is {quantity.unit or '1'!r}"
         ) from None
 
 

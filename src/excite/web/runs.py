@@ -159,7 +159,12 @@ def _campaign(run: Path) -> dict[str, object]:
     except (LookupError, TypeError, AttributeError, ArithmeticError, ValueError):
         return {}
     known, rounds = ({"header": header, "rows": rows} for header, rows in tables)
-    return {"known": known, "rounds": rounds, "interrupted": str(content.get("interrupted", ""))}
+    return {
+        "known": known,
+        "rounds": rounds,
+        "interrupted": str(content.get("interrupted", "")),
+        "told": str(content.get("reason") or content.get("interrupted") or ""),
+    }
 
 
 def _table(text: str) -> dict[str, object]:

@@ -90,7 +90,9 @@ class CampaignRun(Run):
                 command(self.marker.command, _likely_command(self)),
                 folded("The plant", plant_facts(d)),
             ]
-        title = f"{d.name}: {ended} ({c['num_samples']} samples in {len(c['rounds'])} rounds)"
+        count = len(c["rounds"])
+        played = f"{c['num_samples']} samples in {count} round{'s' * (count != 1)}"
+        title = f"{d.name}: {ended} ({played})"
         return Section(title, self.marker.folder, "".join(parts))
 
     def _knowledge(self, name: str) -> str:
@@ -130,7 +132,7 @@ def read_campaign(marker: Marker) -> CampaignRun:
 
 def known_table(d: PlantDescription, c: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
     """What is known of every parameter and target, and what was asked."""
-    units, rows = {p.name: p.unit for p in d.parameters}, []
+    units, rows = c.get("units") or {p.name: p.unit for p in d.parameters}, []
     for name in dict.fromkeys([*names_of(d.parameters), *c["targets"]]):
         known, target = c["estimate"].get(name), c["targets"].get(name, "")
         cells = ["–", "–", "–"]

@@ -5,7 +5,7 @@ import { curves } from "./curves.js";
 import { table } from "./record.js";
 
 const section = document.getElementById("runs"), view = document.getElementById("run-view");
-let chosen = "";
+let chosen = "", following = 0;
 
 export async function open() {
   try {
@@ -22,6 +22,7 @@ export async function open() {
 async function show(run, button) {
   section.querySelectorAll("button").forEach((b) => b.setAttribute("aria-pressed", String(b === button)));
   chosen = run.name;
+  clearTimeout(following);
   say(section, "");
   const name = encodeURIComponent(run.name), address = (file) => `api/run/file?name=${name}&file=${encodeURIComponent(file)}`;
   try {
@@ -34,16 +35,17 @@ async function show(run, button) {
       card.append(el("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Table of parameters" }, estimate), el("ul", {}, ...(content.estimate.verdict ?? []).map((text) => el("li", {}, text))));
     }
     if (content.rows.length) card.append(rows(content, "Table of the study"));
+    if (content.campaign.told) card.append(el("p", {}, content.campaign.told));
     if (content.campaign.known) card.append(rows(content.campaign.known, "What is known"), el("h3", {}, "Rounds"), rows(content.campaign.rounds, "Rounds"));
     card.append(...content.notes.map((note) => el("p", { class: "hint" }, note)));
     const link = (file) => download(address(file), file), isPolicy = (file) => file.endsWith(".safetensors");
     const policies = content.files.filter(isPolicy), others = content.files.filter((file) => !isPolicy(file));
     const report = content.is_finished ? [download(`api/run/report.html?name=${name}`, "Report")] : [];
-    if (!content.is_finished) card.append(el("p", {}, "Not finished. To resume, rerun the command in the folder where it was started: ", el("code", {}, content.command || "the same command")));
+    if (!content.is_finished) card.append(el("p", {}, "Not finished. To resume it after an interruption, rerun the command in the folder where it was started: ", el("code", {}, content.command || "the same command")));
     card.append(el("p", { class: "row downloads" }, ...report, ...others.map(link)));
     if (policies.length) card.append(el("details", { open: policies.length < 4 }, el("summary", {}, `Policies (${policies.length})`), el("p", { class: "row downloads" }, ...policies.map(link))));
     const isFollowed = content.kind === "campaign" && !content.is_finished && !content.campaign.interrupted;
-    if (isFollowed) setTimeout(() => chosen === run.name && !section.hidden && show(run, button), 2000);
+    if (isFollowed) following = setTimeout(() => chosen === run.name && !section.hidden && show(run, button), 2000);
     view.replaceChildren(card);
     if (!isFollowed && view.getBoundingClientRect().top > innerHeight / 2) view.scrollIntoView();
     if (content.curves.length) {
