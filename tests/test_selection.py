@@ -216,7 +216,6 @@ def test_an_output_that_is_not_measured_tells_nothing():
         ({"a": {"outputs": []}}, "experiment 'a': it measures no output"),
         ({"a": {"constants": {"m": -1.0}}}, "constant m must be finite, with the sign of 1.07"),
         ({"a": {"constants": {"m": math.inf}}}, "constant m must be finite"),
-        ({"a": {"excitation": 5}}, "experiment 'a': excitation must be"),
         ({"a": {"steps": 2_000_000}}, "experiment 'a': steps must be a whole number from 2"),
         ({"a": {"cost": "4"}}, "a: cost must be a number, got"),
         ({"a": {"cost": 0.0}}, "experiment 'a': cost must be a number above 0: got 0.0"),
