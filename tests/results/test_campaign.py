@@ -48,6 +48,23 @@ def test_the_page_says_how_often_the_true_rival_is_found_with_much_noise():
     assert max(row["largest_nearness"] for row in designed) < 1
 
 
+@pytest.mark.parametrize("name", ["compare", "compare_emps"])
+def test_the_page_compares_campaigns_with_other_methods(name):
+    found = json.loads((FOLDER / f"{name}.json").read_text())
+    for method, row in found["rows"].items():
+        cells = []
+        for target in (key for key in row if key.startswith("0.")):
+            own = row[target]
+            shown = [f"{own[q]:.0f}" if own[q] else "–" for q in ("median", "90 %", "all")]
+            cells.append(" / ".join([*shown, str(own["missed"])]))
+        assert any(
+            line.startswith(f"| {method} | {' | '.join(cells)} |") for line in PAGE.splitlines()
+        )
+    policy = "aero2-wide" if name == "compare" else str(FOLDER / "policies/emps-wide.safetensors")
+    assert found["policy_hash"] == read_policy(policy).hash
+    assert name != "compare" or not any(row["violations"] for row in found["rows"].values())
+
+
 def test_intervals_hold_where_a_round_ends_by_its_own_estimate():
     found = json.loads((FOLDER / "coverage.json").read_text())
     shown = [f"{value:.1f}" for value in found["coverage_percent"].values()]
