@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
@@ -57,6 +57,7 @@ def campaign(
     filter: bool = False,
     guard: bool = False,
     pause: float = 0.0,
+    command: str = "",
     progress: Progress = lambda *_: None,
     on_round: Callable[[Round], None] = lambda _: None,
     on_warning: Callable[[str], None] = lambda _: None,
@@ -85,6 +86,7 @@ def campaign(
         filter: adds a predictive safety filter for parameters within the spread.
         guard: ends a round that no declared plant explains, as for `run`.
         pause: before every round but the first, so that the plant comes to rest [s].
+        command: stored in the folder, to repeat the campaign.
         progress: called with a text, how much is done, and the total.
         on_round: called after every round.
         on_warning: called with sentences about what is played.
@@ -123,7 +125,7 @@ def campaign(
     name = rig if isinstance(rig, str) else type(rig).__name__
     settings = {"rig": name, "seed": seed, "fault": dict(by_name("fault", fault)), "filter": filter,
                 "guard": guard}  # fmt: skip
-    folder = _Folder.checked(root, made, settings)
+    folder = _Folder.checked(root, made, settings, command)
     if not folder.has_rounds:
         progress("predicting what can be reached", 0, rounds)
         made.require_reachable()
@@ -219,10 +221,13 @@ class _Folder:
     """Where a campaign is kept: its settings and rounds, and a record of each."""
 
     root: Path
-    settings: Mapping[str, Any] = field(default_factory=dict)
+    settings: Mapping[str, Any]
+    command: str
 
     @classmethod
-    def checked(cls, root: Path, made: Campaign, asked: Mapping[str, object]) -> _Folder:
+    def checked(
+        cls, root: Path, made: Campaign, asked: Mapping[str, object], command: str
+    ) -> _Folder:
         """A folder that is new, or of the same campaign; ValueError for anything else."""
         own = made.to_dict()
         kept = ("plant_hash", "policy_hash", "spread", "coast", "redesign", "rivals")
@@ -239,7 +244,7 @@ class _Folder:
                 )
         elif root.exists() and not (root.is_dir() and {p.name for p in root.iterdir()} <= _OWN):
             raise ValueError(f"{root} exists and is no campaign: choose another folder")
-        return cls(root, settings)
+        return cls(root, settings, command)
 
     @property
     def has_rounds(self) -> bool:
@@ -254,7 +259,7 @@ class _Folder:
         """Settings, what every round brought, and at the end what was known and the estimate."""
         about = {"excite": __version__, "settings": dict(self.settings)}
         write_json(self.root / "campaign.json", {**about, **made.to_dict()})
-        marker = {"kind": "excite campaign", "excite": __version__, "command": ""}
+        marker = {"kind": "excite campaign", "excite": __version__, "command": self.command}
         write_json(self.root / "run.json", {**marker, "plant": made.plant.description.to_dict()})
         if (made.reason or made.interrupted) and made.result is not None:
             samples, halves = made.knowledge()

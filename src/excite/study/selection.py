@@ -313,17 +313,15 @@ def choose_experiments(
     for name, one in planned.items():
         _experiment(before, name, one)  # a wrong one is told before records are identified
     progress("estimating", 0, len(planned) + 1)
-    if known is None and prior is not None:
-        given = known_before(before, prior, spread)
-        plants = given.region.plants(before, JUDGES)
-    elif known is None:
-        given = known_before(before, {}, spread)
+    if known is None:
+        given = known_before(before, prior or {}, spread)
+    else:
+        given = known_from(known, before, prior, spread)
+    plants = given.region.plants(given.plant, JUDGES)
+    if known is None and prior is None:  # the ellipsoid of a box is far larger than the box
         keys = jax.random.split(jax.random.key(seed), JUDGES)
         drawn = jax.vmap(lambda key: draw_params(before, key, spread))(keys)
         plants = jax.tree.map(lambda a, b: jnp.append(floats(a), b), before.nominal, drawn)
-    else:
-        given = known_from(known, before, prior, spread)
-        plants = given.region.plants(given.plant, JUDGES)
     own, region = given.plant, given.region
     targets = targets_from(own, target)
     for quantity in others_of(own, targets):

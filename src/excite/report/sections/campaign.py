@@ -87,7 +87,7 @@ class CampaignRun(Run):
                         *((key, value) for key, value in c["settings"].items() if key not in c),
                     ]
                 ),
-                command(self.marker.command, _likely_command(self)),
+                command(self.marker.command, "") if self.marker.command else "",
                 folded("The plant", plant_facts(d)),
             ]
         count = len(c["rounds"])
@@ -166,10 +166,3 @@ def _rivals(structure: Mapping[str, Any] | None) -> str:
         return ""
     rows = [[r["plant"], f"{r['probability']:.4f}"] for r in structure["rivals"]]
     return heading("Which plant") + table(["rival", "probability"], rows, labels=1)
-
-
-def _likely_command(campaign: CampaignRun) -> str:
-    """The command that made it, as far as the folder tells."""
-    c = campaign.content
-    target = ",".join(f"{n}={t.replace(' %', '%')}" for n, t in c["targets"].items())
-    return f"excite campaign {campaign.marker.plant.name} --target {target} --out FOLDER"
