@@ -56,7 +56,7 @@ def test_the_page_compares_campaigns_with_other_methods(name):
         for target in (key for key in row if key.startswith("0.")):
             own = row[target]
             shown = [f"{own[q]:.0f}" if own[q] else "–" for q in ("median", "90 %", "all")]
-            cells.append(" / ".join([*shown, str(own["missed"])]))
+            cells.append(", ".join([*shown, str(own["missed"])]))
         assert any(
             line.startswith(f"| {method} | {' | '.join(cells)} |") for line in PAGE.splitlines()
         )
