@@ -144,7 +144,9 @@ def test_a_record_is_replayed_and_its_inputs_are_a_signal(record):
 
 
 MISTAKES = {
-    "ex.Campaign('aero2', 'D_p=1%')": "target must be a dict by parameter, function or prediction: got str 'D_p=1%'",
+    "ex.Campaign('aero2', 'D_p=1%')": (
+        "target must be a dict by parameter, function or prediction: got str 'D_p=1%'"
+    ),
     "ex.Campaign('aero2', {'D_p': None})": "target of D_p must be a number: got NoneType None",
     "ex.Campaign('aero2', {'D_p': True})": "target of D_p must be a number: got bool True",
     "ex.Campaign('aero2', {'D_p': '1%'}, spread='3')": "such as factor:3: got '3'",
