@@ -17,6 +17,7 @@ from commands import excite
 
 import excite as ex
 from excite.description import HALF_95
+from excite.excitation import Replay
 from excite.files import locked_folder, read_columns
 from excite.information import experiment_information
 from excite.plant import Aero2, draw_params
@@ -200,6 +201,8 @@ def test_a_quantity_of_a_parameter_that_is_not_known_is_not_known():
         ({"policy": "aero3"}, "aero3"),
         ({"policy": "dc_motor"}, "the policy has 2 outputs; the plant has 1"),
         ({"plant": "aero3"}, "unknown plant 'aero3'"),
+        ({"steps": 50}, "steps are for rounds without a policy: a policy has its own"),
+        ({"policy": "none", "steps": 3}, "steps must be a whole number from 4 to 10000000: got 3"),
     ],
 )
 def test_a_campaign_that_cannot_be_played_is_one_sentence(options, words):
@@ -208,9 +211,48 @@ def test_a_campaign_that_cannot_be_played_is_one_sentence(options, words):
         ex.Campaign(**given)
 
 
-def test_a_plant_without_a_shipped_policy_needs_one():
-    with pytest.raises(ValueError, match="no shipped policy for 'aero2\\+offset_voltage'"):
-        ex.Campaign("aero2+offset_voltage", {"J_p": "1%"})
+def test_a_plant_without_a_shipped_policy_begins_with_a_robust_signal():
+    campaign = ex.Campaign("aero2+offset_voltage", {"J_p": "1%"})
+    assert (campaign.policy, campaign.steps, campaign.warnings) == (None, 50, ())
+    assert campaign.to_dict()["policy_hash"] == ""
+
+
+@pytest.fixture
+def designed() -> ex.Campaign:
+    """A campaign without a policy; its robust signal takes a minute, and is another one here."""
+    campaign = ex.Campaign("aero2", {"D_p": "2%"}, policy="none", steps=60, coast=20, rounds=4)
+    campaign.opening = Replay(jnp.asarray(3.0 * np.sign(np.sin(np.arange(30) + 0.5)))[:, None])
+    return campaign
+
+
+@pytest.mark.science  # compiles the redesign, 15 s
+def test_without_a_policy_signals_are_redesigned_after_the_first(designed):
+    expected = designed.expected
+    for seed in range(4):
+        if (asked := designed.ask()) is None:
+            break
+        told = designed.tell(ex.simulate("aero2", asked, params=TRUE, seed=seed))
+        assert told.nearness < 1
+    assert designed.reason == REACHED
+    assert [(r.played, r.num_samples) for r in designed.rounds[:2]] == [
+        ("robust", 30),
+        ("redesigned", 60),
+    ]
+    assert abs(designed.known["D_p"].estimate - TRUE["D_p"]) < 0.02 * TRUE["D_p"]
+    # What is predicted on plants around the nominal one, of which this is one.
+    samples, halves = designed.knowledge()
+    is_reached = halves[:, 2] <= 0.02 * designed.known["D_p"].estimate
+    first = samples[is_reached.argmax()]
+    assert expected.samples.min() / 1.5 < first < 1.5 * expected.samples.max()
+
+
+def test_a_robust_signal_that_is_played_again_is_called_so(designed):
+    record = ex.simulate("aero2", designed.ask(), params=TRUE, seed=0)
+    designed.tell(record)
+    assert designed.tell(record).played == "robust"
+    designed.rounds.clear()
+    other = dataclasses.replace(record, inputs=-record.inputs)
+    assert designed.tell(other).played == "redesigned"
 
 
 # ------------------------------------------------------------------------------ ask and tell
@@ -310,6 +352,28 @@ def test_a_round_that_was_interrupted_does_not_count_in_the_budget():
     assert campaign.ask() is not None
     campaign.tell(record)
     assert campaign.reason == "all rounds are played"
+
+
+def test_a_round_that_ended_too_early_makes_later_ones_longer():
+    campaign = ex.Campaign("aero2", {"D_p": "0.001%"}, policy=steady(), redesign=False)
+    assert campaign.monitor(waits=True)._enough(100) == 1
+    told = campaign.tell(ex.simulate("aero2", steady(), params=TRUE, seed=1), REACHED)
+    estimate, half = told.known["D_p"]
+    missing = half / (1e-5 * estimate)
+    assert missing > 10
+    assert told.decision.startswith("go on: D_p is")
+    enough = campaign.monitor(waits=True)._enough(100)
+    assert enough == pytest.approx((1 - 1 / math.sqrt(2 * 100)) / missing)
+
+
+def test_records_that_the_plant_does_not_explain_are_a_warning():
+    campaign = ex.Campaign("aero2", {"D_p": "0.1%"}, policy=steady())
+    record = ex.simulate("aero2", steady(), params=TRUE, seed=1)
+    ripple = 0.01 * np.sin(0.8 * np.arange(len(record.time)))[:, None]
+    campaign.tell(dataclasses.replace(record, outputs=record.outputs + ripple))
+    (sentence,) = campaign.warnings
+    assert "times the declared noise: the plant may be wrong" in sentence
+    assert f"warning: {sentence}"[:60] in repr(campaign)
 
 
 def test_a_share_of_nothing_is_infinite():

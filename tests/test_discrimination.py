@@ -281,6 +281,7 @@ def test_a_campaign_tells_rivals_apart_before_it_identifies():
     assert json.loads(json.dumps(campaign.to_dict()))["structure"]["chosen"] == LAG
 
 
+@pytest.mark.science
 def test_a_campaign_ends_where_no_rival_explains_the_records():
     campaign = ex.Campaign("aero2", {"J_p": "2%"}, rivals=[LAG], spread=0.3, coast=COAST)
     record = ex.simulate("aero2+offset", campaign.ask(), steps=STEPS,
@@ -294,6 +295,7 @@ def test_a_campaign_ends_where_no_rival_explains_the_records():
     assert last.reason.startswith("no rival explains the records")  # and not the end of the budget
 
 
+@pytest.mark.science
 def test_a_choice_that_a_later_record_contradicts_is_made_again():
     campaign = ex.Campaign("aero2", {"D_p": "0.001%"}, rivals=[LAG], spread=0.3, coast=COAST)
     asked = campaign.ask()
@@ -304,6 +306,7 @@ def test_a_choice_that_a_later_record_contradicts_is_made_again():
     assert campaign.reason.startswith("no rival explains the records")
 
 
+@pytest.mark.science
 def test_a_campaign_ends_where_no_signal_is_safe():
     given = f"{LAG},initial_pitch=-0.69:0.69"  # beyond the level in the free motion
     campaign = ex.Campaign("aero2", {"J_p": "2%"}, rivals=[given], spread=0.3, coast=COAST)

@@ -39,6 +39,7 @@ def test_of_a_nearly_linear_response_the_gain_is_exact(narrow):
     assert narrow.few == 0
 
 
+@pytest.mark.science
 def test_samples_from_the_prior_give_wider_bounds_on_the_same_records(narrow):
     few = {**SHORT, "samples": 50}
     found = ex.information_gain("aero2", "chirp", prior=NARROW, from_prior=True, **few)

@@ -180,6 +180,7 @@ def test_what_is_not_allowed_is_one_sentence(options, words):
     assert words in str(error.value)
 
 
+@pytest.mark.science
 def test_run_folders_are_taken_as_results(tmp_path):
     record = ex.simulate("aero2", "chirp", steps=60, seed=1)
     result = ex.identify(record)

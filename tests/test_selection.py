@@ -94,6 +94,7 @@ def records():
     return [ex.simulate("aero2", seed=s, steps=80, options={"amplitude": 2.0}) for s in (1, 2)]
 
 
+@pytest.mark.science
 def test_results_of_several_runs_tell_as_much_as_their_records_together(records, tmp_path):
     results = [ex.identify(record) for record in records]
     results[1].save(tmp_path / "run")

@@ -47,7 +47,13 @@ from .options import (
     "--policy",
     metavar="NAME",
     help="Shipped, or a file; default the plant's policy for a spread by a factor, or its usual "
-    "one.",
+    "one. Without one, or with none, the first round plays a robust signal.",
+)
+@click.option(
+    "--steps",
+    type=WholeNumber(4),
+    metavar="N",
+    help="Samples of a round without a policy, default 50; the first has half as many.",
 )
 @click.option(
     "--out",
@@ -59,7 +65,7 @@ from .options import (
 @click.option(
     "--spread",
     type=SPREAD,
-    help="Spread of the parameters (0.3, factor:3); default that of the policy's training.",
+    help="Spread of the parameters (0.3, factor:3); default that of the policy's training, or 0.3.",
 )
 @click.option("--rounds", type=WholeNumber(1, 1000), default=10, show_default=True, help="At most.")
 @click.option(
@@ -73,7 +79,7 @@ from .options import (
     "--redesign/--no-redesign",
     default=True,
     help="Play signals redesigned for what is known, after the first round, where they need fewer "
-    "samples than the policy; not with --guard.",
+    "samples than the first one's; not with --guard.",
 )
 @click.option(
     "--rival",
@@ -117,8 +123,8 @@ def campaign(
 ) -> None:
     """Play rounds of experiments on PLANT until its parameters are known as asked.
 
-    A round plays the policy from rest and ends as soon as enough is known. Exit code 1 where
-    the campaign ends without every target.
+    A round plays a policy or a designed signal from rest and ends as soon as enough is known.
+    Exit code 1 where the campaign ends without every target.
     """
     from ..study.campaign import REACHED
     from ..study.campaign_on_rig import campaign as campaigned

@@ -1,11 +1,11 @@
 """Campaigns: rounds of experiments until the parameters are known as precisely as asked.
 
 Where several plants may be the true one, the first rounds play signals that tell them apart, until
-one is chosen. A round then plays a policy from rest, or, once there is an estimate, a signal
-redesigned for what is known, where that is better. It ends with its last sample, or as soon as the
-running estimate reaches every target and the free motion that would follow is predicted to be
-safe. After every round all records are identified together. The policy needs to know nothing of
-the plant but the spread that it was trained for.
+one is chosen. A round then plays from rest: a policy, or, where there is none, a signal that is
+safe for the whole spread; once there is an estimate, a signal redesigned for what is known, where
+that is better. It ends with its last sample, or as soon as the running estimate reaches every
+target and the free motion that would follow is predicted to be safe. After every round all records
+are identified together.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from ..description import (
     require_whole,
     wrong_type,
 )
-from ..environment import run_episodes
+from ..environment import prior_sd_of, run_episodes
 from ..estimation import Status
 from ..estimation.diagnosis import chi2_tail
 from ..estimation.identify import RecordLike, identify
@@ -50,9 +50,11 @@ from ..report.tables import html_table, text_table
 from ..rig.contract import Interval
 from ..rig.loop import COMPLETE
 from ..safety import critical_levels
+from ..training.design import design
+from ..training.redesign import Region
 from .discrimination import Discrimination, RivalLike, judged, rivals_from, with_experiment
 from .falsify import trained_in
-from .knowledge import region_of
+from .knowledge import region_of, unexplained
 from .monitor import Monitor
 from .next_experiment import COAST, REDESIGNED, NextExperiment, best_of, candidates
 from .quantities import (
@@ -79,11 +81,15 @@ if TYPE_CHECKING:
 REACHED = "every target is reached"
 WHOLE = (COMPLETE, REACHED)  # ends of rounds that count in the budget
 
-DISCRIMINATING = "signal for rivals"
+DISCRIMINATING, ROBUST = "signal for rivals", "robust"
+NO_POLICY = "none"  # instead of a policy's name
+
+DESIGNED = 50  # samples of a round without a policy, unless another number is given
 
 _SHORT = 20  # samples of a round that tells rivals apart
 _PADDED = 8  # rounds for which the fits of rivals are compiled
 _PLANTS = 32  # drawn to predict what a campaign reaches
+_FEWER = 8  # where a signal is redesigned for each of them
 
 
 @dataclass(frozen=True)
@@ -92,7 +98,7 @@ class Round:
 
     Attributes:
         num_samples: of the round.
-        played: the policy, a redesigned signal, or one that tells rivals apart.
+        played: the policy, a robust or redesigned signal, or one that tells rivals apart.
         ended: why, as a sentence.
         nearness: largest measured output over its critical level.
         known: of each parameter and target, the estimate from this and all earlier rounds with half
@@ -157,8 +163,9 @@ class Campaign:
         plant: as identification knows it: the declared one, or the rival that was chosen.
         discrimination: of the rivals, when they were last compared; None where there are none.
         targets: what is to be known, and how precisely.
-        policy: that is played in the first round.
-        redesign: whether the policy is compared with redesigned signals in later rounds.
+        policy: that is played in the first round; None for a robust signal.
+        steps: samples of a round; a robust signal has half as many.
+        redesign: whether signals are redesigned for later rounds.
         spread: of the parameters before the campaign.
         most_rounds: the budget.
         coast: samples of free motion after an end that must be safe.
@@ -170,7 +177,6 @@ class Campaign:
         interrupted: what interrupted `campaign`, such as a signal; empty if nothing did.
         prediction: what was expected before the first round, as a sentence; empty if that was not
             computed.
-        warnings: sentences about policy and plant.
     """
 
     def __init__(
@@ -179,6 +185,7 @@ class Campaign:
         target: TargetLike,
         *,
         policy: str | Path | Policy | None = None,
+        steps: int | None = None,
         spread: SpreadLike | None = None,
         rounds: int = 10,
         coast: int | None = None,
@@ -195,13 +202,16 @@ class Campaign:
                 predicted for an experiment from rest, `pitch@2:step.csv` after 2 s of the inputs
                 in a file, or of a signal by name.
             policy: to be played, its name or file; default the plant's shipped policy for a
-                spread by a factor, or its usual one.
-            spread: of the parameters; default that of the policy's training.
+                spread by a factor, or its usual one. "none", or a plant without one, begins with
+                a robust signal, which `design` makes safe for the spread.
+            steps: samples of a round without a policy, default 50; the first has half as many,
+                because little is known of the plant.
+            spread: of the parameters; default that of the policy's training, or 0.3.
             rounds: that are played at most.
             coast: samples after a round's end in which the plant must be safe; default that of the
                 policy's training, or 100.
             redesign: whether signals are redesigned for later rounds, and played where they reach
-                the targets with fewer samples than the policy; see `next_experiment`.
+                the targets with fewer samples than what was played first; see `next_experiment`.
             rivals: other plants of which one may be the true one, as for `discriminate`. Signals
                 tell them apart first, in rounds of 20 samples.
 
@@ -215,6 +225,10 @@ class Campaign:
         require_whole("rounds", rounds, 1, 1000)
         self.most_rounds = rounds
         self.policy = _policy(policy, description)
+        if steps is not None and self.policy is not None:
+            raise ValueError("steps are for rounds without a policy: a policy has its own")
+        self.steps = self.policy.layout.num_steps if self.policy else steps or DESIGNED
+        require_whole("steps", self.steps if steps is None else steps, 4)
         usual, _, usual_coast = trained_in(self.policy, self.plant)
         self.spread = Spread.of(usual if spread is None else spread)
         self.coast = coast if coast is not None else usual_coast or COAST
@@ -232,19 +246,33 @@ class Campaign:
             for own in self.discrimination.rival_plants:
                 for quantity in others_of(own, self.targets):
                     require_defined(quantity, own)
-        self.warnings = _warnings(self.policy, self.plant, self.spread)
         self.records: list[Record] = []
         self.rounds: list[Round] = []
         self.result: Identification | None = None
         self.next: NextExperiment | None = None
         self.reason, self.interrupted, self.prediction = "", "", ""
+        self._haste = 1.0
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Sentences about policy and plant, and where the plant does not explain the records."""
+        return *_about_policy(self.policy, self.plant, self.spread), *unexplained(self.result)
+
+    @cached_property
+    def opening(self) -> Policy | Replay:
+        """What the first round plays: the policy, or a robust signal, which takes a minute."""
+        if self.policy is not None:
+            return self.policy
+        steps, spread = self.steps // 2, self.spread.setting
+        return design(self.declared, steps=steps, spread=spread, coast=self.coast).excitation
 
     def ask(self) -> Policy | Replay | None:
         """What to play in the next round, from rest; None once the campaign has ended.
 
-        That is the policy; after the first estimate, a signal redesigned for what is known, where
-        that is better. No signal is redesigned where the plant does not explain the records.
-        While several rivals are possible, it is a signal that tells them apart.
+        That is the policy or a robust signal; after the first estimate, a signal redesigned for
+        what is known, where that is better. No signal is redesigned where the plant does not
+        explain the records. While several rivals are possible, it is a signal that tells them
+        apart.
         """
         if self.reason:
             return None
@@ -262,9 +290,9 @@ class Campaign:
         chosen = None if self.next is None else self.next.chosen
         is_other = self.plant.description.hash != self.declared.description.hash
         if self.next is not None and chosen is None and is_other:
-            self.reason = self.next.decision  # nothing is known of the policy on this plant
+            self.reason = self.next.decision  # the opening may be unsafe on this plant
             return None
-        return self.policy if chosen is None else chosen.excitation
+        return self.opening if chosen is None else chosen.excitation
 
     @property
     def is_undecided(self) -> bool:
@@ -277,8 +305,8 @@ class Campaign:
             return None
         region, known = region_of(self.plant, result, self.spread), self.known
         made = candidates(
-            self.plant, region, self.targets, ("policy", self.policy),
-            num_steps=self.policy.layout.num_steps, coast=self.coast, seed=len(self.rounds),
+            self.plant, region, self.targets, (self._opening_name, self.opening),
+            num_steps=self.steps, coast=self.coast, seed=len(self.rounds),
         )  # fmt: skip
         best = best_of(made, self.targets)
         return NextExperiment(self.plant, known, self.targets, tuple(made), best)
@@ -325,6 +353,8 @@ class Campaign:
         near = float(np.nanmax(sizes, initial=0.0))
         known = self.known
         shares = shares_of(self.targets, known)
+        if ended == REACHED:  # says the running estimate; the intervals of all records may be wider
+            self._haste = max(self._haste, *shares.values())
         if goes_on:
             self.reason = ""
         elif unsafe or near >= 1:
@@ -352,7 +382,6 @@ class Campaign:
         if self.is_undecided or self.discrimination.plant is not self.plant:
             self.result = None
         self.plant = self.discrimination.plant or self.plant
-        self.warnings = _warnings(self.policy, self.plant, self.spread)
         return self.discrimination.decision
 
     def _identify(self) -> str:
@@ -383,8 +412,16 @@ class Campaign:
             return DISCRIMINATING
         if self.next is not None and self.next.chosen is not None:
             return self.next.chosen.name
-        is_policy = self.result is None or "policy_hash" in record.metadata
-        return "policy" if is_policy or not self.redesign else REDESIGNED
+        first = self.records[0].inputs[:-1]
+        count = min(len(first), len(record.inputs) - 1)
+        is_opening = self.result is None or "policy_hash" in record.metadata or (
+            self.policy is None and np.array_equal(first[:count], record.inputs[:count])
+        )  # fmt: skip
+        return self._opening_name if is_opening or not self.redesign else REDESIGNED
+
+    @property
+    def _opening_name(self) -> str:
+        return ROBUST if self.policy is None else "policy"
 
     @property
     def known(self) -> dict[str, Interval]:
@@ -405,28 +442,51 @@ class Campaign:
 
     def monitor(self, waits: bool = False) -> Monitor:
         """A judge of the next round while it runs; see `Monitor`."""
-        steps = self.policy.layout.num_steps
-        return Monitor(self.plant, self.result, self.targets, steps, self.coast, waits)
+        room = 1 / self._haste
+        return Monitor(self.plant, self.result, self.targets, self.steps, self.coast, waits, room)
 
     @cached_property
     def expected(self) -> Expected:
-        """What the campaign will reach; computed once, which takes seconds."""
-        steps = self.policy.layout.num_steps
-        keys = jax.random.split(jax.random.key(0), _PLANTS)
-        excitation = PolicyExcitation.of(self.policy)
+        """What the campaign will reach; computed once, which takes seconds.
+
+        With a policy, every round plays it. Without one, the first plays the robust signal, and
+        all others what is redesigned for each plant after it.
+        """
+        opening, steps, count = self.opening, self.steps, _PLANTS
+        if isinstance(opening, Policy):
+            excitation = PolicyExcitation.of(opening)
+        else:
+            excitation, steps, count = opening, len(opening.inputs), _FEWER
+        keys = jax.random.split(jax.random.key(0), count)
         episodes = run_episodes(self.plant, excitation, steps, self.spread, keys)
+        first = later = episodes.trajectory.inputs
+        if self.redesign and self.policy is None:
+            later = jnp.stack([
+                self._redesigned(jax.tree.map(lambda x, i=i: x[i], episodes.params), first[i])
+                for i in range(count)
+            ])  # fmt: skip
         asked = [t.quantity for t in self.targets]
-        inputs = episodes.trajectory.inputs
-        outlook = _halves(self.plant, episodes.params, inputs, self.most_rounds, asked)
+        outlook = _halves(self.plant, episodes.params, first, later, self.most_rounds, asked)
         values, halves = map(np.asarray, outlook)
         shares = {
-            t.name: t.share(values[None, :, None, i], halves[..., i])
-            for i, t in enumerate(self.targets)
+            t.name: t.share(values[:, None, i], halves[..., i]) for i, t in enumerate(self.targets)
         }
-        worst = np.max(list(shares.values()), axis=0)  # round, plant, step
-        is_reached = worst.transpose(1, 0, 2).reshape(_PLANTS, -1) <= 1
-        first = np.where(is_reached.any(axis=1), is_reached.argmax(axis=1) + 1.0, np.inf)
-        return Expected(first, {name: float(np.nanmin(s[-1, :, -1])) for name, s in shares.items()})
+        is_reached = np.max(list(shares.values()), axis=0) <= 1  # plant, sample
+        samples = np.where(is_reached.any(axis=1), is_reached.argmax(axis=1) + 1.0, np.inf)
+        return Expected(samples, {name: float(np.nanmin(s[:, -1])) for name, s in shares.items()})
+
+    def _redesigned(
+        self, params: Params, first: Float[Array, "time input"]
+    ) -> Float[Array, "step input"]:
+        """What would be played on a plant after the first round; that again where nothing is."""
+        before = jnp.eye(len(params)) / prior_sd_of(self.spread) ** 2
+        gained = running_information(self.plant, params, first)[-1]
+        region = Region(jnp.stack(list(params)), before + gained)
+        made = candidates(
+            self.plant, region, self.targets, (self._opening_name, self.opening),
+            num_steps=self.steps, coast=self.coast,
+        )[-1]  # fmt: skip
+        return jnp.asarray(made.inputs if made.is_safe else np.resize(first, made.inputs.shape))
 
     def require_reachable(self) -> None:
         """Predicts what is reached; ValueError where no plant of the spread reaches the targets."""
@@ -437,7 +497,7 @@ class Campaign:
             best = target.half * share
             told = f"{100 * best:.2g} %" if target.is_relative else f"{best:.2g}"
             raise ValueError(
-                f"no experiment of {self.most_rounds} x {self.policy.layout.num_steps} samples "
+                f"no experiment of {self.most_rounds} x {self.steps} samples "
                 f"reaches {name} to {target}: at best {told}; ask for less, or for more "
                 "rounds"
             )
@@ -453,7 +513,8 @@ class Campaign:
         return {
             "plant": self.plant.description.name,
             "plant_hash": self.declared.description.hash,
-            "policy_hash": self.policy.hash,
+            "policy_hash": self.policy.hash if self.policy else "",
+            "steps": 0 if self.policy else self.steps,
             "targets": {t.name: str(t) for t in self.targets},
             "allowed": self._allowed(),
             "units": {q.name: q.unit for q in quantities_of(self.plant, self.targets)},
@@ -570,37 +631,50 @@ class Campaign:
 def _halves(
     plant: AbstractPlant,
     params: Params,
-    inputs: Float[Array, "plant time input"],
+    first: Float[Array, "plant time input"],
+    later: Float[Array, "plant step input"],
     rounds: int,
     quantities: Sequence[AbstractQuantity],
-) -> tuple[Float[Array, "plant quantity"], Float[Array, "round plant time quantity"]]:
-    """Values, and half of each interval after every sample of every round, if all were alike."""
+) -> tuple[Float[Array, "plant quantity"], Float[Array, "plant sample quantity"]]:
+    """Values, and half of each interval after every sample of all rounds.
 
-    def one(params: Params, inputs: Array) -> tuple[Array, Array]:
-        running = running_information(plant, params, inputs)
-        before = jnp.arange(rounds)[:, None, None, None] * running[-1][None, None]
+    Args:
+        plant: with its sensor.
+        params: of each plant.
+        first: inputs of the first round.
+        later: inputs of each other round.
+        rounds: of the campaign.
+        quantities: that are asked.
+    """
+
+    def one(params: Params, first: Array, later: Array) -> tuple[Array, Array]:
+        opened = running_information(plant, params, first)
+        each = running_information(plant, params, later)
+        before = opened[-1][None] + jnp.arange(rounds - 1)[:, None, None] * each[-1][None]
+        others = (before[:, None] + each[None]).reshape((rounds - 1) * len(each), *each.shape[1:])
         values, _ = slopes(quantities, plant, params)
-        return values, half_intervals(quantities, plant, params, before + running[None])
+        running = jnp.concatenate([opened, others])
+        return values, half_intervals(quantities, plant, params, running)
 
-    values, halves = jax.vmap(one)(params, inputs)
-    return values, jnp.swapaxes(halves, 0, 1)
+    return jax.vmap(one)(params, first, later)
 
 
-def _policy(given: str | Path | Policy | None, plant: PlantDescription) -> Policy:
-    """The policy to play; ValueError where it cannot be played on the plant."""
+def _policy(given: str | Path | Policy | None, plant: PlantDescription) -> Policy | None:
+    """The policy to play, if there is one; ValueError where it cannot be played on the plant."""
     if given is None:
         shipped = shipped_policies()
-        wide = f"{plant.name}-wide"
-        given = wide if wide in shipped else plant.name
-        if given not in shipped:
-            raise ValueError(f"there is no shipped policy for {plant.name!r}: give one (--policy)")
+        given = next((n for n in (f"{plant.name}-wide", plant.name) if n in shipped), NO_POLICY)
+    if isinstance(given, str) and given == NO_POLICY:
+        return None
     found = given if isinstance(given, Policy) else read_policy(given)
     mismatch(found, plant)
     return found
 
 
-def _warnings(policy: Policy, plant: AbstractPlant, spread: Spread) -> tuple[str, ...]:
+def _about_policy(policy: Policy | None, plant: AbstractPlant, spread: Spread) -> tuple[str, ...]:
     """What is to be known of a policy that is played on this plant, with this spread."""
+    if policy is None:
+        return ()
     about = mismatch(policy, plant.description)
     trained = Spread.of(trained_in(policy, plant)[0])
     told = [] if about is None else [about]

@@ -45,6 +45,7 @@ def campaign(
     *,
     out: str | Path,
     policy: str | Path | Policy | None = None,
+    steps: int | None = None,
     spread: SpreadLike | None = None,
     rounds: int = 10,
     coast: int | None = None,
@@ -75,7 +76,7 @@ def campaign(
         'every target is reached'
 
     Args:
-        plant: as for `Campaign`, and so are `target`, `policy`, `spread`, `rounds`,
+        plant: as for `Campaign`, and so are `target`, `policy`, `steps`, `spread`, `rounds`,
             `coast`, `redesign` and `rivals`.
         rig: a name, `FILE.fmu`, `FILE.json`, `path/to/file.py:ClassName` or a rig, as for `run`.
         out: folder of the campaign.
@@ -97,10 +98,12 @@ def campaign(
         TypeError: for an argument of another type.
     """
     made = Campaign(
-        plant, target, policy=policy, spread=spread, rounds=rounds, coast=coast,
+        plant, target, policy=policy, steps=steps, spread=spread, rounds=rounds, coast=coast,
         redesign=redesign and not guard,  # a guard knows its policy
         rivals=rivals,
     )  # fmt: skip
+    if guard and made.policy is None:
+        raise ValueError("a guard knows a policy: it does not go without one")
     if rivals and (guard or filter):
         raise ValueError("guard and filter know one plant: they do not go together with rivals")
     require_whole("seed", seed, 0, LARGEST_SEED)
@@ -127,7 +130,8 @@ def campaign(
                 "guard": guard}  # fmt: skip
     folder = _Folder.checked(root, made, settings, command)
     if not folder.has_rounds:
-        progress("predicting what can be reached", 0, rounds)
+        first = "designing the first signal, and " * (made.policy is None)
+        progress(f"{first}predicting what can be reached", 0, rounds)
         made.require_reachable()
     for sentence in made.warnings:
         on_warning(sentence)
@@ -230,7 +234,7 @@ class _Folder:
     ) -> _Folder:
         """A folder that is new, or of the same campaign; ValueError for anything else."""
         own = made.to_dict()
-        kept = ("plant_hash", "policy_hash", "spread", "coast", "redesign", "rivals")
+        kept = ("plant_hash", "policy_hash", "steps", "spread", "coast", "redesign", "rivals")
         settings = {**{name: own[name] for name in kept}, **asked}
         file = root / "campaign.json"
         if file.is_file() and (root / "round-01.csv").exists():

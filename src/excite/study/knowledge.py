@@ -129,19 +129,20 @@ def known_from(
     if result is not None and result.basis is not None:  # sampled as the records are
         own = result.basis.plant if plant is None else own.changed(dt=result.basis.plant.dt)
     region = region_of(own, result or before or {}, reach)
-    found = Knowledge(own, region, result, _warnings(result))
+    found = Knowledge(own, region, result, unexplained(result))
     _require_within(found, reach)
     return found
 
 
-def _warnings(result: Identification | None) -> tuple[str, ...]:
-    """Sentences, where the plant does not explain the records."""
+def unexplained(result: Identification | None) -> tuple[str, ...]:
+    """Sentences, where the plant does not explain the records of a result."""
     if result is None or result.basis is None:
         return ()
     sd = np.asarray(result.basis.plant.sensor.sd)
     residual = np.concatenate([part.computed["residual"] for part in result.fitted])
     size = float(np.nanmax(np.sqrt(np.nanmean((residual / sd[None]) ** 2, axis=0))))
-    why = "the plant may be wrong, and what is predicted too good"
+    cause = "".join(f" (likely cause: {suspect.name})" for suspect in result.suspects[:1])
+    why = f"the plant may be wrong, and what is predicted too good{cause}"
     if size > _LARGE:
         return (f"the residual is {size:.2g} times the declared noise: {why}",)
     return (f"the residual follows the input: {why}",) * (result.misfit_factor > 1)

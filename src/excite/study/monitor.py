@@ -44,6 +44,7 @@ class Monitor:
         num_steps: int,
         coast: int,
         waits: bool,
+        enough: float = 1.0,
     ) -> None:
         """Compiles the estimator; this takes seconds.
 
@@ -55,13 +56,14 @@ class Monitor:
             coast: samples of free motion after its end that must be safe.
             waits: whether a call waits for its estimate; otherwise it is computed beside the
                 experiment, and the judgement follows some samples later.
+            enough: largest share of the allowed intervals that ends the round.
         """
         own, estimator = plant, NLS()
         if before is not None:
             _, prior, _ = with_prior(plant, before, plant.nominal, {}, {})
             estimator = dataclasses.replace(estimator, prior=prior)
             own = with_nominal(plant, dict(before.params))
-        self._plant, self._targets = plant, targets
+        self._plant, self._targets, self._share = plant, targets, enough
         self._others = others_of(plant, targets)
         self._is_later, self._num_outputs = before is not None, len(plant.definition.outputs)
         self._live = LiveEstimate(own, num_steps, True, estimator, first=_FIRST, waits=waits)
@@ -87,7 +89,8 @@ class Monitor:
         The size of the noise is that of this round's residual. With earlier records it may be
         larger, so that a later round leaves room for one standard error of it.
         """
-        return 1 - 1 / math.sqrt(2 * count * self._num_outputs) if self._is_later else 1.0
+        room = 1 / math.sqrt(2 * count * self._num_outputs) if self._is_later else 0.0
+        return self._share * (1 - room)
 
     def _known(self, estimate: Estimate) -> dict[str, Interval]:
         """What is known of every parameter and target.

@@ -123,29 +123,30 @@ def candidates(
     plant: AbstractPlant,
     region: Region,
     targets: Sequence[Target],
-    policy: tuple[str, Policy] | None,
+    opening: tuple[str, Policy | Replay] | None,
     *,
     num_steps: int,
     coast: int,
     ahead: int = 1,
     seed: int = 0,
 ) -> list[Candidate]:
-    """What could be played next: the policy, and a signal redesigned for the region.
+    """What could be played next: a given excitation, and a signal redesigned for the region.
 
     Args:
         plant: with the sensor of the experiment.
         region: plants that are possible.
         targets: by parameter.
-        policy: its name and itself; None for none.
+        opening: name of a policy or a signal, and itself; None for none.
         num_steps: of the experiment.
         coast: samples of free motion after it that must be safe too.
         ahead: experiments for which the redesign looks ahead; the first of them is the candidate.
         seed: of its starts, and of the noise.
     """
     found, starts = [], first_signals(plant, ahead, num_steps, seed)
-    if policy is not None:
-        name, given = policy
-        length = min(num_steps, given.layout.num_steps)
+    if opening is not None:
+        name, given = opening
+        own = given.layout.num_steps if isinstance(given, Policy) else len(given.inputs)
+        length = min(num_steps, own)
         found.append(_candidate(plant, region, targets, name, given, length, coast, seed))
         inputs = jnp.asarray(np.resize(found[0].inputs, (num_steps, found[0].inputs.shape[1])))
         starts = jnp.concatenate([starts, jnp.broadcast_to(inputs, (1, *starts.shape[1:]))])
