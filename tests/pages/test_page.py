@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 if CHROMIUM is None and os.environ.get("EXCITE_BROWSER_TESTS") != "1":
     pytest.skip("no chromium on this computer (apt-get install chromium)", allow_module_level=True)
 
+from axe_playwright_python.sync_playwright import Axe  # noqa: E402
 from playwright.sync_api import Browser, Page, expect, sync_playwright  # noqa: E402
 
 ARGUMENTS = [
@@ -69,6 +71,9 @@ def address(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
     campaign.mkdir()
     about = {"kind": "excite campaign", "plant": Aero2().description.to_dict()}
     write_json(campaign / "run.json", about)
+    damaged = folder / "damaged"
+    damaged.mkdir()
+    (damaged / "run.json").write_text('{"kind": "\\ud800", "plant": {"name": NaN}}')
     run = folder / "a_study"
     (run / "seeds" / "agent" / "0").mkdir(parents=True)
     write_json(run / "run.json", {"kind": "excite study", "plant": {"name": "aero2"}})
@@ -110,6 +115,8 @@ def page(chromium: Browser) -> Iterator[Page]:
 def ready(page: Page, address: str, part: str = "experiment") -> Page:
     page.goto(f"{address}/#{part}")
     expect(page.locator(f"#{part} .primary")).to_be_enabled(timeout=WAIT)
+    if part == "experiment":
+        page.get_by_text("Advanced").click()
     return page
 
 
@@ -203,7 +210,7 @@ def test_a_run_is_stopped(address: str, page: Page):
 
 def test_a_value_that_is_not_allowed_is_one_sentence(address: str, page: Page):
     ready(page, address)
-    page.evaluate("document.getElementById('signals').append(document.createElement('canvas'))")
+    expect(page.locator("#signals canvas")).to_have_count(2)  # what was prepared
     page.locator("#params input").first.fill("-1")
     page.get_by_role("button", name="Run", exact=True).click()
     expect(status(page)).to_contain_text("is not allowed", timeout=WAIT)
@@ -217,6 +224,8 @@ def test_it_is_used_by_the_keyboard_alone(address: str, page: Page):
     names = []
     for _ in range(60):
         page.keyboard.press("Tab")
+        if page.evaluate("document.activeElement.textContent") == "Advanced":
+            page.keyboard.press("Enter")
         element = "document.activeElement"
         names.append(page.evaluate(f"{element}.id || {element}.textContent.trim()"))
         assert page.evaluate(f"{element} === document.body || {element}.matches(':focus-visible')")
@@ -241,7 +250,7 @@ def test_the_header_is_skipped_to_the_part_that_is_shown(address: str, page: Pag
     expect(page).to_have_url(f"{address}/#main")
     expect(page.locator("#runs")).to_be_visible()
     page.keyboard.press("Tab")
-    expect(page.get_by_role("button", name="a_study")).to_be_focused()
+    expect(page.get_by_label("Name, kind, plant or date")).to_be_focused()
 
 
 def test_columns_are_chosen_before_anything_is_identified(address: str, page: Page):
@@ -333,6 +342,187 @@ def test_a_bad_file_is_one_sentence(
     expect(page.get_by_role("button", name="Identify")).to_be_disabled()
 
 
+PLOT = "document.querySelectorAll('{}')[{}].plot"
+
+
+def shown_range(page: Page, which: str, i: int) -> list[float]:
+    """The part of the time axis that a plot shows."""
+    u = PLOT.format(which, i) + ".u.scales.x"
+    return page.evaluate(f"[{u}.min, {u}.max]")
+
+
+def prepared(page: Page, address: str) -> Page:
+    """The page with its prepared result, in the middle of the screen."""
+    page.goto(address)
+    expect(status(page)).to_contain_text("What is shown was prepared", timeout=WAIT)
+    return page
+
+
+def test_a_prepared_result_is_drawn_before_anything_is_run(address: str, page: Page):
+    prepared(page, address)
+    rows = page.locator("#comparison tbody tr")
+    assert [rows.nth(i).locator("th").inner_text() for i in range(3)] == ["chirp", "prbs", "aero2"]
+    # The chirp stays below the warning level of 30 degrees, the policy goes to 37.7.
+    assert [rows.nth(i).locator("td").first.inner_text() for i in (0, 2)] == ["safe", "warning"]
+    assert page.locator("#overlays figure").count() == 6
+    command = page.locator("#again pre").text_content()
+    assert command is not None
+    assert command.startswith("excite simulate aero2 --excitation chirp")
+    require_no_sideways_scroll(page)
+
+
+def test_plots_share_a_cross_hair_and_a_zoom(address: str, page: Page):
+    prepared(page, address)
+    first, chart = page.locator("#signals .chart").first, page.locator("#signals .chart").nth(1)
+    box = chart.bounding_box()
+    assert box is not None
+    left, right, y = box["x"] + 200, box["x"] + 400, box["y"] + 80
+    page.mouse.move(left, y)
+    for i in range(2):
+        expect(page.locator("#signals .read").nth(i)).to_have_text(re.compile(r"^[\d.]+ s: "))
+    page.mouse.down()
+    page.mouse.move(right, y, steps=4)
+    page.mouse.up()
+    zoomed = shown_range(page, "#signals .chart", 1)
+    assert 0 < zoomed[0] < zoomed[1] < 50
+    for which, i in (("#signals .chart", 0), ("#overlays .chart", 2), ("#estimates .chart", 0)):
+        assert shown_range(page, which, i) == pytest.approx(zoomed)
+    chart.dblclick()
+    assert shown_range(page, "#overlays .chart", 0) == [0, 50]
+    # The same by the keyboard.
+    first.focus()
+    for key in ("Home", "ArrowRight", "Shift+ArrowRight"):
+        page.keyboard.press(key)
+    expect(page.locator("#signals .read").first).to_have_text(re.compile(r"^1\.1 s: "))
+    page.keyboard.press("+")
+    assert shown_range(page, "#signals .chart", 1) == pytest.approx([0, 25])
+    page.keyboard.press("-")
+    assert shown_range(page, "#signals .chart", 1) == [0, 50]
+    page.keyboard.press("+")
+    page.keyboard.press("0")
+    assert shown_range(page, "#signals .chart", 0) == [0, 50]
+
+
+def test_a_line_is_hidden_and_a_plot_is_saved(address: str, page: Page, tmp_path: Path):
+    prepared(page, address)
+    figure = page.locator("#overlays figure").nth(1)
+    toggle = figure.get_by_role("button", name="prbs")
+    toggle.focus()
+    page.keyboard.press("Enter")
+    expect(toggle).to_have_attribute("aria-pressed", "false")
+    expect(toggle).to_be_focused()
+    made = {}
+    for kind in ("PNG", "SVG", "CSV"):
+        with page.expect_download() as waiting:
+            figure.get_by_role("button", name=kind).click()
+        assert waiting.value.suggested_filename == f"pitch_deg.{kind.lower()}"
+        waiting.value.save_as(tmp_path / kind)
+        made[kind] = (tmp_path / kind).read_bytes()
+    assert made["PNG"].startswith(b"\x89PNG")
+    drawn = ElementTree.fromstring(made["SVG"])
+    assert len(drawn.findall(".//{*}polyline[@stroke-width='1.6']")) == 2
+    header, *rows = made["CSV"].decode().splitlines()
+    assert (header, len(rows)) == ("time,chirp,aero2", 501)
+    expected = np.degrees(ex.simulate("aero2", "chirp", noise={"pitch": 1e-12}).outputs[:, 0])
+    found = [float(row.split(",")[1]) for row in rows]
+    np.testing.assert_allclose(found, expected, atol=2e-3)  # five digits are kept
+
+
+def test_an_experiment_is_paused_and_played_again(address: str, page: Page):
+    ready(page, address)
+    page.get_by_label("Played in").select_option("5")
+    page.get_by_role("button", name="Run", exact=True).click()
+    expect(status(page)).to_have_text(re.compile("^Running"), timeout=WAIT)
+    page.get_by_role("button", name="Pause").click()
+    count = PLOT.format("#signals .chart", 1) + ".what.lines[0].x.length"
+    paused = page.evaluate(count)
+    assert 0 < paused < 501
+    expect(status(page)).to_have_text("Done.", timeout=WAIT)
+    assert page.evaluate(count) == paused
+    slider = page.get_by_label("Time that is shown")
+    slider.fill("100")
+    assert page.evaluate(count) == 100
+    expect(page.locator("#player output")).to_have_text("9.90 s")
+    page.get_by_role("button", name="Play").click()
+    expect(page.locator("#player output")).to_have_text("50.0 s", timeout=WAIT)
+    expect(page.get_by_role("button", name="Play")).to_be_visible()
+
+
+def test_the_time_at_which_a_level_is_passed_is_told(address: str, page: Page):
+    ready(page, address)
+    page.locator("#amplitude").fill("24")
+    page.get_by_label("Played in").select_option("0")
+    for label in ("First", "Second"):
+        page.get_by_label(label, exact=True).select_option("chirp")  # nothing to compare with
+    page.get_by_role("button", name="Run", exact=True).click()
+    expect(status(page)).to_have_text("Done.", timeout=WAIT)
+    loud = ex.simulate("aero2", "chirp", options={"amplitude": 24.0})
+    level = Aero2().description.outputs[0].critical_level
+    time = loud.time[np.argmax(np.abs(loud.outputs[:, 0]) >= level)]
+    told = f"critical level passed at {time:.3g}"
+    expect(page.locator("#signals figcaption").nth(1)).to_contain_text(told)
+    expect(page.locator("#overlays figcaption").nth(1)).to_contain_text(f"chirp: {told}")
+    expect(page.locator("#comparison td").first).to_have_text("violation")
+
+
+def test_a_file_is_previewed_and_its_units_are_taken_from_the_names(address: str, page: Page):
+    page.goto(f"{address}/#record")
+    expect(page.locator("#record-plant option").first).to_be_attached(timeout=WAIT)
+    record = ex.simulate("aero2", "chirp", steps=200)
+    columns = 1000 * record.time, record.inputs[:, 0], np.degrees(record.outputs[:, 0])
+    rows = "".join(f"{t:.9g},{u:.9g},{y:.9g}\n" for t, u, y in zip(*columns, strict=True))
+    content = ("t [ms],voltage (V),pitch (°)\n" + rows).encode()
+    page.locator("#file").set_input_files({"name": "a.csv", "mimeType": "", "buffer": content})
+    expect(page.locator("#first-rows tbody tr")).to_have_count(5, timeout=WAIT)
+    expect(page.locator("#columns figure")).to_have_count(3)
+    for name, unit in (("time", "ms"), ("voltage", "V"), ("pitch", "°")):
+        expect(page.locator(f"#unit-{name}")).to_have_value(unit)
+    page.get_by_role("button", name="Identify").click()
+    expect(status(page, "record")).to_have_text("Done: successful.", timeout=WAIT)
+    shown = page.locator("#identified tbody td").first.inner_text()
+    assert float(shown) == pytest.approx(ex.identify(record).params.J_p, rel=1e-3)
+    command = page.locator("#record-again pre").text_content()
+    assert command is not None
+    assert "--unit 'time=ms,pitch=°'" in command
+    page.locator("#record-again summary").click()
+    page.context.grant_permissions(["clipboard-read", "clipboard-write"])
+    page.get_by_role("button", name="Copy").click()
+    expect(page.locator("#record-again [role=status]")).to_have_text("Copied.")
+    assert page.evaluate("navigator.clipboard.readText()") == command
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [1440, 1024, 390])
+def test_nothing_hinders_people_who_do_not_see_or_point(
+    scheme: Any, width: int, address: str, page: Page
+):
+    page.emulate_media(color_scheme=scheme)
+    page.set_viewport_size({"width": width, "height": 900})
+    prepared(page, address)
+    for part in ("experiment", "record", "runs/a_study", "training"):
+        page.evaluate(f"location.hash = {part!r}")
+        expect(page.locator(f"#{part.partition('/')[0]}")).to_be_visible()
+        if "/" in part:
+            expect(page.locator("#run-view canvas")).to_have_count(3)
+        found = Axe().run(page).response["violations"]
+        assert [(v["id"], v["nodes"][0]["html"]) for v in found] == []
+
+
+def test_a_run_has_an_address_and_is_found_by_words(address: str, page: Page):
+    page.goto(f"{address}/#runs/a_study")
+    expect(page.locator("#run-view td").first).to_have_text("1")
+    names = page.locator("#run-list button")
+    expect(names).to_have_count(3)  # one damaged run hides no other
+    page.get_by_label("Name, kind, plant or date").fill("campaign aero2")
+    expect(names).to_have_count(1)
+    names.first.click()
+    expect(page).to_have_url(f"{address}/#runs/the_campaign")
+    page.go_back()
+    expect(page.locator("#run-view td").first).to_have_text("1")
+    page.goto(f"{address}/#runs/nothing")
+    expect(status(page, "runs")).to_have_text("The run folder has no run nothing.")
+
+
 def test_runs_are_looked_at(address: str, page: Page):
     page.goto(f"{address}/#runs")
     page.get_by_role("button", name="a_study").click()
@@ -365,7 +555,7 @@ def test_a_training_is_started_and_stopped(address: str, page: Page):
     expect(card.locator("code")).to_contain_text("excite train aero2 --objective D")
     expect(card.get_by_role("status")).to_have_text("training", timeout=3 * WAIT)
     expect(card.locator("canvas")).to_have_count(5)  # what the curve is drawn on
-    expect(card.locator("figcaption").nth(2)).to_have_text(re.compile(r"^bound of Jp %[\d.]+$"))
+    expect(card.locator("figcaption").nth(2)).to_have_text(re.compile(r"^bound of Jp %[\d.]+PNG"))
     card.get_by_role("button", name="Stop").click()
     expect(card.get_by_role("status")).to_contain_text("stopped", timeout=WAIT)
     require_no_sideways_scroll(page)

@@ -33,6 +33,7 @@ from served import EXPERIMENT, MAX_GAP, TRIES, Told, browser, served, streamed
 from starlette.requests import Request
 from starlette.testclient import TestClient
 
+import excite as ex
 from excite.files import write_json
 from excite.plant import Aero2
 from excite.record import READ_ENDINGS
@@ -40,6 +41,7 @@ from excite.record.bags import BAG_ENDINGS
 from excite.report.html import report_html
 from excite.study.objectives import OBJECTIVES
 from excite.web import application
+from excite.web.first import FILE, events
 from excite.web.places import _file_name, _receive
 from excite.web.requests import MAX_UPLOAD, RefusedError
 from excite.web.runs import found
@@ -109,6 +111,33 @@ def printed(*words: str, folder: Path) -> dict[str, Any]:
 
 
 # -------------------------------------------------------------------------------- numbers
+
+
+def test_what_the_page_shows_first_is_what_its_workers_compute():
+    kept, now = json.loads(FILE.read_text()), events()
+    assert [event["kind"] for event in kept] == [event["kind"] for event in now]
+    assert [event["kind"] for event in kept].count("other") == 2
+    for before, after in zip(kept, now, strict=True):
+        if "traces" not in after:
+            continue
+        assert before["row"]["is_violation"] == after["row"]["is_violation"]
+        for name in ("time", "inputs", "outputs", "log_det"):  # None becomes NaN
+            old, new = (np.array(e["traces"][name], float) for e in (before, after))
+            np.testing.assert_allclose(old, new, rtol=1e-3, atol=1e-6)
+
+
+def test_traces_are_the_experiment_and_its_information(told: Told):
+    result = told.of("result")[0]
+    record = ex.simulate(
+        "aero2", "chirp", options={"amplitude": 7.2}, params={"J_p": 0.025}, seed=3
+    )
+    np.testing.assert_allclose(result["traces"]["inputs"], record.inputs[:-1], rtol=1e-12)
+    assert result["traces"]["log_det"][-1] == result["row"]["log_det_information"]
+    assert result["traces"]["log_det"][0] is None  # one sample does not tell three parameters
+    for name, p in result["row"]["params"].items():
+        last = result["traces"]["bound_percent"][name][-1]
+        assert last == pytest.approx(p["cramer_rao_percent"], rel=1e-12)
+    assert [len(event["traces"]["outputs"]) for event in told.of("other")] == [501, 501]
 
 
 def test_numbers_are_those_of_the_command_line(told: Told, tmp_path: Path):

@@ -25,7 +25,7 @@ async def answered(
     """What workers would say, at once; identifications with a column "bad" fail."""
     del workers, urgent
     if target == "columns":
-        yield {"kind": "columns", "columns": {"time": 2}}
+        yield {"kind": "columns", "columns": {"time": 2}, "previews": {}}
     elif target == "reported":
         if not all(Path(folder).is_dir() for folder in arguments["folders"]):
             yield {"kind": "failed", "sentence": f"{arguments['folders'][0]}: no such folder"}

@@ -43,7 +43,7 @@ def unit_factor(name: str, word: str, unit: str) -> float:
     """
     if word == unit:
         return 1.0
-    table = next((table for table in _TABLES if unit in table), {unit: 1.0})
+    table = _table_of(unit)
     if word not in table:
         allowed = ", ".join(known or "1" for known in table)
         raise ValueError(
@@ -52,3 +52,13 @@ def unit_factor(name: str, word: str, unit: str) -> float:
             f"factor with --scale {name}=FACTOR)"
         )
     return table[word] / table[unit]
+
+
+def known_units(unit: str) -> list[str]:
+    """The units of the same quantity, this one first."""
+    return [unit, *(word for word in _table_of(unit) if word != unit)]
+
+
+def _table_of(unit: str) -> dict[str, float]:
+    """The factors of the units of a quantity."""
+    return next((table for table in _TABLES if unit in table), {unit: 1.0})

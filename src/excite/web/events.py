@@ -34,6 +34,7 @@ class IdentificationRequest(TypedDict):
     initial_state: str
     columns: dict[str, str]
     scales: Numbers
+    units: dict[str, str]
 
 
 class StartedEvent(TypedDict):
@@ -111,11 +112,27 @@ class Row(TypedDict):
     log_det_information: float
 
 
+class Traces(TypedDict):
+    """Signals of an experiment, and what it tells over time.
+
+    `bound_percent` is the Cramér-Rao bound of each parameter, one standard deviation, in percent
+    of the true value; it and `log_det` have one number after each input.
+    """
+
+    time: list[float]
+    inputs: Rows
+    outputs: Rows
+    log_det: list[float]
+    bound_percent: dict[str, list[float]]
+
+
 class Concluded(TypedDict):
     """Results of the requested experiment; `result` names its files."""
 
     kind: Literal["result"]
     row: Row
+    traces: Traces
+    command: str
     identification: dict[str, object] | None
     result: NotRequired[str]
 
@@ -125,6 +142,7 @@ class Compared(TypedDict):
 
     kind: Literal["other"]
     row: Row
+    traces: Traces
 
 
 class LeftOut(TypedDict):
@@ -135,17 +153,30 @@ class LeftOut(TypedDict):
     sentence: str
 
 
+class Preview(TypedDict):
+    """A column of an uploaded file: its first cells, and numbers for a small plot.
+
+    `values` are those of the rows `index`; empty for a column of texts.
+    """
+
+    first: list[str]
+    index: list[int]
+    values: list[float]
+
+
 class Columns(TypedDict):
-    """Columns of an uploaded file, and how many samples each has."""
+    """Columns of an uploaded file, how many samples each has, and what is in them."""
 
     kind: Literal["columns"]
     columns: dict[str, int]
+    previews: dict[str, Preview]
 
 
 class Identified(TypedDict):
     """Parameters of an uploaded record, and the samples of it that a screen can show."""
 
     kind: Literal["identified"]
+    command: str
     plant: dict[str, object]
     identification: dict[str, object]
     time: list[float]

@@ -29,6 +29,7 @@ from ..description import (
     Parameter,
     PlantDescription,
     display_unit,
+    names_of,
     unknown,
 )
 from ..estimation import NLS, Experiments, Status, stack_experiments
@@ -49,17 +50,21 @@ from ..plant import AbstractPlant
 from ..plant.catalogue import PLANTS, plant_named
 from ..policy import Policy, mismatch, read_policy, shipped_policies
 from ..record import column_lengths
+from ..record.bags import is_bag
 from ..record.figure import kept_samples
+from ..record.formats import columns_in
+from ..record.units import known_units
 from ..report.html import report_html
 from ..safety import critical_levels, is_violation, max_abs_output
 from ..simulation import Experiment, Trajectory
-from .events import ExperimentRequest, IdentificationRequest, ParameterRow, Row
+from .events import ExperimentRequest, IdentificationRequest, ParameterRow, Preview, Row, Traces
 from .events import JobEvent as Event
 
 NUM_ESTIMATES = 20
 _FIRST = 40  # samples before the first estimate
 _RECORD = "record.csv"  # name of a simulated record
-_MAX_POINTS = 2000  # more cannot be seen on a screen
+_MAX_POINTS = 200_000  # of a record on the page; longer ones show the extremes of each section
+_MAX_PREVIEW, _FIRST_ROWS = 400, 5  # points of a column's plot, and its rows in the table
 _MAX_COLUMNS, _MAX_NAME = 500, 200  # of an uploaded file, and characters of a column's name
 
 
@@ -92,16 +97,19 @@ def catalogue(plants: Mapping[str, str]) -> Iterator[Event]:
     }
 
 
+DEFAULT: ExperimentRequest = {
+    "plant": "aero2", "excitation": "chirp",
+    "amplitude": PLANTS["aero2"]().definition.inputs[0].amplitude,
+    "noise": {}, "params": {}, "steps": 500, "seed": 0, "others": ["prbs", "aero2"],
+}  # fmt: skip
+"""What the page asks for, if nothing is changed."""
+
+
 def warm_up() -> Iterator[Event]:
     """Compiles the default experiment, so that a worker's first run starts fast."""
-    plant = PLANTS["aero2"]().definition
-    asked: ExperimentRequest = {
-        "plant": plant.name, "excitation": "chirp", "amplitude": plant.inputs[0].amplitude,
-        "noise": {}, "params": {}, "steps": 500, "seed": 0, "others": ["prbs", plant.name],
-    }  # fmt: skip
-    yield from episode(asked)
+    yield from episode(DEFAULT)
     with tempfile.TemporaryDirectory() as folder:
-        yield from followed(asked, f"{folder}/run")
+        yield from followed(DEFAULT, f"{folder}/run")
 
 
 def _fits(policy: Policy, description: PlantDescription) -> bool:
@@ -117,7 +125,8 @@ def _shown(description: PlantDescription) -> dict[str, object]:
     data = description.to_dict()
     for part in (*data["inputs"], *data["outputs"]):
         part["shown_unit"], part["factor"] = display_unit(part["unit"])
-    return data
+        part["units"] = known_units(part["unit"])
+    return {**data, "units_of_time": known_units("s")}
 
 
 # --------------------------------------------------------------------------- experiments
@@ -184,10 +193,14 @@ def followed(asked: ExperimentRequest, folder: str) -> Iterator[Event]:
     information = running_information(own.plant, own.params, run.inputs)
     yield from _estimates(plant, own, run, information)
     row, result = _outcome(plant, own, run, information[-1])
+    command = _experiment_again(asked)
     if result is not None:
-        result.save(folder, command=_experiment_again(asked))
+        result.save(folder, command=command)
     identification = None if result is None else result.to_dict()
-    yield {"kind": "result", "row": row, "identification": identification}
+    yield {
+        "kind": "result", "row": row, "traces": _traces(own, run, information),
+        "command": command, "identification": identification,
+    }  # fmt: skip
     for name in asked["others"]:
         try:
             other = _experiment(asked, name)
@@ -195,8 +208,9 @@ def followed(asked: ExperimentRequest, folder: str) -> Iterator[Event]:
         except ValueError as error:  # the requested experiment is complete without it
             yield {"kind": "left_out", "excitation": name, "sentence": str(error)}
             continue
-        its = running_information(other.plant, other.params, its_run.inputs)[-1]
-        yield {"kind": "other", "row": _outcome(plant, other, its_run, its)[0]}
+        its = running_information(other.plant, other.params, its_run.inputs)
+        row, traces = _outcome(plant, other, its_run, its[-1])[0], _traces(other, its_run, its)
+        yield {"kind": "other", "row": row, "traces": traces}
 
 
 def _estimates(
@@ -241,7 +255,7 @@ def _identification_again(asked: IdentificationRequest, name: str) -> str:
         "excite", "identify", f"./{name}" if name[0] == "-" else name,
         "--plant", asked["plant"], "--estimator", asked["estimator"],
         "--initial-state", asked["initial_state"], *_given("--column", asked["columns"]),
-        *_given("--scale", asked["scales"]), "--out", "run",
+        *_given("--scale", asked["scales"]), *_given("--unit", asked["units"]), "--out", "run",
     ]  # fmt: skip
     return shlex.join(words)
 
@@ -296,6 +310,22 @@ def _outcome(
     }, result
 
 
+def _traces(own: Experiment, run: Trajectory, information: Array) -> Traces:
+    """Signals without noise, and what is known after each sample."""
+    params = zip(own.plant.definition.parameters, map(float, own.params), strict=True)
+    per = np.array([abs(true) or p.scale for p, true in params])
+    bounds = np.asarray(jax.vmap(cramer_rao_bound)(information))
+    percent = 100 * bounds * np.asarray(relative_size(own.plant, own.params)) / per
+    names = names_of(own.plant.definition.parameters)
+    return {
+        "time": run.time.tolist(),
+        "inputs": run.inputs.tolist(),
+        "outputs": run.outputs.tolist(),
+        "log_det": jax.vmap(d_optimality)(information).tolist(),
+        "bound_percent": dict(zip(names, percent.T.tolist(), strict=True)),
+    }
+
+
 def _by_name(parts: Sequence[Parameter | Output], values: Iterable[ArrayLike]) -> dict[str, float]:
     return {part.name: float(np.asarray(v)) for part, v in zip(parts, values, strict=True)}
 
@@ -304,9 +334,11 @@ def _by_name(parts: Sequence[Parameter | Output], values: Iterable[ArrayLike]) -
 
 
 def columns(folder: str, name: str) -> Iterator[Event]:
-    """The columns of an uploaded file, and how many samples each has."""
+    """The columns of an uploaded file, and how many samples each has; no preview of a bag."""
     with contextlib.chdir(folder):  # so that messages have the file's name without its folder
-        counts = column_lengths(Path(name))
+        path = Path(name)
+        cells = {} if is_bag(path) else columns_in(path)
+        counts = {n: len(own) for n, own in cells.items()} if cells else column_lengths(path)
     if not counts:
         raise ValueError(f"{name} has no column of numbers")
     if len(counts) > _MAX_COLUMNS or max(map(len, counts)) > _MAX_NAME:
@@ -314,7 +346,21 @@ def columns(folder: str, name: str) -> Iterator[Event]:
             f"{name} has {len(counts)} columns, the longest name has {max(map(len, counts))} "
             f"characters; at most {_MAX_COLUMNS} columns of {_MAX_NAME} characters are taken"
         )
-    yield {"kind": "columns", "columns": counts}
+    yield {"kind": "columns", "columns": counts, "previews": _previews(cells)}
+
+
+def _previews(columns: Mapping[str, np.ndarray]) -> dict[str, Preview]:
+    """The first cells of each column, and what its plot shows."""
+    found: dict[str, Preview] = {}
+    for name, cells in columns.items():
+        try:
+            values = cells.astype(float)
+        except (TypeError, ValueError):
+            values = np.zeros(0)
+        kept = kept_samples([values], _MAX_PREVIEW) if len(values) else np.zeros(0, int)
+        first = [str(cell)[:_MAX_NAME] for cell in cells[:_FIRST_ROWS]]
+        found[name] = {"first": first, "index": kept.tolist(), "values": values[kept].tolist()}
+    return found
 
 
 def identified(
@@ -329,14 +375,17 @@ def identified(
             initial_state=cast(InitialState, asked["initial_state"]),  # checked there
             columns=asked["columns"],
             scales=asked["scales"],
+            units=asked["units"],
         )
-    result.save(folder, command=_identification_again(asked, name))
+    command = _identification_again(asked, name)
+    result.save(folder, command=command)
     fitted = result.fitted[0]
     record = fitted.record
     signals = [*record.inputs.T, *record.outputs.T, *fitted.simulated.T]
     kept = kept_samples(signals, _MAX_POINTS)
     yield {
         "kind": "identified",
+        "command": command,
         "plant": _shown(result.plant),
         "identification": result.to_dict(),
         "time": record.time[kept].tolist(),

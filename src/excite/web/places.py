@@ -46,8 +46,9 @@ def routes(workers: Workers, run_of: Callable[[Request], Path]) -> list[Route]:
                 place.is_done = True
         finally:
             session.end(job)
-        columns = told["columns"] if told["kind"] == "columns" else {}
-        return JSONResponse({"upload": name, "file": file, "columns": columns})
+        columns = told if told["kind"] == "columns" else {"columns": {}, "previews": {}}
+        found = {"columns": columns["columns"], "previews": columns["previews"]}
+        return JSONResponse({"upload": name, "file": file, **found})
 
     def file(request: Request) -> FileResponse:
         asked = request.path_params

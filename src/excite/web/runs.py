@@ -11,6 +11,7 @@ import json
 import math
 import os
 from collections.abc import Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +64,8 @@ def found(folder: Path) -> dict[str, Path]:
     for place, folders, files in os.walk(folder, followlinks=False):
         path = Path(place)
         name = path.relative_to(folder).as_posix()
-        if "run.json" in files and len(runs) < _MAX_RUNS:
+        is_text = name.isprintable()  # bytes that are no text come as lone surrogates
+        if "run.json" in files and is_text and len(runs) < _MAX_RUNS:
             runs[name] = path
             folders.clear()
         folders[:] = [f for f in sorted(folders) if f[0] != "." and not (path / f).is_symlink()]
@@ -116,6 +118,7 @@ def _json(run: Path, name: str) -> dict[str, object]:
     """Content of a JSON file of a run; empty where there is none."""
     try:
         content = json.loads(_text(run, name))
+        json.dumps(content, ensure_ascii=False, allow_nan=False).encode()  # as it will be sent
     except (ValueError, RecursionError):
         return {}
     return content if isinstance(content, dict) else {}
@@ -130,9 +133,18 @@ def _summary(name: str, run: Path) -> dict[str, object]:
         "plant": str(plant.get("name", "")) if isinstance(plant, dict) else "",
         "command": without_folders(str(marker.get("command") or "")),
         "title": str(study.get("title") or study.get("name") or ""),
+        "changed": _changed(run),
         "is_finished": bool(_json(run, "campaign.json").get("reason"))
         or any(_is_inside(run / f, run) for f in ("table.json", "estimate.json")),
     }
+
+
+def _changed(run: Path) -> str:
+    """When the newest file of a run was written, in UTC; empty where there is none."""
+    times = [path.lstat().st_mtime for path in run.iterdir()]
+    if not times:
+        return ""
+    return datetime.fromtimestamp(max(times), UTC).isoformat(timespec="seconds")
 
 
 def _content(run: Path) -> dict[str, object]:

@@ -107,6 +107,7 @@ def _identification(asked: Asked, plants: Mapping[str, str]) -> IdentificationRe
         "initial_state": word(asked, "initial_state"),
         "columns": texts(asked, "columns"),
         "scales": numbers(asked, "scales"),
+        "units": texts(asked, "units"),
     }
 
 

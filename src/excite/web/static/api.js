@@ -113,19 +113,35 @@ export class Task {
   }
 }
 
+/** A command for a terminal, and a button that copies it. */
+export function command(text) {
+  const said = el("span", { role: "status", class: "hint" });
+  const copy = async () => {
+    try { await navigator.clipboard.writeText(text); said.textContent = "Copied."; }
+    catch { said.textContent = "The browser does not allow it: select the text."; }
+  };
+  return el("details", {}, el("summary", {}, "The same in a terminal"), el("pre", { tabindex: "0" }, text),
+    el("p", { class: "row" }, el("button", { type: "button", click: copy }, "Copy"), said));
+}
+
 /** A link to a file; where there is none, the page says why instead of saving the answer. */
 export function download(address, text) {
   const name = (new URLSearchParams(address.split("?")[1]).get("file") ?? address.split("?")[0]).split("/").at(-1);
   return el("a", { href: address, download: name, click: (event) => { event.preventDefault(); save(event.currentTarget); } }, text);
 }
 
+/** Saves what the page has made. */
+export function keep(name, blob) {
+  const file = URL.createObjectURL(blob);
+  el("a", { href: file, download: name }).click();
+  setTimeout(() => URL.revokeObjectURL(file), 60_000);
+}
+
 async function save(link) {
   const section = link.closest("main > section");
   link.setAttribute("aria-busy", "true");
   try {
-    const file = URL.createObjectURL(await (await answered(link.href)).blob());
-    el("a", { href: file, download: link.download }).click();
-    setTimeout(() => URL.revokeObjectURL(file), 60_000);
+    keep(link.download, await (await answered(link.href)).blob());
   } catch (error) {
     say(section, error.message, true);
   } finally {

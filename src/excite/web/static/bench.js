@@ -8,17 +8,22 @@ import * as training from "./training.js";
 
 const parts = { experiment: null, record: null, runs, training };
 const isPart = (word) => Object.hasOwn(parts, word);
+/** The part of the page that the address names, and what in it: "#runs/frontier". */
+function place() {
+  const [word, what = ""] = location.hash.slice(1).split(/\/(.*)/s);
+  try { return [word, decodeURIComponent(what)]; } catch { return [word, what]; }
+}
 const door = document.getElementById("door");
 
 function turn() {
   if (location.hash === "#main") return; // the link that skips the header
-  const name = isPart(location.hash.slice(1)) ? location.hash.slice(1) : "experiment";
+  const [word, what] = place(), name = isPart(word) ? word : "experiment";
   for (const part of Object.keys(parts)) document.getElementById(part).hidden = part !== name;
   document.querySelectorAll("nav a").forEach((link) => {
     if (link.hash === `#${name}`) link.setAttribute("aria-current", "page");
     else link.removeAttribute("aria-current");
   });
-  parts[name]?.open();
+  parts[name]?.open(what);
 }
 
 async function enter() {
@@ -55,7 +60,7 @@ try {
   const { is_known: isKnown } = await post("api/session", {});
   const brought = new URLSearchParams(`token=${location.hash.slice(1)}`).get("token");
   if (isKnown) await enter();
-  else if (brought && !isPart(brought)) {
+  else if (brought && !isPart(place()[0])) {
     history.replaceState(null, "", location.pathname); // keeps the token out of the history
     await show(brought);
   } else knock();

@@ -3,7 +3,7 @@
 import { el, symbol } from "./api.js";
 import { Plot, range, shown } from "./plot.js";
 
-const COLOURS = ["output", "input", "simulated", "critical", "warning", "soft"];
+export const COLOURS = ["output", "input", "simulated", "critical", "warning", "soft"];
 
 /** An agent rewarded with information shows the bounds of its experiments, not errors. */
 const wordOf = (every) => {
@@ -11,15 +11,9 @@ const wordOf = (every) => {
   return [...words].sort().reverse().join(" or ");
 };
 
-const legend = (every, agents) => {
-  const name = (agent) => (every.find((curve) => curve.agent === agent).is_bound ? `${agent}, bound` : agent);
-  return el("p", { class: "legend" }, ...agents.map((agent, i) => el("span", { class: `key ${COLOURS[i % COLOURS.length]}` }, name(agent))));
-};
-
 /** Draws curves {agent, is_bound, columns}, one line a seed, one colour an agent; returns a function that draws anew. */
 export function curves(parent, every) {
   const agents = [...new Set(every.map((curve) => curve.agent))];
-  if (agents.length > 1) parent.before(legend(every, agents));
   const names = Object.keys(every[0]?.columns ?? {}).filter((name) => name.startsWith("relative_error_"));
   const plots = ["return", "violation_rate", ...names].map((name) => {
     const word = name.replace("relative_error_", "");
@@ -31,7 +25,8 @@ export function curves(parent, every) {
     const [part, unit] = last >= 1e6 ? [1e6, "million steps"] : last >= 1e3 ? [1e3, "thousand steps"] : [1, "steps"];
     for (const [name, plot] of plots) {
       const isPercent = name.startsWith("relative_error_");
-      const lines = now.map(({ agent, columns }) => ({
+      const lines = now.map(({ agent, is_bound: isBound, columns }) => ({
+        name: agents.length > 1 ? `${agent}${isBound ? ", bound" : ""}` : undefined,
         x: (columns.steps ?? []).map((steps) => steps / part), color: COLOURS[agents.indexOf(agent) % COLOURS.length], dots: now.length === 1, width: now.length > 1 ? 1 : 1.6,
         y: (columns[name] ?? []).map((v) => (isPercent ? Math.log10(Math.max(100 * v, 1e-9)) : v)),
       }));

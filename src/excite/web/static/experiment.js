@@ -1,6 +1,7 @@
 // Choose a plant and an excitation, run the experiment, watch the estimates.
 
-import { download, el, options, say, symbol, Task, tell } from "./api.js";
+import { command, download, el, get, options, say, symbol, Task, tell } from "./api.js";
+import { COLOURS } from "./curves.js";
 import { digits, Plot, range, shown } from "./plot.js";
 
 const section = document.getElementById("experiment"), form = section.querySelector("form");
@@ -19,6 +20,17 @@ export function begin(known) {
   choosePlant();
   task = new Task(form);
   say(form, "Ready.");
+  prepared();
+}
+
+/** Draws the default experiment, as it was computed for this page. */
+async function prepared() {
+  const events = await get("static/first.json");
+  if (task.isBusy || at("signals").querySelector("figure")) return;
+  clear();
+  const follow = follower(events.filter(({ kind }) => kind === "result" || kind === "other").length);
+  events.forEach(follow);
+  say(form, "Ready. What is shown was prepared: chirp, PRBS and the policy aero2. Press Run for your own.");
 }
 
 const fields = (id) => [...at(id).querySelectorAll("input")];
@@ -39,9 +51,9 @@ function choosePlant() {
   plant = catalogue.plants[at("plant").value];
   const policies = Object.keys(plant.policies), names = catalogue.excitations;
   const groups = [
-    { label: "signals", group: names.filter((n) => !n.startsWith("loop-")) },
-    { label: "signals in a position loop", group: names.filter((n) => n.startsWith("loop-")) },
-    { label: "policies", group: policies },
+    { label: "classical", group: names.filter((n) => !n.startsWith("loop-")) },
+    { label: "in a position loop", group: names.filter((n) => n.startsWith("loop-")) },
+    { label: "learned", group: policies },
   ].filter((g) => g.group.length);
   options(at("excitation"), groups, "chirp");
   options(at("other1"), groups, "prbs");
@@ -60,6 +72,8 @@ function chooseExcitation() {
   Object.assign(at("amplitude"), { disabled: !isSignal, max: half, value: input.amplitude });
   section.querySelector("label[for=amplitude] .unit").textContent = isSignal ? `${input.unit}, at most ${half}` : "set by the excitation";
   const policy = plant.policies[name], longest = policy?.num_steps;
+  at("about").textContent = policy ? "Learned: a policy that reacts to every measurement."
+    : isSignal ? "Classical: a signal that is fixed beforehand." : "A classical signal as the reference of a position loop, which keeps the plant near it.";
   at("claim").textContent = policy ? `Safety: ${policy.claim}.` : "";
   at("steps").max = longest ?? 5000;
   if (longest && +at("steps").value > longest) at("steps").value = longest;
@@ -98,11 +112,22 @@ const waiting = (live) => (live.found.length ? "Estimating and comparing…"
 
 function run() {
   const wanted = asked();
-  let live = null, rows = [];
-  at("outcome").hidden = true;
-  for (const plots of ["signals", "estimates"]) at(plots).replaceChildren(); // of the run before
+  clear();
   say(form, "Waiting for a worker…");
-  task.run("api/experiments", wanted, (event) => {
+  task.run("api/experiments", wanted, follower(wanted.others.length + 1));
+}
+
+/** Takes away what is shown of the run before. */
+function clear() {
+  at("outcome").hidden = at("player").hidden = true;
+  for (const plots of ["signals", "estimates", "overlays"]) at(plots).replaceChildren();
+  section.querySelector(".view").group?.show(null);
+}
+
+/** Draws the events of an experiment and its comparisons, of which there are so many. */
+function follower(total) {
+  let live = null, rows = [];
+  return (event) => {
     if (event.kind === "started") say(form, "Preparing. The first run with a plant, a length or an excitation compiles programs, which can take a minute or two…");
     else if (event.kind === "plan") live = new Live(event);
     else if (event.kind === "samples") {
@@ -114,21 +139,24 @@ function run() {
       if (live.isFull) say(form, waiting(live));
     } else if (["result", "other", "left_out"].includes(event.kind)) {
       rows.push(event.row ?? event);
-      compare(live, rows, wanted.others.length + 1);
+      if (event.traces) live.compared.push({ name: event.row.excitation, ...event.traces });
+      compare(live, rows, total);
+      overlay(live.plan, live.compared);
       if (event.kind === "result") conclude(event);
-      if (rows.length === wanted.others.length + 1) say(form, "Done.");
+      if (rows.length === total) say(form, "Done.");
     }
-  });
+  };
 }
 
 /** An experiment under way: what was measured so far, and the estimates. */
 class Live {
   constructor(plan) {
-    Object.assign(this, { plan, time: [], inputs: [], outputs: [], found: [] });
+    Object.assign(this, { plan, time: [], inputs: [], outputs: [], found: [], compared: [], until: null });
     this.end = (plan.num_samples - 1) * plan.plant.dt;
-    if (matchMedia("(max-width: 60rem)").matches) section.querySelector(".view").scrollIntoView();
+    if (task.isBusy && matchMedia("(max-width: 60rem)").matches) section.querySelector(".view").scrollIntoView();
     if (plan.warning) say(form, plan.warning, true);
     const title = (part) => el("span", {}, part.name, " ", el("span", { class: "unit" }, part.shown_unit));
+    this.play();
     const from = (name) => el("span", {}, symbol(name), " ", el("span", { class: "unit" }, "% from the true value"));
     this.plots = [...plan.plant.inputs, ...plan.plant.outputs].map((part) =>
       new Plot(at("signals"), title(part), `${part.name} over time, with its safety levels`));
@@ -143,19 +171,50 @@ class Live {
     this.time.push(...time);
     this.inputs.push(...inputs);
     this.outputs.push(...outputs);
+    if (this.isFull && this.until === null) this.halt();
     this.draw();
+  }
+
+  /** How many samples are shown: all there are, unless it is paused. */
+  get count() { return this.until ?? this.time.length; }
+
+  /** The button that pauses and plays again, and the slider through what was recorded. */
+  play() {
+    const button = at("player").querySelector("button"), slider = at("shown-time");
+    const move = (count) => { this.until = count; this.draw(); this.track(); };
+    const halt = () => { cancelAnimationFrame(this.frame); button.textContent = "Play"; };
+    this.halt = halt;
+    at("player").hidden = false;
+    slider.max = this.plan.num_samples;
+    button.textContent = "Pause";
+    slider.oninput = () => { halt(); move(Math.min(+slider.value, this.time.length)); };
+    button.onclick = () => {
+      if (button.textContent === "Pause") { halt(); move(this.count); return; }
+      button.textContent = "Pause";
+      if (!this.isFull) { this.until = null; this.draw(); return; }
+      const first = this.count < this.time.length ? this.count : 0, length = 1000 * Math.min(10, this.end), begin = performance.now();
+      const next = (now) => {
+        move(Math.min(this.time.length, Math.round(first + ((now - begin) / length) * this.time.length)));
+        if (this.count < this.time.length) this.frame = requestAnimationFrame(next); else halt();
+      };
+      this.frame = requestAnimationFrame(next);
+    };
   }
 
   estimate(event) {
     this.found.push(event);
-    const { plant, params } = this.plan, time = this.found.map((e) => (e.k) * plant.dt);
+    this.track();
+  }
+
+  track() {
+    const { plant, params } = this.plan, found = this.found.filter((e) => this.until === null || e.k < this.until), time = found.map((e) => e.k * plant.dt);
     plant.parameters.forEach(({ name, scale, unit }, i) => {
       const true_ = params[name], per = 100 / (Math.abs(true_) || scale);
-      const column = (what) => this.found.map((e) => (e[what][name] === null ? null : e[what][name] * per));
+      const column = (what) => found.map((e) => (e[what][name] === null ? null : e[what][name] * per));
       const middle = column("estimate").map((v) => (v === null ? null : v - true_ * per));
       const half = column("half"), bound = column("bound");
       // The first estimates are far off: the scale follows the later ones.
-      const from = Math.floor(this.found.length / 2.5), reach = [];
+      const from = Math.floor(found.length / 2.5), reach = [];
       for (let j = from; j < middle.length; j++) if (middle[j] !== null) reach.push(Math.abs(middle[j]) + half[j], bound[j]);
       const top = 1.15 * (Math.max(...reach.filter(Number.isFinite), 0) || 100);
       const good = middle.map((v, j) => j).filter((j) => middle[j] !== null);
@@ -164,43 +223,108 @@ class Live {
         x: [0, this.end], y: [-top, top], unit: "s",
         bands: [{ x: pick(time), lower: good.map((j) => middle[j] - half[j]), upper: good.map((j) => middle[j] + half[j]), color: "band" }],
         lines: [
-          { x: time, y: bound, color: "bound", dash: [5, 4], width: 1.2 },
-          { x: time, y: bound.map((b) => (b === null ? null : -b)), color: "bound", dash: [5, 4], width: 1.2 },
-          { x: time, y: middle, color: "output", dots: true },
+          { x: time, y: middle, name: "estimate", color: "output", dots: true },
+          { x: time, y: bound, name: "Cramér-Rao bound, 95 %", color: "bound", dash: [5, 4], width: 1.2 },
+          { x: time, y: bound.map((b) => (b === null ? null : -b)), name: "Cramér-Rao bound, 95 %", color: "bound", dash: [5, 4], width: 1.2 },
         ],
       });
-      const last = event.estimate[name];
-      this.tracks[i].note.textContent = last === null ? "no estimate yet"
-        : `${shown(last, digits(last, event.half[name]))} ± ${shown(event.half[name], 2)} ${unit}`;
+      const last = found.at(-1)?.estimate[name] ?? null, half95 = found.at(-1)?.half[name];
+      this.tracks[i].note.textContent = last === null ? "no estimate yet" : `${shown(last, digits(last, half95))} ± ${shown(half95, 2)} ${unit}`;
     });
   }
 
   draw() {
-    const { inputs, outputs } = this.plan.plant, x = [0, this.end];
-    inputs.forEach((part, i) => this.plots[i].show({
-      x, y: range(this.inputs.map((row) => row[i]), -part.amplitude, part.amplitude), unit: "s",
-      lines: [{ x: this.time.slice(0, this.inputs.length), y: this.inputs.map((row) => row[i]), color: "input", step: true, width: 1.3 }],
-    }));
-    outputs.forEach((part, i) => {
-      const levels = [["warning", part.warning_level], ["critical", part.critical_level]].filter(([, level]) => level !== null)
-        .flatMap(([word, level]) => [1, -1].map((sign) => ({ y: sign * level * part.factor, color: word, word: sign > 0 ? `${word} level` : "" })));
-      const values = this.outputs.map((row) => row[i] * part.factor);
-      const largest = Math.max(...values.map(Math.abs), 0);
-      this.plots[inputs.length + i].show({
-        x, y: range(values, ...levels.map((l) => 1.1 * l.y), ...(levels.length ? [] : [-0.1 * part.scale * part.factor, 0.1 * part.scale * part.factor])), unit: "s", levels,
-        lines: [{ x: this.time, y: values, color: "output" }],
+    const { inputs, outputs } = this.plan.plant, x = [0, this.end], { count } = this;
+    const time = this.time.slice(0, count), played = this.inputs.slice(0, count), seen = this.outputs.slice(0, count);
+    at("shown-time").value = count;
+    at("player").querySelector("output").textContent = `${shown(time.at(-1) ?? 0)} s`;
+    inputs.forEach((part, i) => {
+      const y = played.map((row) => row[i]);
+      this.plots[i].show({
+        x, y: range(this.inputs.map((row) => row[i]), -part.amplitude, part.amplitude), unit: "s",
+        lines: [{ x: time.slice(0, y.length), y, color: "input", step: true, width: 1.3 }],
       });
-      // A violation is one of the true output, which only the comparison shows.
-      this.plots[inputs.length + i].note.textContent = `largest measured ${shown(largest)} ${part.shown_unit}`;
+    });
+    outputs.forEach((part, i) => {
+      const values = seen.map((row) => row[i] * part.factor), plot = this.plots[inputs.length + i];
+      plot.show({
+        x, y: reach(part, this.outputs.map((row) => row[i] * part.factor)), unit: "s", levels: levelsOf(part), marks: passed(part, time, values),
+        lines: [{ x: time, y: values, color: "output" }],
+      });
+      // A violation is one of the true output, which the comparison shows.
+      const largest = Math.max(...values.map(Math.abs), 0);
+      plot.note.textContent = [`largest measured ${shown(largest)} ${part.shown_unit}`, ...passed(part, time, values).map(({ word }) => word)].join("; ");
     });
   }
+}
+
+/** Both safety levels of an output, as bands with a name, in its shown unit. */
+function levelsOf({ warning_level: warning, critical_level: critical, factor }) {
+  const found = [["warning", warning, critical], ["critical", critical, null]].filter(([, level]) => level !== null);
+  return found.flatMap(([word, level, next]) => [1, -1].map((sign) => ({
+    y: sign * level * factor, until: next === null ? undefined : sign * next * factor, color: word, word: sign > 0 ? `${word} level` : "",
+  })));
+}
+
+/** The first time at which an output passed its critical level, or else its warning level. */
+function passed({ warning_level: warning, critical_level: critical, factor }, time, values, who = "") {
+  for (const [word, level] of [["critical", critical], ["warning", warning]]) {
+    const k = level === null ? -1 : values.findIndex((value) => Math.abs(value) >= level * factor);
+    if (k >= 0) return [{ x: time[k], color: word, word: `${who}${word} level passed at ${shown(time[k])} s` }];
+  }
+  return [];
+}
+
+function reach(part, values) {
+  const always = levelsOf(part).map(({ y }) => 1.1 * y), usual = 0.1 * part.scale * part.factor;
+  return range(values, ...(always.length ? always : [-usual, usual]));
+}
+
+/** All excitations in the same plots: inputs, true outputs, information and bounds over time. */
+function overlay({ plant, num_samples: count }, compared) {
+  const parent = at("overlays"), x = [0, (count - 1) * plant.dt], unit = "s";
+  if (!compared.length) return;
+  const title = (part) => el("span", {}, part.name, " ", el("span", { class: "unit" }, part.shown_unit));
+  const bound = (name) => el("span", {}, "bound of ", symbol(name), " ", el("span", { class: "unit" }, "%"));
+  parent.plots ??= [];
+  if (!parent.children.length) parent.plots = [
+    ...plant.inputs.map((part) => new Plot(parent, title(part), `${part.name} of all excitations over time`)),
+    ...plant.outputs.map((part) => new Plot(parent, title(part), `true ${part.name} of all excitations over time`)),
+    new Plot(parent, "information, log det M", "information of all excitations over time"),
+    ...plant.parameters.map(({ name }) => new Plot(parent, bound(name), `Cramér-Rao bound of ${name} of all excitations over time`)),
+  ];
+  const plots = [...parent.plots], lines = (more, pick) => compared.map((own, i) => ({ x: own.time, name: own.name, color: COLOURS[i % COLOURS.length], ...more, y: pick(own) }));
+  const after = (values) => [null, ...values]; // there is nothing before the first input
+  plant.inputs.forEach((part, i) => {
+    const found = lines({ step: true, width: 1.2 }, (own) => [...own.inputs.map((row) => row[i]), null]);
+    plots.shift().show({ x, unit, y: range(found.flatMap(({ y }) => y), -part.amplitude, part.amplitude), lines: found });
+  });
+  plant.outputs.forEach((part, i) => {
+    const found = lines({}, (own) => own.outputs.map((row) => row[i] * part.factor)), plot = plots.shift();
+    const marks = found.flatMap(({ name, y }, k) => passed(part, compared[k].time, y, `${name}: `).filter(({ color }) => color === "critical"));
+    plot.show({ x, unit, y: reach(part, found.flatMap(({ y }) => y)), levels: levelsOf(part), marks, lines: found });
+    plot.note.textContent = marks.map(({ word }) => word).join("; ");
+  });
+  const gained = lines({}, (own) => after(own.log_det)), seen = gained.flatMap(({ y }) => y.slice(Math.ceil(y.length / 10))).filter(Number.isFinite);
+  plots.shift().show({ x, unit, y: range(seen, ...seen.slice(0, 1)), lines: gained });
+  for (const { name } of plant.parameters) {
+    const found = lines({}, (own) => after(own.bound_percent[name].map((v) => (v === null ? null : Math.log10(v)))));
+    const ends = found.map(({ y }) => y.at(-1)).filter(Number.isFinite), low = Math.min(...ends);
+    plots.shift().show({ x, unit, log: true, y: [Math.floor(low), Math.floor(low) + Math.max(2, Math.ceil(Math.max(...ends) - Math.floor(low)) + 1)], lines: found });
+  }
+}
+
+/** Whether an output passed its critical level, or its warning level. */
+function state(row, outputs) {
+  if (row.is_violation) return "violation";
+  return outputs.some((o) => o.warning_level !== null && row.max_abs_output[o.name] >= o.warning_level) ? "warning" : "safe";
 }
 
 function compare(live, rows, total) {
   const { parameters, outputs } = live.plan.plant;
   const found = rows.filter((row) => row.params);
   const best = (name) => Math.min(...found.map((r) => r.params[name].error_percent ?? Infinity));
-  const head = ["excitation", "safe", ...outputs.map((o) => `largest true ${o.name} [${o.shown_unit}]`)];
+  const head = ["excitation", "safety", ...outputs.map((o) => `largest true ${o.name} [${o.shown_unit}]`)];
   at("outcome").querySelector("h2").textContent = `Comparison: ${live.plan.plant.name}, ${live.plan.num_samples - 1} samples`;
   at("comparison").replaceChildren(
     el("thead", {}, el("tr", {}, ...head.map((text) => el("th", { scope: "col" }, text)),
@@ -208,7 +332,7 @@ function compare(live, rows, total) {
     el("tbody", {}, ...rows.map((row) => (row.sentence ? el("tr", {}, el("th", { scope: "row" }, row.excitation),
       el("td", { class: "said", colspan: 2 + outputs.length + parameters.length }, row.sentence)) : el("tr", {},
       el("th", { scope: "row" }, row.excitation),
-      el("td", { class: row.is_violation ? "bad" : "good" }, row.is_violation ? "violation" : "yes"),
+      el("td", { class: { violation: "bad", warning: "warned", safe: "good" }[state(row, outputs)] }, state(row, outputs)),
       ...outputs.map((o) => el("td", {}, shown(row.max_abs_output[o.name] * o.factor))),
       ...parameters.map(({ name }) => {
         const p = row.params[name];
@@ -221,13 +345,14 @@ function compare(live, rows, total) {
 }
 
 function conclude(event) {
-  const { identification, row, result } = event, downloads = section.querySelector(".downloads");
+  const { identification, row, result = null } = event, downloads = section.querySelector(".downloads");
   const sentences = identification ? identification.verdict : [row.status];
   at("verdict").replaceChildren(...sentences.map((sentence) => el("li", {}, sentence)));
-  downloads.replaceChildren(...(identification ? [
+  downloads.replaceChildren(...(identification && result ? [
     download(`api/results/${result}/report.html`, "Report"),
     download(`api/results/${result}/record.csv`, "Record"),
     download(`api/results/${result}/record.json`, "Sidecar"),
     download(`api/results/${result}/estimate.json`, "Estimate"),
   ] : []));
+  at("again").replaceChildren(command(event.command));
 }

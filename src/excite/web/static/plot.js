@@ -1,11 +1,13 @@
-// Small plots on a canvas: lines, steps, bands, levels. Colours are those of the page.
+// Plots over time: a shared cross-hair, zoom and files; uPlot draws the lines (uplot/LICENSE).
+
+import { el, keep } from "./api.js";
 
 const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
 
 const plots = new Set();
-const redrawAll = () => plots.forEach((plot) => (plot.canvas.isConnected ? plot.draw() : plots.delete(plot)));
-matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redrawAll);
-const resized = new ResizeObserver((entries) => entries.forEach((entry) => entry.target.plot?.draw()));
+const alive = () => [...plots].filter((plot) => plot.chart.isConnected || plots.delete(plot) && false);
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => alive().forEach((plot) => plot.draw(true)));
+const resized = new ResizeObserver((entries) => entries.forEach((entry) => entry.target.plot.resize()));
 
 /** Round numbers that divide a range into about so many parts. */
 export function ticks(low, high, about) {
@@ -32,143 +34,300 @@ export function digits(value, uncertainty) {
 }
 
 const label = (value) => String(+value.toPrecision(6)).replace("-", "−");
-
-export class Plot {
-  /** A figure with a caption and a canvas in `parent`; `about` says in words what is drawn. */
-  constructor(parent, title, about) {
-    const figure = document.createElement("figure"), caption = document.createElement("figcaption");
-    this.note = document.createElement("span");
-    this.canvas = document.createElement("canvas");
-    this.canvas.setAttribute("role", "img");
-    this.canvas.setAttribute("aria-label", about);
-    this.canvas.plot = this;
-    const name = document.createElement("b");
-    name.append(title);
-    caption.append(name, this.note);
-    figure.append(caption, this.canvas);
-    parent.append(figure);
-    this.what = null;
-    plots.add(this);
-    resized.observe(this.canvas);
-  }
-
-  /** Draws {x: [low, high], y: [low, high], lines, bands, levels, log} on the next frame. */
-  show(what) {
-    if (this.what === null || !this.waiting) {
-      this.waiting = true;
-      requestAnimationFrame(() => { this.waiting = false; this.draw(); });
-    }
-    this.what = what;
-  }
-
-  draw() {
-    const { canvas, what } = this, { clientWidth: width, clientHeight: height } = canvas;
-    if (!what || !width) return;
-    const ratio = devicePixelRatio || 1;
-    canvas.width = Math.round(width * ratio);
-    canvas.height = Math.round(height * ratio);
-    const g = canvas.getContext("2d");
-    g.scale(ratio, ratio);
-    g.font = "12px system-ui, sans-serif";
-    const box = { left: 52, right: width - 10, top: 8, bottom: height - 22 };
-    const [x0, x1] = what.x, [y0, y1] = what.y;
-    const X = (x) => box.left + ((x - x0) / (x1 - x0 || 1)) * (box.right - box.left);
-    const Y = (y) => box.bottom - ((y - y0) / (y1 - y0 || 1)) * (box.bottom - box.top);
-    this.grid(g, box, X, Y, what);
-    g.save();
-    g.beginPath();
-    g.rect(box.left, box.top - 2, box.right - box.left, box.bottom - box.top + 4);
-    g.clip();
-    for (const band of what.bands ?? []) this.band(g, band, X, Y);
-    for (const level of what.levels ?? []) this.level(g, level, box, Y);
-    for (const line of what.lines ?? []) this.line(g, line, X, Y);
-    g.restore();
-  }
-
-  grid(g, box, X, Y, what) {
-    g.strokeStyle = colour("line");
-    g.fillStyle = colour("soft");
-    g.lineWidth = 1;
-    g.textAlign = "right";
-    g.textBaseline = "middle";
-    for (const y of ticks(...what.y, 4)) {
-      if (what.log && Math.abs(y - Math.round(y)) > 1e-6) continue;
-      g.beginPath();
-      g.moveTo(box.left, Math.round(Y(y)) + 0.5);
-      g.lineTo(box.right, Math.round(Y(y)) + 0.5);
-      g.stroke();
-      g.fillText(what.log ? shown(10 ** y, 1) : label(y), box.left - 6, Y(y));
-    }
-    g.textAlign = "center";
-    g.textBaseline = "top";
-    const marks = ticks(...what.x, Math.max(2, (box.right - box.left) / 90));
-    for (const x of marks) {
-      const unit = x === marks.at(-1) && what.unit ? ` ${what.unit}` : "";
-      const half = g.measureText(label(x) + unit).width / 2;
-      g.fillText(label(x) + unit, Math.min(X(x), box.right + 8 - half), box.bottom + 6);
-    }
-  }
-
-  band(g, { x, lower, upper, color }, X, Y) {
-    g.fillStyle = colour(color);
-    g.beginPath();
-    x.forEach((value, i) => g.lineTo(X(value), Y(lower[i])));
-    for (let i = x.length - 1; i >= 0; i--) g.lineTo(X(x[i]), Y(upper[i]));
-    g.fill();
-  }
-
-  level(g, { y, color, word }, box, Y) {
-    g.strokeStyle = g.fillStyle = colour(color);
-    g.lineWidth = 1.2;
-    g.setLineDash([6, 4]);
-    g.beginPath();
-    g.moveTo(box.left, Y(y));
-    g.lineTo(box.right, Y(y));
-    g.stroke();
-    g.setLineDash([]);
-    if (!word) return;
-    g.textAlign = "right";
-    g.textBaseline = y > 0 ? "bottom" : "top";
-    g.fillText(word, box.right - 2, Y(y) + (y > 0 ? -1 : 2));
-  }
-
-  line(g, { x, y, color, dash, step, dots, width }, X, Y) {
-    g.strokeStyle = g.fillStyle = colour(color);
-    g.lineWidth = width ?? 1.6;
-    g.lineJoin = "round";
-    g.setLineDash(dash ?? []);
-    g.beginPath();
-    let before = null;
-    x.forEach((value, i) => {
-      if (y[i] === null || !Number.isFinite(y[i])) { before = null; return; }
-      if (before === null) g.moveTo(X(value), Y(y[i]));
-      else {
-        if (step) g.lineTo(X(value), Y(before));
-        g.lineTo(X(value), Y(y[i]));
-      }
-      before = y[i];
-    });
-    g.stroke();
-    g.setLineDash([]);
-    if (!dots) return;
-    x.forEach((value, i) => {
-      if (y[i] === null || !Number.isFinite(y[i])) return;
-      g.beginPath();
-      g.arc(X(value), Y(y[i]), 2.6, 0, 7);
-      g.fill();
-    });
-  }
-}
+const isNumber = (value) => value !== null && value !== undefined && Number.isFinite(value);
 
 /** A range with a little room, that always holds some numbers. */
 export function range(values, ...always) {
   let low = Math.min(...always), high = Math.max(...always);
   for (const value of values) {
-    if (value === null || !Number.isFinite(value)) continue;
+    if (!isNumber(value)) continue;
     if (value < low) low = value;
     if (value > high) high = value;
   }
   if (!(high > low)) { low -= 1; high += 1; }
   const room = 0.06 * (high - low);
   return [low - room, high + room];
+}
+
+/** Index of the number in an ascending list that is nearest to x. */
+function nearest(list, x) {
+  let low = 0, high = list.length - 1;
+  while (high - low > 1) {
+    const middle = (low + high) >> 1;
+    if (list[middle] < x) low = middle; else high = middle;
+  }
+  return Math.abs(list[low] - x) <= Math.abs(list[high] - x) ? low : high;
+}
+
+/** What the plots of one view share: the cross-hair, and the part of the axis that is shown. */
+class Group {
+  constructor() {
+    this.sync = uPlot.sync(`view ${Math.random()}`);
+    this.zoom = null;
+  }
+
+  get plots() { return alive().filter((plot) => plot.group === this); }
+
+  /** Shows a part of the axis; null for all of it. */
+  show(zoom) {
+    this.zoom = zoom;
+    this.plots.forEach((plot) => plot.rescale());
+  }
+
+  /** Puts the cross-hair of all plots at x. */
+  point(x) {
+    for (const { u } of this.plots) u?.setCursor({ left: u.valToPos(x, "x"), top: 0 });
+  }
+}
+
+export class Plot {
+  /** A figure in `parent`; `about` says in words what is drawn. Plots of a view share cross-hair and zoom. */
+  constructor(parent, title, about) {
+    const view = parent.closest(".shared") ?? parent; // plots of one experiment
+    this.group = (view.group ??= new Group());
+    this.note = el("span");
+    this.read = el("span", { class: "read" });
+    this.legend = el("span", { class: "legend" });
+    this.chart = el("div", {
+      class: "chart", tabindex: "0", role: "group", keydown: (event) => this.press(event),
+      "aria-label": `${about}. Arrow keys move the cross-hair, plus and minus zoom, zero shows all.`,
+    });
+    this.chart.plot = this;
+    const file = (kind, make) => el("button", { type: "button", "aria-label": `${about}: save as ${kind}`, click: make }, kind);
+    this.files = el("span", { class: "files" }, file("PNG", () => this.png()), file("SVG", () => this.svg()), file("CSV", () => this.csv()));
+    this.name = el("b", {}, title);
+    parent.append(el("figure", {}, el("figcaption", {}, this.name, this.read, this.note, this.files), this.legend, this.chart));
+    Object.assign(this, { what: null, u: null, made: "", hidden: new Set() });
+    plots.add(this);
+    resized.observe(this.chart);
+  }
+
+  /**
+   * Draws on the next frame: {x: [low, high], y: [low, high], unit, log, lines, bands, levels, marks}.
+   * A line is {x, y, name, color, dash, step, dots, points, width}; those with a name can be hidden.
+   */
+  show(what) {
+    if (!this.waiting) requestAnimationFrame(() => { this.waiting = false; this.draw(); });
+    this.waiting = true;
+    this.what = what;
+  }
+
+  get lines() { return this.what.lines.filter((line) => !this.hidden.has(line.name)); }
+
+  get size() { return { width: this.chart.clientWidth, height: this.chart.clientHeight }; }
+
+  resize() { if (this.u) this.u.setSize(this.size); else this.draw(); }
+
+  draw(isNew = false) {
+    if (!this.what || !this.chart.clientWidth) return;
+    const kind = JSON.stringify([this.what.unit, this.what.log, this.lines.map(({ x, y, ...how }) => how)]);
+    if (this.u && !isNew && kind === this.made) this.u.setData(this.data());
+    else {
+      this.u?.destroy();
+      this.made = kind;
+      this.u = new uPlot(this.options(), this.data(), this.chart);
+      this.toggles();
+    }
+  }
+
+  /** Columns for uPlot: the times of all lines together, and a value or a gap of each line there. */
+  data() {
+    const clean = (y) => y.map((value) => (isNumber(value) ? value : null));
+    const { lines } = this;
+    if (!lines.length) return [[]];
+    const isShared = lines.every(({ x }) => x === lines[0].x);
+    if (isShared) return [lines[0].x, ...lines.map(({ y }) => clean(y))];
+    return uPlot.join(lines.map(({ x, y }) => [x, clean(y)]));
+  }
+
+  options() {
+    const soft = colour("soft"), grid = { stroke: colour("line"), width: 1 };
+    const axis = { stroke: soft, grid, ticks: { show: false }, font: "12px system-ui, sans-serif" };
+    const { unit, log } = this.what;
+    return {
+      ...this.size, legend: { show: false }, padding: [8, 18, 0, 0],
+      scales: { x: { time: false, range: () => this.group.zoom ?? this.what.x }, y: { range: () => this.reach() } },
+      axes: [
+        { ...axis, size: 26, splits: (u, i, low, high) => ticks(low, high, Math.max(2, u.bbox.width / devicePixelRatio / 90)), values: (u, found) => found.map((x, i) => label(x) + (i === found.length - 1 && unit ? ` ${unit}` : "")) },
+        { ...axis, size: 54, gap: 4, splits: (u, i, low, high) => ticks(low, high, 4).filter((y) => !log || Math.abs(y - Math.round(y)) < 1e-6), values: (u, found) => found.map((y) => (log ? shown(10 ** y, 1) : label(y))) },
+      ],
+      cursor: {
+        sync: { key: this.group.sync.key, scales: ["x", null] }, y: false,
+        drag: { x: true, y: false, setScale: false, dist: 5 },
+        bind: { dblclick: () => () => this.group.show(null) },
+      },
+      series: [{}, ...this.lines.map((line) => ({
+        stroke: colour(line.color), width: line.width ?? 1.6, dash: line.dash,
+        paths: line.points ? () => null : line.step ? uPlot.paths.stepped({ align: 1 }) : undefined,
+        points: { show: Boolean(line.dots || line.points), size: line.points ? 3.5 : 5, fill: colour(line.color), width: 0 },
+      }))],
+      hooks: {
+        drawAxes: [(u) => this.below(u)], draw: [(u) => this.above(u)],
+        setCursor: [(u) => this.tell(u)], setSelect: [(u) => this.select(u)],
+      },
+    };
+  }
+
+  /** The range of y: as asked, or that of the part of the axis that is shown. */
+  reach() {
+    const { zoom } = this.group, { log, y } = this.what;
+    if (!zoom || log) return y;
+    const seen = this.lines.flatMap((line) => line.y.filter((value, i) => line.x[i] >= zoom[0] && line.x[i] <= zoom[1] && isNumber(value)));
+    return seen.length ? range(seen, seen[0]) : y;
+  }
+
+  rescale() {
+    this.u?.setSelect({ left: 0, top: 0, width: 0, height: 0 }, false);
+    this.u?.setData(this.u.data);
+  }
+
+  select(u) {
+    const { left, width } = u.select;
+    if (width > 4 && u.cursor.event) this.group.show([u.posToVal(left, "x"), u.posToVal(left + width, "x")]);
+  }
+
+  press(event) {
+    const { u, what } = this, keys = { ArrowLeft: -1, ArrowRight: 1, Home: -Infinity, End: Infinity, "+": 0.5, "=": 0.5, "-": 2, 0: null, Escape: null };
+    if (!u || !(event.key in keys) || event.ctrlKey || event.metaKey || event.altKey) return;
+    event.preventDefault();
+    const change = keys[event.key], times = u.data[0], [low, high] = this.group.zoom ?? what.x;
+    const first = nearest(times, low), last = nearest(times, high);
+    const now = u.cursor.idx ?? first;
+    if (event.key.startsWith("Arrow") || event.key === "Home" || event.key === "End") {
+      const step = change * (event.shiftKey ? 10 : 1);
+      this.group.point(times[Math.min(last, Math.max(first, now + step))]);
+    } else if (change === null) this.group.show(null);
+    else {
+      const middle = times[now] ?? (low + high) / 2, part = change * (high - low);
+      const begin = Math.max(what.x[0], Math.min(middle - part / 2, what.x[1] - part));
+      this.group.show(part >= what.x[1] - what.x[0] ? null : [begin, begin + part]);
+      this.group.point(middle);
+    }
+  }
+
+  /** Says the values under the cross-hair. */
+  tell(u) {
+    const x = u.cursor.idx === null || u.cursor.left < 0 ? null : u.data[0][u.cursor.idx], { unit, log } = this.what;
+    const at = (line) => {
+      const i = nearest(line.x, x), value = line.x.length && Math.abs(line.x[i] - x) < 0.02 * (this.what.x[1] - this.what.x[0]) ? line.y[i] : null;
+      return shown(log && isNumber(value) ? 10 ** value : value, 4);
+    };
+    const isAlone = this.lines.length === 1 && !this.lines[0].name;
+    this.read.textContent = x === null || x === undefined ? "" : `${label(x)} ${unit ?? ""}${isAlone ? `: ${at(this.lines[0])}` : ""}`;
+    for (const button of this.legend.children) {
+      const line = this.lines.find(({ name }) => name === button.dataset.name);
+      button.lastChild.textContent = line && x !== null && x !== undefined ? ` ${at(line)}` : "";
+    }
+  }
+
+  /** One button a named line: it hides the line, and shows its value under the cross-hair. */
+  toggles() {
+    const named = [...new Map(this.what.lines.filter(({ name }) => name).map((line) => [line.name, line])).values()];
+    const focused = this.legend.contains(document.activeElement) ? document.activeElement.dataset.name : null;
+    this.legend.replaceChildren(...named.map(({ name, color, points }) => el("button", {
+      type: "button", class: `key ${color}${points ? " points" : ""}`, "data-name": name, "aria-pressed": String(!this.hidden.has(name)),
+      click: () => { if (!this.hidden.delete(name)) this.hidden.add(name); this.draw(true); },
+    }, name, el("span"))));
+    if (focused !== null) [...this.legend.children].find((button) => button.dataset.name === focused)?.focus();
+  }
+
+  /** What lies below the lines: bands, and safety levels with their names. */
+  below(u) {
+    const { bands = [], levels = [] } = this.what, { ctx: g, bbox: box } = u, ratio = devicePixelRatio;
+    const X = (x) => u.valToPos(x, "x", true), Y = (y) => u.valToPos(y, "y", true);
+    g.save();
+    g.beginPath();
+    g.rect(box.left, box.top, box.width, box.height);
+    g.clip();
+    for (const { x, lower, upper, color } of bands) {
+      g.fillStyle = colour(color);
+      g.beginPath();
+      x.forEach((value, i) => g.lineTo(X(value), Y(lower[i])));
+      for (let i = x.length - 1; i >= 0; i--) g.lineTo(X(x[i]), Y(upper[i]));
+      g.fill();
+    }
+    g.font = `${12 * ratio}px system-ui, sans-serif`;
+    g.textAlign = "right";
+    for (const { y, until, color, word } of levels) {
+      g.strokeStyle = g.fillStyle = colour(color);
+      const end = until === undefined ? (y > 0 ? box.top : box.top + box.height) : Y(until);
+      g.globalAlpha = 0.1;
+      g.fillRect(box.left, Math.min(Y(y), end), box.width, Math.abs(end - Y(y)));
+      g.globalAlpha = 1;
+      g.lineWidth = ratio;
+      g.setLineDash([6 * ratio, 4 * ratio]);
+      g.beginPath();
+      g.moveTo(box.left, Y(y));
+      g.lineTo(box.left + box.width, Y(y));
+      g.stroke();
+      g.textBaseline = y > 0 ? "bottom" : "top";
+      if (word && Math.abs(end - Y(y)) > 14 * ratio) g.fillText(word, box.left + box.width - 4 * ratio, Y(y) + (y > 0 ? -2 : 2) * ratio);
+    }
+    g.restore();
+  }
+
+  /** What lies above the lines: marked times. */
+  above(u) {
+    const { ctx: g, bbox: box } = u, ratio = devicePixelRatio;
+    g.save();
+    g.font = `${12 * ratio}px system-ui, sans-serif`;
+    for (const { x, color, word } of this.what.marks ?? []) {
+      const at = u.valToPos(x, "x", true);
+      if (at < box.left || at > box.left + box.width) continue;
+      g.strokeStyle = g.fillStyle = colour(color);
+      g.lineWidth = 1.5 * ratio;
+      g.beginPath();
+      g.moveTo(at, box.top);
+      g.lineTo(at, box.top + box.height);
+      g.stroke();
+      g.textBaseline = "bottom";
+      g.textAlign = at > box.left + box.width / 2 ? "right" : "left";
+      g.fillText(word, at + (g.textAlign === "left" ? 4 : -4) * ratio, box.top + box.height - 3 * ratio);
+    }
+    g.restore();
+  }
+
+  get file() { return this.name.textContent.trim().replace(/[^\p{L}\p{N}]+/gu, "_").replace(/^_+|_+$/g, ""); }
+
+  png() {
+    const source = this.u.ctx.canvas, canvas = el("canvas", { width: source.width, height: source.height }), g = canvas.getContext("2d");
+    g.fillStyle = colour("card");
+    g.fillRect(0, 0, canvas.width, canvas.height);
+    g.drawImage(source, 0, 0);
+    canvas.toBlob((blob) => keep(`${this.file}.png`, blob));
+  }
+
+  csv() {
+    const name = (line) => line.name ?? this.name.textContent.trim();
+    const quoted = (text) => (/[",\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text);
+    const head = [this.what.unit === "s" ? "time" : this.what.unit ?? "x", ...this.lines.map(name)].map(quoted);
+    const value = (y, i) => (isNumber(y) ? (this.what.log && i ? 10 ** y : y) : "");
+    const [times, ...columns] = this.u.data;
+    const rows = times.map((x, k) => [x, ...columns.map((own) => own[k])].map(value).join(","));
+    keep(`${this.file}.csv`, new Blob([[head.join(","), ...rows, ""].join("\n")], { type: "text/csv" }));
+  }
+
+  svg() {
+    const { u } = this, { width, height } = this.size, [y0, y1] = [u.scales.y.min, u.scales.y.max], [x0, x1] = [u.scales.x.min, u.scales.x.max];
+    const left = 54, right = width - 18, top = 8, bottom = height - 26, two = (v) => v.toFixed(2);
+    const X = (x) => two(left + ((x - x0) / (x1 - x0)) * (right - left)), Y = (y) => two(bottom - ((y - y0) / (y1 - y0)) * (bottom - top));
+    const text = (x, y, anchor, word) => `<text x="${x}" y="${y}" text-anchor="${anchor}" fill="${colour("soft")}">${word.replaceAll("&", "&amp;").replaceAll("<", "&lt;")}</text>`;
+    const line = (points, color, more = "") => `<polyline points="${points}" fill="none" stroke="${colour(color)}" ${more}/>`;
+    const { log, unit, levels = [], bands = [] } = this.what, marks = ticks(x0, x1, Math.max(2, (right - left) / 90));
+    const parts = [
+      ...ticks(y0, y1, 4).filter((y) => !log || Math.abs(y - Math.round(y)) < 1e-6).map((y) => line(`${left},${Y(y)} ${right},${Y(y)}`, "line") + text(left - 6, +Y(y) + 4, "end", log ? shown(10 ** y, 1) : label(y))),
+      ...marks.map((x, i) => text(X(x), height - 8, "middle", label(x) + (i === marks.length - 1 && unit ? ` ${unit}` : ""))),
+      ...bands.map(({ x, lower, upper, color }) => `<polygon points="${[...x.map((v, i) => `${X(v)},${Y(lower[i])}`), ...x.map((v, i) => `${X(v)},${Y(upper[i])}`).reverse()].join(" ")}" fill="${colour(color)}" clip-path="url(#c)"/>`),
+      ...levels.filter(({ y }) => y >= y0 && y <= y1).map(({ y, color, word }) => line(`${left},${Y(y)} ${right},${Y(y)}`, color, 'stroke-dasharray="6 4"') + (word ? text(right - 4, +Y(y) - 3, "end", word) : "")),
+      ...this.lines.map(({ x, y, color, step, dash, points, width: thick }) => {
+        const there = x.map((v, i) => i).filter((i) => isNumber(y[i]) && x[i] >= x0 && x[i] <= x1);
+        if (points) return there.map((i) => `<circle cx="${X(x[i])}" cy="${Y(y[i])}" r="1.7" fill="${colour(color)}"/>`).join("");
+        const path = there.map((i, n) => (step && n ? `${X(x[i])},${Y(y[there[n - 1]])} ` : "") + `${X(x[i])},${Y(y[i])}`).join(" ");
+        return line(path, color, `stroke-width="${thick ?? 1.6}" clip-path="url(#c)"${dash ? ` stroke-dasharray="${dash.join(" ")}"` : ""}`);
+      }),
+    ];
+    const head = `<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 ${width} ${height}" font-family="system-ui, sans-serif" font-size="12">`;
+    const clip = `<clipPath id="c"><rect x="${left}" y="${top}" width="${right - left}" height="${bottom - top}"/></clipPath><rect width="100%" height="100%" fill="${colour("card")}"/>`;
+    keep(`${this.file}.svg`, new Blob([head, clip, ...parts, "</svg>\n"], { type: "image/svg+xml" }));
+  }
 }

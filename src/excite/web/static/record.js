@@ -1,6 +1,6 @@
 // A recorded experiment: drop a file, map its columns, identify.
 
-import { download, el, options, say, symbol, Task, tell, upload } from "./api.js";
+import { command, download, el, options, say, symbol, Task, tell, upload } from "./api.js";
 import { digits, Plot, range, shown } from "./plot.js";
 
 const section = document.getElementById("record"), form = section.querySelector("form");
@@ -35,6 +35,7 @@ async function take(chosen) {
     if (own !== reading) return; // another was chosen while this one was read
     file = taken;
     showMapping();
+    preview();
     task.refresh();
     const counts = Object.values(file.columns);
     say(form, `${chosen.name}: ${counts.length} columns, ${Math.max(...counts)} samples. ${task.isBusy ? "Another file is still being identified; wait, or stop it." : "Map them, then identify."}`);
@@ -43,9 +44,26 @@ async function take(chosen) {
   }
 }
 
+/** The first rows of the file, and a small plot of every column over its rows. */
+function preview() {
+  const names = Object.keys(file.previews), rows = names.length ? file.previews[names[0]].first.length : 0;
+  at("preview").hidden = !names.length;
+  at("first-rows").replaceChildren(
+    el("thead", {}, el("tr", {}, ...names.map((name) => el("th", { scope: "col" }, name)))),
+    el("tbody", {}, ...Array.from({ length: rows }, (_, k) => el("tr", {}, ...names.map((name) => el("td", {}, file.previews[name].first[k] ?? ""))))));
+  at("columns").replaceChildren();
+  for (const name of names) {
+    const { index: x, values: y } = file.previews[name];
+    if (y.length < 2) continue;
+    new Plot(at("columns"), name, `column ${name} over the rows`).show({ x: [0, x.at(-1)], y: range(y, y[0] ?? 0), unit: "row", lines: [{ x, y, color: "output" }] });
+  }
+}
+
 const plant = () => catalogue.plants[at("record-plant").value];
 const needed = () => ["time", ...plant().inputs.map((p) => p.name), ...plant().outputs.map((p) => p.name)];
-const unitOf = (name) => [...plant().inputs, ...plant().outputs].find((p) => p.name === name)?.unit ?? "s";
+const unitsOf = (name) => [...plant().inputs, ...plant().outputs].find((p) => p.name === name)?.units ?? plant().units_of_time;
+/** The unit that a column's name gives in brackets, such as "t [ms]" or "angle (deg)". */
+const unitIn = (column) => /[[(]([^\])]+)[\])]\s*$/.exec(column)?.[1].trim();
 
 function showMapping() {
   if (file === null) return;
@@ -56,23 +74,31 @@ function showMapping() {
     const likely = found(name) ?? (name === "time" ? there.find((c) => /^(t|time|timestamps?)(?![a-z])/i.test(c)) : undefined);
     options(select, there, likely);
     if (likely === undefined) select.prepend(el("option", { value: "", selected: true }, "choose…"));
-    select.addEventListener("change", () => task.refresh());
+    const unit = el("select", { id: `unit-${name}` });
+    const guess = () => options(unit, unitsOf(name).map((word) => word || "1"), unitIn(select.value));
+    select.addEventListener("change", () => { guess(); task.refresh(); });
+    guess();
     return el("div", { class: "map" },
-      el("div", { class: "field" }, el("label", { for: select.id }, `${name} `, el("span", { class: "unit" }, unitOf(name))), select),
-      el("div", { class: "field" }, el("label", { for: `scale-${name}` }, "scale"),
+      el("div", { class: "field" }, el("label", { for: select.id }, name), select),
+      el("div", { class: "field" }, el("label", { for: unit.id }, "unit", el("span", { class: "unseen" }, ` of ${name}`)), unit),
+      el("div", { class: "field" }, el("label", { for: `scale-${name}` }, "scale", el("span", { class: "unseen" }, ` of ${name}`)),
         el("input", { id: `scale-${name}`, type: "number", step: "any", placeholder: "none" })));
   }));
   task.refresh();
 }
 
 function identify() {
-  const scales = {};
-  for (const name of needed()) if (at(`scale-${name}`).value !== "") scales[name] = +at(`scale-${name}`).value;
+  const scales = {}, units = {};
+  for (const name of needed()) {
+    if (at(`scale-${name}`).value !== "") scales[name] = +at(`scale-${name}`).value;
+    else if (at(`unit-${name}`).selectedIndex) units[name] = at(`unit-${name}`).value;
+  }
   const wanted = {
     upload: file.upload,
     plant: at("record-plant").value,
     columns: Object.fromEntries(needed().map((name) => [name, at(`column-${name}`).value])),
     scales,
+    units,
     estimator: at("estimator").value,
     initial_state: at("initial").value,
   };
@@ -86,10 +112,11 @@ function identify() {
   });
 }
 
-const hideResults = () => section.querySelectorAll(".view > section").forEach((part) => { part.hidden = true; });
+const results = () => section.querySelectorAll(".view > section:not(#preview)");
+const hideResults = () => results().forEach((part) => { part.hidden = true; });
 
-function show({ identification, plant: fitted, result, time, inputs, outputs, simulated }) {
-  section.querySelectorAll(".view > section").forEach((part) => { part.hidden = false; });
+function show({ identification, plant: fitted, result, time, inputs, outputs, simulated, command: again }) {
+  results().forEach((part) => { part.hidden = false; });
   say(form, `Done: ${identification.status}.`);
   section.querySelector(".view h2").textContent = `Identified: ${identification.files.join(", ")}, ${fitted.name}`;
   table(at("identified"), identification);
@@ -100,6 +127,7 @@ function show({ identification, plant: fitted, result, time, inputs, outputs, si
     download(`api/results/${result}/record.csv`, "Record"),
     download(`api/results/${result}/record.json`, "Sidecar"),
     download(`api/results/${result}/estimate.json`, "Estimate"));
+  at("record-again").replaceChildren(command(again));
   const parent = at("record-signals"), x = [time[0], time.at(-1)];
   parent.replaceChildren();
   const title = (part) => el("span", {}, part.name, " ", el("span", { class: "unit" }, part.shown_unit));
@@ -111,7 +139,7 @@ function show({ identification, plant: fitted, result, time, inputs, outputs, si
     const measured = outputs.map((row) => row[i] * part.factor), model = simulated.map((row) => row[i] * part.factor);
     new Plot(parent, title(part), `${part.name}, measured and simulated, over time`).show({
       x, y: range([...measured, ...model], 0), unit: "s",
-      lines: [{ x: time, y: measured, color: "output" }, { x: time, y: model, color: "simulated", dash: [5, 4] }],
+      lines: [{ x: time, y: measured, name: "measured", color: "output", points: true }, { x: time, y: model, name: "simulated", color: "simulated" }],
     });
     const left = measured.map((v, k) => v - model[k]);
     new Plot(parent, el("span", {}, "residual of ", title(part)), `measured minus simulated ${part.name}`).show({

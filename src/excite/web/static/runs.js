@@ -5,22 +5,39 @@ import { curves } from "./curves.js";
 import { table } from "./record.js";
 
 const section = document.getElementById("runs"), view = document.getElementById("run-view");
-let chosen = "", following = 0;
+const filter = document.getElementById("run-filter"), order = document.getElementById("run-order");
+let all = [], chosen = "", following = 0;
+filter.addEventListener("input", list);
+order.addEventListener("change", list);
 
-export async function open() {
+/** Lists the runs; one that the address names is shown. */
+export async function open(name) {
   try {
-    const { runs } = await get("api/runs");
-    say(section, runs.length ? "" : "The run folder is empty; studies and identifications appear here.");
-    document.getElementById("run-list").replaceChildren(...runs.map((run) => el("li", {},
-      el("button", { type: "button", "aria-pressed": "false", click: (event) => show(run, event.currentTarget) },
-        run.name, el("small", {}, [run.kind, run.plant, run.is_finished ? "" : "not finished"].filter(Boolean).join(", "))))));
+    all = (await get("api/runs")).runs;
+    say(section, all.length ? "" : "The run folder is empty; studies and identifications appear here.");
+    list();
+    const run = all.find((each) => each.name === name);
+    if (run) await show(run);
+    else if (name) say(section, `The run folder has no run ${name}.`, true);
   } catch (error) {
     say(section, error.message, true);
   }
 }
 
-async function show(run, button) {
-  section.querySelectorAll("button").forEach((b) => b.setAttribute("aria-pressed", String(b === button)));
+const about = (run) => [run.kind, run.plant, run.changed.slice(0, 10), run.is_finished ? "" : "not finished"].filter(Boolean).join(", ");
+
+/** The runs whose name, kind, plant or date has the words of the filter. */
+function list() {
+  const words = filter.value.toLowerCase().split(/\s+/).filter(Boolean);
+  const found = all.filter((run) => words.every((word) => `${run.name} ${run.title} ${about(run)}`.toLowerCase().includes(word)));
+  if (order.value === "newest") found.sort((a, b) => b.changed.localeCompare(a.changed));
+  document.getElementById("run-list").replaceChildren(...found.map((run) => el("li", {},
+    el("button", { type: "button", "data-name": run.name, "aria-pressed": String(run.name === chosen), click: () => { location.hash = `runs/${encodeURIComponent(run.name)}`; } },
+      run.name, el("small", {}, about(run))))));
+}
+
+async function show(run) {
+  section.querySelectorAll("#run-list button").forEach((b) => b.setAttribute("aria-pressed", String(b.dataset.name === run.name)));
   chosen = run.name;
   clearTimeout(following);
   say(section, "");
@@ -45,7 +62,7 @@ async function show(run, button) {
     card.append(el("p", { class: "row downloads" }, ...report, ...others.map(link)));
     if (policies.length) card.append(el("details", { open: policies.length < 4 }, el("summary", {}, `Policies (${policies.length})`), el("p", { class: "row downloads" }, ...policies.map(link))));
     const isFollowed = content.kind === "campaign" && !content.is_finished && !content.campaign.interrupted;
-    if (isFollowed) following = setTimeout(() => chosen === run.name && !section.hidden && show(run, button), 2000);
+    if (isFollowed) following = setTimeout(() => chosen === run.name && !section.hidden && show(run), 2000);
     view.replaceChildren(card);
     if (!isFollowed && view.getBoundingClientRect().top > innerHeight / 2) view.scrollIntoView();
     if (content.curves.length) {
