@@ -301,7 +301,7 @@ class Campaign:
 
     def _next(self, result: Identification) -> NextExperiment | None:
         """The candidates of the coming round; None where the estimate is not to be trusted."""
-        if result.misfit_factor > 1 or result.held:
+        if unexplained(result) or result.held:
             return None
         region, known = region_of(self.plant, result, self.spread), self.known
         made = candidates(
