@@ -375,6 +375,7 @@ def test_records_that_the_plant_does_not_explain_are_a_warning():
     assert "times the declared noise: the plant may be wrong" in sentence
     assert f"warning: {sentence}"[:60] in repr(campaign)
     assert campaign.ask() is campaign.policy  # a signal redesigned for this plant may be unsafe
+    assert campaign.tell(record).played == "policy"
 
 
 def test_a_share_of_nothing_is_infinite():

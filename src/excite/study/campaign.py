@@ -251,7 +251,7 @@ class Campaign:
         self.result: Identification | None = None
         self.next: NextExperiment | None = None
         self.reason, self.interrupted, self.prediction = "", "", ""
-        self._haste = 1.0
+        self._haste, self._asked = 1.0, ""
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -292,6 +292,7 @@ class Campaign:
         if self.next is not None and chosen is None and is_other:
             self.reason = self.next.decision  # the opening may be unsafe on this plant
             return None
+        self._asked = self._opening_name if chosen is None else chosen.name
         return self.opening if chosen is None else chosen.excitation
 
     @property
@@ -371,7 +372,7 @@ class Campaign:
             decision = f"{structure}; {decision}"
         told = Round(count, played, ended, near, known, status, decision)
         self.rounds.append(told)
-        self.next = None
+        self.next, self._asked = None, ""
         return told
 
     def _compare(self) -> str:
@@ -407,11 +408,11 @@ class Campaign:
         return chi2_tail(int(np.isfinite(sizes).sum()), float(np.nansum(sizes))) > RARE
 
     def _played(self, record: Record) -> str:
-        """The name of what a round played."""
+        """The name of what a round played; without `ask`, it is taken from the record."""
         if self.is_undecided:
             return DISCRIMINATING
-        if self.next is not None and self.next.chosen is not None:
-            return self.next.chosen.name
+        if self._asked:
+            return self._asked
         first = self.records[0].inputs[:-1]
         count = min(len(first), len(record.inputs) - 1)
         is_opening = self.result is None or "policy_hash" in record.metadata or (
