@@ -19,6 +19,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import h5py
 import httpx2 as httpx
@@ -26,10 +27,12 @@ import numpy as np
 import pandas
 import pytest
 import scipy.io
+import uvicorn
 from bags import write
 from cluster import wait_for
 from commands import PATIENCE, excite
 from served import EXPERIMENT, MAX_GAP, TRIES, Told, browser, served, streamed
+from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.testclient import TestClient
 
@@ -40,7 +43,8 @@ from excite.record import READ_ENDINGS
 from excite.record.bags import BAG_ENDINGS
 from excite.report.html import report_html
 from excite.study.objectives import OBJECTIVES
-from excite.web import application
+from excite.web import application, connections
+from excite.web.connections import MAX_SILENT
 from excite.web.first import FILE, events
 from excite.web.places import _file_name, _receive
 from excite.web.requests import MAX_UPLOAD, RefusedError
@@ -111,6 +115,44 @@ def printed(*words: str, folder: Path) -> dict[str, Any]:
 
 
 # -------------------------------------------------------------------------------- numbers
+
+
+def test_connections_that_ask_nothing_hold_nobody_up(address: str):
+    """More than are kept, with unfinished heads; the oldest are closed, and the page answers."""
+    where = urlsplit(address)
+    assert where.hostname
+    with contextlib.ExitStack() as stack:
+        opened = []
+        for _ in range(MAX_SILENT + 100):
+            one = stack.enter_context(socket.create_connection((where.hostname, where.port)))
+            one.sendall(b"GET / HTTP/1.1\r\nHost: ")
+            opened.append(one)
+        assert httpx.get(address + "/", timeout=PATIENCE).status_code == 200
+        for one in opened[:50]:
+            one.settimeout(PATIENCE)
+            with contextlib.suppress(ConnectionResetError):
+                assert one.recv(1) == b""
+        opened[-1].setblocking(False)
+        with pytest.raises(BlockingIOError):  # the newest is still open
+            opened[-1].recv(1)
+
+
+@pytest.mark.parametrize("sent", [b"", b"GET / HT", b"POST /api/session HTTP/1.1\r\nHost: x\r\n"])
+def test_a_request_that_does_not_come_is_not_awaited(sent: bytes, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(connections, "PATIENCE", 0.4)
+    config = uvicorn.Config(Starlette(), http=connections.Connection, log_level="error", port=0)
+    server = uvicorn.Server(config)
+    listening = socket.create_server(("127.0.0.1", 0))
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]})
+    thread.start()
+    try:
+        with socket.create_connection(listening.getsockname()) as one:
+            one.settimeout(PATIENCE)
+            one.sendall(sent)
+            assert one.recv(1) == b""
+    finally:
+        server.should_exit = True
+        thread.join()
 
 
 def test_what_the_page_shows_first_is_what_its_workers_compute():
@@ -636,8 +678,10 @@ def test_texts_and_borders_can_be_seen(page: TestClient):
 
 
 @pytest.mark.parametrize(
-    "host", ["evil.example", "evil.example:8000", "127.0.0.1:8001", "127.0.0.1", "", "[", "a:b:c"]
-)
+    "host",
+    ["evil.example", "evil.example:8000", "127.0.0.1:8001", "127.0.0.1", "", "[", "a:b:c",
+     "x@127.0.0.1:8000", "127.0.0.1:8000/a", "127.0.0.1:8000#a", "127.0.0.1:08000"],
+)  # fmt: skip
 def test_another_host_is_refused(host: str, page: TestClient):
     for path in ("/", "/api/runs", "/static/bench.js"):
         assert page.get(path, headers={"host": host}).status_code == 421

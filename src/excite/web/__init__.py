@@ -27,6 +27,7 @@ from starlette.responses import FileResponse, JSONResponse
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
+from .connections import Connection
 from .events import Catalogue
 from .places import routes as place_routes
 from .requests import MAX_BODY, RefusedError
@@ -139,6 +140,7 @@ class _Server(uvicorn.Server):
         super().__init__(
             uvicorn.Config(
                 app,
+                http=Connection,
                 log_level="error",
                 server_header=False,
                 proxy_headers=False,

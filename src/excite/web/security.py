@@ -81,8 +81,10 @@ class Guard:
             name, port = (parts.hostname or "").lower(), parts.port or 80
         except (ValueError, IndexError):
             name, port = "", 0
-        bound = scope.get("server") or ("", port)
-        if len(hosts) != 1 or port != bound[1] or not self._is_own(name):
+        bound, plain = scope.get("server") or ("", port), f"[{name}]" if ":" in name else name
+        exact = [f"{plain}:{port}", *([plain] if port == 80 else [])]  # no user, no other spelling
+        is_exact = len(hosts) == 1 and hosts[0].lower() in exact
+        if not is_exact or port != bound[1] or not self._is_own(name):
             raise RefusedError(421, "the bench page does not answer to this address")
 
     def _is_own(self, name: str) -> bool:
