@@ -90,8 +90,8 @@ WITHOUT_JAX = (
     "report",
     "web",
 )
-WORKERS = ("web/jobs",)
-"""What runs in a worker of the page, and may load JAX there."""
+WORKERS = ("web/jobs", "web/first")
+"""What runs in a worker of the page, or writes what a worker would say, and may load JAX there."""
 
 BY_NAME = {
     "study/tasks": ["training/gradient", "training/ppo"],

@@ -18,10 +18,11 @@ import pytest
 
 from excite.cli import main
 from excite.policy import read_policy
+from excite.report.answer import answered
 from excite.report.estimates import parameter_cells, residual_cells, residual_in_words
 from excite.report.html import report_html
 from excite.report.numbers import number
-from excite.report.rows import EstimateSummary
+from excite.report.rows import EstimateSummary, Row, StudyFacts
 from excite.report.sections import elements
 from excite.report.study_table import difference_cells, footnotes
 from excite.report.svg import inline_svg
@@ -211,6 +212,59 @@ def test_an_experiment_makes_one_small_page_that_needs_nothing_else(name, made):
     assert page.tags["svg"] >= 1
     assert page.tags["img"] == 0
     assert str(made.parent) not in page.text  # where it lies is nobody's business
+
+
+def row(method: str, estimator: str, log_det: float, bound: float, violations: int = 0) -> Row:
+    """A row of a study of one parameter, with errors a tenth above the bound, or far above."""
+    rms = bound * (1.1 if estimator == "nls" else 50.0)
+    error = {"mean": 0.8 * rms, "sd": rms, "median": rms, "rms": rms}
+    return Row.model_validate({
+        "method": method, "estimator": estimator, "evaluations": 100, "failed": 0, "failures": {},
+        "violations": violations, "log_det_information": log_det, "log_det_information_sd": 1.0,
+        "violation_rate": {"estimate": violations / 100, "ci95": [0.0, 0.037]},
+        "max_abs_output": {"mean": 1.0, "sd": 1.0, "output": "y", "unit": "m"},
+        "relative_error_percent": {"k": error}, "cramer_rao_percent": {"k": bound},
+        "rms_over_cramer_rao": {"k": 1.1}, "coverage95_percent": {"k": 95.0},
+        "beyond_6_std_errors": 0,
+    })  # fmt: skip
+
+
+ROWS = [
+    row("chirp", "arx", 50.0, 0.4), row("chirp", "nls", 50.0, 0.4),
+    row("loud", "nls", 60.0, 0.05, violations=3), row("learned", "nls", 55.0, 0.1),
+    row("clairvoyant", "nls", 70.0, 0.02),
+]  # fmt: skip
+FACTS = StudyFacts(
+    name="s", plant="p", episodes=100, num_steps=10, seed=0, spread=0.3,
+    methods={"chirp": {}, "loud": {}}, estimators={"arx": {}, "nls": {}},
+)  # fmt: skip
+
+
+def test_a_study_is_answered_by_the_most_informative_excitation_without_a_violation():
+    found = answered(ROWS, FACTS, {"learned": "largest output found: 0.97; found, not proved"})
+    assert found.best is not None
+    assert (found.best.method, found.best.estimator) == ("learned", "nls")
+    first, second, third = found.sentences
+    assert "Of 2 excitations that reached no critical level" in first
+    assert "learned tells most about the plant: log det 55.0" in first
+    assert "4 times smaller than those of chirp" in first  # 0.4 over 0.1
+    assert second.startswith("It reached a critical level in 0 of 100 experiments (sampled; 95 %")
+    assert third == "Largest output found: 0.97."
+    unsearched = answered(ROWS, FACTS, {"learned": "no certificate: no search was made"})
+    assert unsearched.sentences[2] == "No search was made."
+    assert [cells[0] for cells in found.table()[1]] == ["learned", "chirp", "loud"]
+    none = answered([ROWS[2]], FACTS, {})
+    assert none.best is None
+    assert none.sentences == (
+        "No excitation was without a violation: loud had the fewest, 3 of 100.",
+    )
+
+
+@pytest.mark.parametrize("name", ["frontier", "table1"])
+def test_a_page_of_a_study_begins_with_the_answer(name):
+    body = report_html([RESULTS / name]).partition("<main>")[2]
+    assert body.index('class="answer"') < body.index("<svg") < body.index("<table>")
+    assert body.index("<table>") < body.index("<h3>All results</h3>")
 
 
 def test_what_a_search_found_for_an_agent_is_on_its_page():

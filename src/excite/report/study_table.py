@@ -239,7 +239,7 @@ def _cells(rows: Sequence[Row], row: Row) -> list[str]:
         cells += [text, number(row.cramer_rao_percent[name], 2)]
     cells += [
         mean_sd(row.max_abs_output.mean, row.max_abs_output.sd),
-        _violations(row),
+        violations_cell(row),
         f"{row.failed}/{row.evaluations}",
         *_rig_cells(row.on_rig, row.evaluations).values(),
         number(row.log_det_information, 4),
@@ -249,7 +249,7 @@ def _cells(rows: Sequence[Row], row: Row) -> list[str]:
     return cells + _training_cells(row) * _is_trained(rows)
 
 
-def _violations(row: Row) -> str:
+def violations_cell(row: Row) -> str:
     """Count and interval of the rate; for several seeds, that of the seeds."""
     counts = row.by_seed
     if counts is None:

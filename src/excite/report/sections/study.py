@@ -11,6 +11,7 @@ from ...description import PlantDescription, names_of
 from ...files import folder_word, read_columns, read_json
 from ...policy import POLICY_ENDING, read_policy
 from ...record import Record
+from ..answer import answered
 from ..figures import benchmark_figure
 from ..frontier import frontier_figure, lengths_figure
 from ..rows import EpisodeData, Options, StudyFacts
@@ -60,15 +61,26 @@ class StudyRun(Run):
 
     def section(self, name: str) -> Section:
         """The section of a study."""
-        t = self.table
+        t, claims = self.table, _claims(self)
+        answer = answered(t.rows, t.study, claims)
         notes = "".join(map(paragraph, footnotes(t.study)))
+        seeds = t.best_seeds
+        searched = bullets(
+            f"{agent}, seed {seeds[agent]}: {told}" for agent, told in claims.items()
+        )
+        everything = table(*t.cells(), name=t.study.heading)
         parts = [
-            table(*t.cells(), name=t.study.heading),
-            f'<div class="notes">\n{notes}</div>\n',
+            f'<div class="answer">\n{"".join(map(paragraph, answer.sentences))}</div>\n',
+            _frontier(t, name),
+            table(*answer.table(), labels=1, name="the excitations"),
+            paragraph(answer.caption),
             _comparisons(t, name),
-            _claims(self),
+            heading("Searched for violations") + searched if searched else "",
             _learning(self, name),
             _episodes(self, name),
+            heading("All results"),
+            everything,
+            f'<div class="notes">\n{notes}</div>\n',
             _differences(t),
             _settings(self),
         ]
@@ -89,8 +101,16 @@ def read_study_run(marker: Marker) -> StudyRun:
     return StudyRun(marker, StudyTable.in_folder(folder, study, _ADVICE))
 
 
+def _frontier(found: StudyTable, name: str) -> str:
+    """Information against violations; nothing where there is only one method."""
+    if len({row.method for row in found.rows}) < 2:
+        return ""
+    caption = "Information of each method, and how many experiments reach the critical level."
+    return figure(frontier_figure(found.rows, found.study.heading), f"{name}-frontier", caption)
+
+
 def _comparisons(found: StudyTable, name: str) -> str:
-    """Error against bound, information against violations, bound against length."""
+    """Error against bound, bound against length."""
     rows, title = found.rows, found.study.heading
     parts = [
         heading("Error against bound"),
@@ -101,15 +121,6 @@ def _comparisons(found: StudyTable, name: str) -> str:
             "estimator with the same data.",
         ),
     ]
-    if len({row.method for row in rows}) > 1:
-        parts += [
-            heading("Information against violations"),
-            figure(
-                frontier_figure(rows, title),
-                f"{name}-frontier",
-                "Information of each method, and how many experiments reach the critical level.",
-            ),
-        ]
     if any(row.bound_by_length for row in rows):
         parts += [
             heading("Bound against length"),
@@ -122,14 +133,14 @@ def _comparisons(found: StudyTable, name: str) -> str:
     return "".join(parts)
 
 
-def _claims(run: StudyRun) -> str:
+def _claims(run: StudyRun) -> dict[str, str]:
     """What a search for violations found for the best seed of each agent."""
-    seeds, claims = run.marker.folder / "seeds", []
+    seeds, claims = run.marker.folder / "seeds", dict[str, str]()
     for agent, seed in run.table.best_seeds.items():
         path = seeds / folder_word(agent) / f"{seed}/policy{POLICY_ENDING}"
         if path.is_file():
-            claims.append(f"{agent}, seed {seed}: {read_policy(path).claim}")
-    return heading("Searched for violations") + bullets(claims) if claims else ""
+            claims[agent] = read_policy(path).claim
+    return claims
 
 
 def _learning(run: StudyRun, name: str) -> str:
