@@ -445,6 +445,10 @@ def test_an_experiment_is_paused_and_played_again(address: str, page: Page):
     expect(page.locator("#player output")).to_have_text("9.90 s")
     page.get_by_role("button", name="Play").click()
     expect(page.locator("#player output")).to_have_text("50.0 s", timeout=WAIT)
+    # The plots of the prepared result are given up.
+    assert (
+        page.evaluate("document.querySelector('#experiment .view').group.sync.plots.length") == 11
+    )
     expect(page.get_by_role("button", name="Play")).to_be_visible()
 
 

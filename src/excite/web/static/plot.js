@@ -5,7 +5,11 @@ import { el, keep } from "./api.js";
 const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
 
 const plots = new Set();
-const alive = () => [...plots].filter((plot) => plot.chart.isConnected || plots.delete(plot) && false);
+/** The plots on the page; those that were taken away are given up. */
+function alive() {
+  for (const plot of plots) if (plot.u && !plot.chart.isConnected) plot.end();
+  return [...plots];
+}
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => alive().forEach((plot) => plot.draw(true)));
 const resized = new ResizeObserver((entries) => entries.forEach((entry) => entry.target.plot.resize()));
 
@@ -98,6 +102,7 @@ export class Plot {
     this.name = el("b", {}, title);
     parent.append(el("figure", {}, el("figcaption", {}, this.name, this.read, this.note, this.files), this.legend, this.chart));
     Object.assign(this, { what: null, u: null, made: "", hidden: new Set() });
+    alive();
     plots.add(this);
     resized.observe(this.chart);
   }
@@ -115,6 +120,12 @@ export class Plot {
   get lines() { return this.what.lines.filter((line) => !this.hidden.has(line.name)); }
 
   get size() { return { width: this.chart.clientWidth, height: this.chart.clientHeight }; }
+
+  end() {
+    this.u.destroy();
+    resized.unobserve(this.chart);
+    plots.delete(this);
+  }
 
   resize() { if (this.u) this.u.setSize(this.size); else this.draw(); }
 
