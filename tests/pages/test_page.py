@@ -116,7 +116,7 @@ def ready(page: Page, address: str, part: str = "experiment") -> Page:
     page.goto(f"{address}/#{part}")
     expect(page.locator(f"#{part} .primary")).to_be_enabled(timeout=WAIT)
     if part == "experiment":
-        page.get_by_text("Advanced").click()
+        page.locator("#experiment form summary").click()
     return page
 
 
@@ -493,6 +493,37 @@ def test_a_file_is_previewed_and_its_units_are_taken_from_the_names(address: str
     page.get_by_role("button", name="Copy").click()
     expect(page.locator("#record-again [role=status]")).to_have_text("Copied.")
     assert page.evaluate("navigator.clipboard.readText()") == command
+
+
+def test_what_the_plant_leaves_out_is_estimated_by_one_click(
+    address: str, page: Page, tmp_path: Path
+):
+    late = ex.simulate("aero2+delay_voltage", "chirp", params={"delay_voltage": 0.06}, steps=300)
+    late.save(tmp_path / "late.csv")
+    page.goto(f"{address}/#record")
+    expect(page.locator("#record-plant option").first).to_be_attached(timeout=WAIT)
+    page.locator("#file").set_input_files(tmp_path / "late.csv")
+    expect(status(page, "record")).to_contain_text("301 samples", timeout=WAIT)
+    page.get_by_role("button", name="Identify").click()
+    cause = page.get_by_role("button", name="Estimate delay_voltage, too")
+    expect(cause).to_be_visible(timeout=WAIT)
+    cause.click()
+    expect(page.locator("#identified tbody tr")).to_have_count(4, timeout=WAIT)
+    found = page.locator("#identified tbody tr").nth(3).locator("td").first.inner_text()
+    assert float(found) == pytest.approx(0.06, rel=0.01)
+    expect(page.locator("#effect")).to_have_value("delay_voltage")
+    command = page.locator("#record-again pre").text_content()
+    assert command is not None
+    assert "--plant aero2+delay_voltage" in command
+    page.get_by_text("Correlation of the estimates").click()
+    cells = page.locator("#correlations td")
+    expect(cells).to_have_count(16)
+    expect(cells.first).to_have_text("1.00")
+    # The residual is white now: about 95 % of 30 correlations within the band.
+    plot = PLOT.format("#residual-echoes .chart", 0) + ".what"
+    values, edge = page.evaluate(f"[{plot}.lines[0].y, {plot}.bands[0].upper[0]]")
+    assert len(values) == 30
+    assert sum(abs(v) > edge for v in values) <= 6
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

@@ -48,9 +48,13 @@ def test_the_page_says_how_often_the_true_rival_is_found_with_much_noise():
     assert max(row["largest_nearness"] for row in designed) < 1
 
 
-@pytest.mark.parametrize("name", ["compare", "compare_emps"])
+@pytest.mark.parametrize(
+    "name", ["compare", "compare_emps", "compare_dc_motor", "compare_cart_pole"]
+)
 def test_the_page_compares_campaigns_with_other_methods(name):
     found = json.loads((FOLDER / f"{name}.json").read_text())
+    plant = name.partition("_")[2]
+    is_named = plant in ("dc_motor", "cart_pole")
     for method, row in found["rows"].items():
         cells = []
         for target in (key for key in row if key.startswith("0.")):
@@ -58,11 +62,12 @@ def test_the_page_compares_campaigns_with_other_methods(name):
             shown = [f"{own[q]:.0f}" if own[q] else "–" for q in ("median", "90 %", "all")]
             cells.append(", ".join([*shown, str(own["missed"])]))
         assert any(
-            line.startswith(f"| {method} | {' | '.join(cells)} |") for line in PAGE.splitlines()
+            line.startswith(f"| {method}{f', {plant}' * is_named} | {' | '.join(cells)} |")
+            for line in PAGE.splitlines()
         )
-    policy = "aero2-wide" if name == "compare" else str(FOLDER / "policies/emps-wide.safetensors")
+    policy = FOLDER / f"policies/{plant}-wide.safetensors" if plant else "aero2-wide"
     assert found["policy_hash"] == read_policy(policy).hash
-    assert name != "compare" or not any(row["violations"] for row in found["rows"].values())
+    assert name == "compare_emps" or not any(row["violations"] for row in found["rows"].values())
 
 
 def test_intervals_hold_where_a_round_ends_by_its_own_estimate():

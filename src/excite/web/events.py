@@ -35,6 +35,9 @@ class IdentificationRequest(TypedDict):
     columns: dict[str, str]
     scales: Numbers
     units: dict[str, str]
+    intervals: str
+    hold_input: str
+    effect: str
 
 
 class StartedEvent(TypedDict):
@@ -173,7 +176,10 @@ class Columns(TypedDict):
 
 
 class Identified(TypedDict):
-    """Parameters of an uploaded record, and the samples of it that a screen can show."""
+    """Parameters of an uploaded record, and the samples of it that a screen can show.
+
+    `is_whole` says whether these are all samples.
+    """
 
     kind: Literal["identified"]
     command: str
@@ -183,6 +189,7 @@ class Identified(TypedDict):
     inputs: Rows
     outputs: Rows
     simulated: Rows
+    is_whole: bool
     result: NotRequired[str]
 
 

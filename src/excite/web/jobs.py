@@ -35,7 +35,7 @@ from ..description import (
 from ..estimation import NLS, Experiments, Status, stack_experiments
 from ..estimation.catalogue import ESTIMATORS
 from ..estimation.diagnosis import half_95
-from ..estimation.identify import InitialState, identify
+from ..estimation.identify import InitialState, Intervals, identify
 from ..estimation.result import Identification
 from ..excitation.catalogue import EXCITATIONS, LOOP
 from ..files import write_bytes
@@ -48,6 +48,7 @@ from ..information import (
 )
 from ..plant import AbstractPlant
 from ..plant.catalogue import PLANTS, plant_named
+from ..plant.extension import extended, extensions_of
 from ..policy import Policy, mismatch, read_policy, shipped_policies
 from ..record import column_lengths
 from ..record.bags import is_bag
@@ -81,13 +82,15 @@ def catalogue(plants: Mapping[str, str]) -> Iterator[Event]:
     names = [*EXCITATIONS, *(LOOP + name for name in EXCITATIONS)]
     shown = {}
     for name, file in {**{name: name for name in PLANTS}, **plants}.items():
-        description = _plant(file).description
+        plant = _plant(file)
+        description = plant.description
         fitting = {
             n: {"num_steps": p.layout.num_steps, "claim": p.claim}
             for n, p in policies.items()
             if _fits(p, description)
         }
-        shown[name] = {**_shown(description), "policies": fitting}
+        effects = list(extensions_of(plant))
+        shown[name] = {**_shown(description), "policies": fitting, "effects": effects}
     yield {
         "kind": "catalogue",
         "version": __version__,
@@ -251,10 +254,14 @@ def _experiment_again(asked: ExperimentRequest) -> str:
 
 def _identification_again(asked: IdentificationRequest, name: str) -> str:
     """The command that makes the same run folder of a file."""
+    plant = f"{asked['plant']}+{asked['effect']}" if asked["effect"] else asked["plant"]
     words = [
         "excite", "identify", f"./{name}" if name[0] == "-" else name,
-        "--plant", asked["plant"], "--estimator", asked["estimator"],
-        "--initial-state", asked["initial_state"], *_given("--column", asked["columns"]),
+        "--plant", plant, "--estimator", asked["estimator"],
+        "--initial-state", asked["initial_state"],
+        *(["--intervals", asked["intervals"]] if asked["intervals"] != "linear" else []),
+        *(["--hold-input", asked["hold_input"]] if asked["hold_input"] != "constant" else []),
+        *_given("--column", asked["columns"]),
         *_given("--scale", asked["scales"]), *_given("--unit", asked["units"]), "--out", "run",
     ]  # fmt: skip
     return shlex.join(words)
@@ -367,11 +374,14 @@ def identified(
     asked: IdentificationRequest, source: str, name: str, folder: str
 ) -> Iterator[Event]:
     """Parameters from an uploaded file; writes a run folder like `excite identify`."""
+    plant = _plant(asked["plant"])
     with contextlib.chdir(source):
         result = identify(
             Path(name),
-            _plant(asked["plant"]),
+            extended(plant, [asked["effect"]]) if asked["effect"] else plant,
             asked["estimator"],
+            intervals=cast(Intervals, asked["intervals"]),
+            hold_input=asked["hold_input"],
             initial_state=cast(InitialState, asked["initial_state"]),  # checked there
             columns=asked["columns"],
             scales=asked["scales"],
@@ -392,6 +402,7 @@ def identified(
         "inputs": record.inputs[kept].tolist(),
         "outputs": record.outputs[kept].tolist(),
         "simulated": fitted.simulated[kept].tolist(),
+        "is_whole": len(kept) == len(record.time),
     }
 
 

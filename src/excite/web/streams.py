@@ -108,6 +108,9 @@ def _identification(asked: Asked, plants: Mapping[str, str]) -> IdentificationRe
         "columns": texts(asked, "columns"),
         "scales": numbers(asked, "scales"),
         "units": texts(asked, "units"),
+        "intervals": word({"intervals": "linear", **asked}, "intervals"),
+        "hold_input": word({"hold_input": "constant", **asked}, "hold_input"),
+        "effect": word(asked, "effect") if asked.get("effect") else "",
     }
 
 

@@ -87,7 +87,7 @@ class Group {
 export class Plot {
   /** A figure in `parent`; `about` says in words what is drawn. Plots of a view share cross-hair and zoom. */
   constructor(parent, title, about) {
-    const view = parent.closest(".shared") ?? parent; // plots of one experiment
+    const view = parent.closest(".own, .shared") ?? parent; // plots of one experiment
     this.group = (view.group ??= new Group());
     this.note = el("span");
     this.read = el("span", { class: "read" });

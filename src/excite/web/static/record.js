@@ -12,7 +12,8 @@ export function begin(known) {
   task = new Task(form, () => file !== null && needed().every((name) => at(`column-${name}`)?.value));
   options(at("record-plant"), Object.keys(catalogue.plants), "aero2");
   options(at("estimator"), catalogue.estimators, "nls");
-  at("record-plant").addEventListener("change", showMapping);
+  at("record-plant").addEventListener("change", () => { effects(); showMapping(); });
+  effects();
   at("file").addEventListener("change", () => take(at("file").files[0]));
   const drop = section.querySelector(".drop");
   const over = (is) => (event) => { event.preventDefault(); drop.classList.toggle("over", is); };
@@ -59,6 +60,8 @@ function preview() {
   }
 }
 
+const effects = () => at("effect").replaceChildren(el("option", { value: "" }, "nothing"), ...plant().effects.map((name) => el("option", { value: name }, name)));
+
 const plant = () => catalogue.plants[at("record-plant").value];
 const needed = () => ["time", ...plant().inputs.map((p) => p.name), ...plant().outputs.map((p) => p.name)];
 const unitsOf = (name) => [...plant().inputs, ...plant().outputs].find((p) => p.name === name)?.units ?? plant().units_of_time;
@@ -101,6 +104,9 @@ function identify() {
     units,
     estimator: at("estimator").value,
     initial_state: at("initial").value,
+    effect: at("effect").value,
+    hold_input: at("hold-input").value,
+    intervals: at("intervals").value,
   };
   hideResults();
   say(form, "Waiting for a worker…");
@@ -115,7 +121,7 @@ function identify() {
 const results = () => section.querySelectorAll(".view > section:not(#preview)");
 const hideResults = () => results().forEach((part) => { part.hidden = true; });
 
-function show({ identification, plant: fitted, result, time, inputs, outputs, simulated, command: again }) {
+function show({ identification, plant: fitted, result, time, inputs, outputs, simulated, is_whole: isWhole, command: again }) {
   results().forEach((part) => { part.hidden = false; });
   say(form, `Done: ${identification.status}.`);
   section.querySelector(".view h2").textContent = `Identified: ${identification.files.join(", ")}, ${fitted.name}`;
@@ -127,9 +133,12 @@ function show({ identification, plant: fitted, result, time, inputs, outputs, si
     download(`api/results/${result}/record.csv`, "Record"),
     download(`api/results/${result}/record.json`, "Sidecar"),
     download(`api/results/${result}/estimate.json`, "Estimate"));
+  causes(identification.suspects ?? []);
+  correlations(Object.keys(identification.params), identification.correlation ?? []);
   at("record-again").replaceChildren(command(again));
   const parent = at("record-signals"), x = [time[0], time.at(-1)];
   parent.replaceChildren();
+  at("residual-echoes").replaceChildren();
   const title = (part) => el("span", {}, part.name, " ", el("span", { class: "unit" }, part.shown_unit));
   fitted.inputs.forEach((part, i) => {
     const y = inputs.map((row) => row[i]);
@@ -145,7 +154,42 @@ function show({ identification, plant: fitted, result, time, inputs, outputs, si
     new Plot(parent, el("span", {}, "residual of ", title(part)), `measured minus simulated ${part.name}`).show({
       x, y: range(left, 0), unit: "s", lines: [{ x: time, y: left, color: "output", width: 1 }],
     });
+    if (!isWhole) return;
+    const { lags, values, bound } = echoes(left), most = lags.at(-1) + 0.5;
+    new Plot(at("residual-echoes"), el("span", {}, "correlation of the residual of ", part.name), `autocorrelation of the residual of ${part.name} over the lag in samples; white noise lies within the band in 95 %`).show({
+      x: [0, most], y: range(values, -0.2, 0.2), unit: "samples", bands: [{ x: [0, most], lower: [-bound, -bound], upper: [bound, bound], color: "band" }],
+      lines: [{ x: lags, y: values, color: "output", points: true }],
+    });
   });
+}
+
+/** Buttons that estimate what the plant may leave out, the likeliest first. */
+function causes(suspects) {
+  const possible = suspects.filter(({ name }) => plant().effects.includes(name));
+  at("causes").replaceChildren(...possible.slice(0, 3).map(({ name }, i) => el("button", {
+    type: "button", click: () => { at("effect").value = name; identify(); },
+  }, i ? `Or estimate ${name}` : `Estimate ${name}, too`)));
+}
+
+/** The correlations as a table, the stronger the darker. */
+function correlations(names, rows) {
+  at("correlations").hidden = rows.length < 2;
+  const cell = (value) => {
+    const shade = el("td", {}, value === null ? "–" : value.toFixed(2));
+    if (value !== null) shade.style.background = `color-mix(in srgb, var(--${value < 0 ? "simulated" : "output"}) ${Math.round(35 * Math.abs(value))}%, transparent)`;
+    return shade;
+  };
+  at("correlations").querySelector("table").replaceChildren(
+    el("thead", {}, el("tr", {}, el("th"), ...names.map((name) => el("th", { scope: "col" }, symbol(name))))),
+    el("tbody", {}, ...rows.map((row, i) => el("tr", {}, el("th", { scope: "row" }, symbol(names[i])), ...row.map(cell)))));
+}
+
+/** The correlation of a residual with itself, of up to so many samples later. */
+function echoes(left, most = 30) {
+  const seen = left.filter(Number.isFinite), mean = seen.reduce((a, b) => a + b, 0) / seen.length;
+  const own = left.map((v) => (Number.isFinite(v) ? v - mean : 0)), power = own.reduce((a, v) => a + v * v, 0) || 1;
+  const lags = Array.from({ length: Math.min(most, left.length - 1) }, (_, k) => k + 1);
+  return { lags, values: lags.map((k) => own.slice(k).reduce((a, v, i) => a + v * own[i], 0) / power), bound: 1.96 / Math.sqrt(seen.length) };
 }
 
 /** What the tests of a residual say; the verdict says what follows from a small p. */
