@@ -29,7 +29,16 @@ MAPPED: Any = {
     "initial_state": "free",
     "columns": {"pitch": "theta (deg)", "voltage": "u"},
     "scales": {"pitch": 3.141592653589793 / 180},
-}
+    "units": {}, "intervals": "linear", "hold_input": "constant", "effect": "",
+}  # fmt: skip
+OPTIONS = {
+    "a scale": {},
+    "a unit and an effect": {
+        "estimator": "nls", "scales": {}, "units": {"pitch": "deg"}, "hold_input": "linear",
+        "effect": "delay_voltage",
+    },
+    "profiles": {"estimator": "nls", "intervals": "profile"},
+}  # fmt: skip
 CHANGES = {
     "a signal": {},
     "of its usual size": {"amplitude": None, "noise": {}, "params": {}},
@@ -72,7 +81,8 @@ def test_the_command_of_an_experiment_makes_it_again(change: dict[str, Any], tmp
 
 
 @pytest.mark.science
-def test_the_command_of_a_file_identifies_it_again(tmp_path: Path):
+@pytest.mark.parametrize("change", OPTIONS.values(), ids=list(OPTIONS))
+def test_the_command_of_a_file_identifies_it_again(change: dict[str, Any], tmp_path: Path):
     source, page = tmp_path / "upload", tmp_path / "page"
     source.mkdir()
     page.mkdir()
@@ -82,6 +92,6 @@ def test_the_command_of_a_file_identifies_it_again(tmp_path: Path):
     values = [row.split(",") for row in rows]
     degrees = [f"{time},{u},{float(pitch) * 180 / 3.14159}" for time, u, pitch in values]
     (source / "my_log.csv").write_text("\n".join(["time,u,theta (deg)", *degrees, ""]))
-    list(live.identified(MAPPED, str(source), "my_log.csv", str(page / "run")))
+    list(live.identified(MAPPED | change, str(source), "my_log.csv", str(page / "run")))
     shutil.copy(source / "my_log.csv", tmp_path)
     assert_same(page / "run", again(page / "run", tmp_path))
