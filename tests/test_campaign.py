@@ -392,7 +392,7 @@ def test_the_expected_samples_are_those_of_the_bound():
     for i in (0, 5):
         params_key, key = jax.random.split(keys[i])
         params = draw_params(plant, params_key, "factor:3")
-        excitation = ex.Campaign("aero2", EASY, policy=steady()).policy
+        excitation = steady()
         from excite.excitation import PolicyExcitation
 
         run = run_episode(plant, params, PolicyExcitation.of(excitation), 60, key)
