@@ -449,7 +449,13 @@ def test_an_experiment_is_paused_and_played_again(address: str, page: Page):
     assert (
         page.evaluate("document.querySelector('#experiment .view').group.sync.plots.length") == 11
     )
+    # A new run ends the playing of the one before.
+    page.get_by_role("button", name="Play").click()
+    page.get_by_label("Played in").select_option("0")
+    page.get_by_role("button", name="Run", exact=True).click()
+    expect(status(page)).to_have_text("Done.", timeout=WAIT)
     expect(page.get_by_role("button", name="Play")).to_be_visible()
+    assert page.evaluate(count) == 501
 
 
 def test_the_time_at_which_a_level_is_passed_is_told(address: str, page: Page):

@@ -6,7 +6,7 @@ import { digits, Plot, range, shown } from "./plot.js";
 
 const section = document.getElementById("experiment"), form = section.querySelector("form");
 const at = (id) => document.getElementById(id);
-let catalogue, plant, task;
+let catalogue, plant, task, shownRun = null;
 
 export function begin(known) {
   catalogue = known;
@@ -119,6 +119,7 @@ function run() {
 
 /** Takes away what is shown of the run before. */
 function clear() {
+  shownRun?.halt();
   at("outcome").hidden = at("player").hidden = true;
   for (const plots of ["signals", "estimates", "overlays"]) at(plots).replaceChildren();
   section.querySelector(".view").group?.show(null);
@@ -152,6 +153,7 @@ function follower(total) {
 class Live {
   constructor(plan) {
     Object.assign(this, { plan, time: [], inputs: [], outputs: [], found: [], compared: [], until: null });
+    shownRun = this;
     this.end = (plan.num_samples - 1) * plan.plant.dt;
     if (task.isBusy && matchMedia("(max-width: 60rem)").matches) section.querySelector(".view").scrollIntoView();
     if (plan.warning) say(form, plan.warning, true);
@@ -178,24 +180,28 @@ class Live {
   /** How many samples are shown: all there are, unless it is paused. */
   get count() { return this.until ?? this.time.length; }
 
+  /** Ends what is being played again. */
+  halt() {
+    cancelAnimationFrame(this.frame);
+    at("player").querySelector("button").textContent = "Play";
+  }
+
   /** The button that pauses and plays again, and the slider through what was recorded. */
   play() {
     const button = at("player").querySelector("button"), slider = at("shown-time");
     const move = (count) => { this.until = count; this.draw(); this.track(); };
-    const halt = () => { cancelAnimationFrame(this.frame); button.textContent = "Play"; };
-    this.halt = halt;
     at("player").hidden = false;
     slider.max = this.plan.num_samples;
     button.textContent = "Pause";
-    slider.oninput = () => { halt(); move(Math.min(+slider.value, this.time.length)); };
+    slider.oninput = () => { this.halt(); move(Math.min(+slider.value, this.time.length)); };
     button.onclick = () => {
-      if (button.textContent === "Pause") { halt(); move(this.count); return; }
+      if (button.textContent === "Pause") { this.halt(); move(this.count); return; }
       button.textContent = "Pause";
       if (!this.isFull) { this.until = null; this.draw(); return; }
       const first = this.count < this.time.length ? this.count : 0, length = 1000 * Math.min(10, this.end), begin = performance.now();
       const next = (now) => {
         move(Math.min(this.time.length, Math.round(first + ((now - begin) / length) * this.time.length)));
-        if (this.count < this.time.length) this.frame = requestAnimationFrame(next); else halt();
+        if (this.count < this.time.length) this.frame = requestAnimationFrame(next); else this.halt();
       };
       this.frame = requestAnimationFrame(next);
     };
