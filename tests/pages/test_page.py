@@ -27,7 +27,7 @@ if CHROMIUM is None and os.environ.get("EXCITE_BROWSER_TESTS") != "1":
     pytest.skip("no chromium on this computer (apt-get install chromium)", allow_module_level=True)
 
 from axe_playwright_python.sync_playwright import Axe  # noqa: E402
-from playwright.sync_api import Browser, Page, expect, sync_playwright  # noqa: E402
+from playwright.sync_api import Browser, Page, Route, expect, sync_playwright  # noqa: E402
 
 ARGUMENTS = [
     "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
@@ -562,6 +562,23 @@ def test_a_run_has_an_address_and_is_found_by_words(address: str, page: Page):
     expect(page.locator("#run-view td").first).to_have_text("1")
     page.goto(f"{address}/#runs/nothing")
     expect(status(page, "runs")).to_have_text("The run folder has no run nothing.")
+
+
+def test_a_slow_list_of_runs_does_not_undo_a_later_address(address: str, page: Page):
+    page.goto(f"{address}/#experiment")
+    held: list[Route] = []
+    page.route("**/api/runs", lambda route: route.continue_() if held else held.append(route))
+    with page.expect_request("**/api/runs"):
+        page.evaluate("location.hash = 'runs/a_study'")
+    page.evaluate("location.hash = 'runs/nothing'")
+    missing = "The run folder has no run nothing."
+    expect(status(page, "runs")).to_have_text(missing)
+    with page.expect_response("**/api/runs") as late:
+        held[0].continue_()
+    late.value.finished()
+    page.wait_for_timeout(200)
+    expect(status(page, "runs")).to_have_text(missing)
+    assert page.locator("#run-view h2").count() == 0
 
 
 def test_runs_are_looked_at(address: str, page: Page):

@@ -6,19 +6,25 @@ import { table } from "./record.js";
 
 const section = document.getElementById("runs"), view = document.getElementById("run-view");
 const filter = document.getElementById("run-filter"), order = document.getElementById("run-order");
-let all = [], chosen = "", following = 0;
+let all = [], asked = "", chosen = "", following = 0;
 filter.addEventListener("input", list);
 order.addEventListener("change", list);
 
 /** Lists the runs; one that the address names is shown. */
 export async function open(name) {
+  asked = name;
   try {
     all = (await get("api/runs")).runs;
+    if (asked !== name) return; // the address changed while the list was loading
     say(section, all.length ? "" : "The run folder is empty; studies and identifications appear here.");
     list();
     const run = all.find((each) => each.name === name);
     if (run) await show(run);
-    else if (name) say(section, `The run folder has no run ${name}.`, true);
+    else if (name) {
+      chosen = "";
+      view.replaceChildren();
+      say(section, `The run folder has no run ${name}.`, true);
+    }
   } catch (error) {
     say(section, error.message, true);
   }
@@ -74,7 +80,7 @@ async function show(run) {
       view.append(el("section", { class: "card" }, el("h2", {}, figure.replace(/\.png$/, "")), el("img", { src: address(figure), alt: `figure ${figure} of ${run.name}`, loading: "lazy" })));
     }
   } catch (error) {
-    say(section, error.message, true);
+    if (chosen === run.name) say(section, error.message, true);
   }
 }
 
