@@ -29,6 +29,7 @@ from excite.study.campaign_on_rig import _paused
 from excite.study.monitor import Monitor
 from excite.study.quantities import known_of, propagated
 from excite.study.targets import others_of, targets_from
+from excite.training.design import Design
 
 TRUE = {"J_p": 0.025, "K_pu": 0.0110, "D_p": 0.0011}
 EASY = {"J_p": "5%", "K_pu": "10%"}
@@ -249,10 +250,8 @@ def test_without_a_policy_signals_are_redesigned_after_the_first(designed):
 def test_a_robust_signal_that_is_played_again_is_called_so(designed):
     record = ex.simulate("aero2", designed.ask(), params=TRUE, seed=0)
     designed.tell(record)
-    assert designed.tell(record).played == "robust"
-    designed.rounds.clear()
-    other = dataclasses.replace(record, inputs=-record.inputs)
-    assert designed.tell(other).played == "redesigned"
+    assert designed.rounds[0].played == "robust"
+    assert designed.tell(record, played="redesigned").played == "redesigned"
 
 
 # ------------------------------------------------------------------------------ ask and tell
@@ -352,6 +351,24 @@ def test_a_round_that_was_interrupted_does_not_count_in_the_budget():
     assert campaign.ask() is not None
     campaign.tell(record)
     assert campaign.reason == "all rounds are played"
+
+
+def test_a_round_that_tells_nothing_does_not_make_later_ones_longer():
+    campaign = ex.Campaign("aero2", {"D_p": "1%"}, policy=steady(), redesign=False)
+    still = ex.simulate("aero2", np.zeros((20, 1)), params=TRUE, seed=1)
+    campaign.tell(still, REACHED)
+    assert campaign.monitor(waits=True)._enough(100) == 1
+
+
+def test_a_first_signal_that_is_not_safe_is_refused(monkeypatch):
+    record = ex.simulate("aero2", "chirp", steps=10)
+    made = Design(Aero2.definition, "robust", "D", 0, record.inputs, record, 1.0, 3, 1000)
+    monkeypatch.setattr("excite.study.campaign.design", lambda *_, **__: made)
+    campaign = ex.Campaign("aero2", {"D_p": "1%"}, policy="none")
+    with pytest.raises(
+        ValueError, match=r"a critical level on 3 of 1000 plants of the spread 0\.3"
+    ):
+        _ = campaign.ask()
 
 
 def test_a_round_that_ended_too_early_makes_later_ones_longer():

@@ -11,6 +11,7 @@ are identified together.
 from __future__ import annotations
 
 import dataclasses
+import math
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -56,7 +57,7 @@ from .discrimination import Discrimination, RivalLike, judged, rivals_from, with
 from .falsify import trained_in
 from .knowledge import region_of, unexplained
 from .monitor import Monitor
-from .next_experiment import COAST, REDESIGNED, NextExperiment, best_of, candidates
+from .next_experiment import COAST, NextExperiment, best_of, candidates
 from .quantities import (
     AbstractQuantity,
     OneParameter,
@@ -139,10 +140,12 @@ class Expected:
         reached = np.isfinite(self.samples)
         if not reached.any():
             return "no plant of the spread reaches every target"
-        median, most = np.quantile(self.samples, [0.5, 0.9], method="inverted_cdf")
+        count = len(self.samples)
+        share, word = (0.9, "90 %") if count >= _PLANTS else (1.0, "largest")
+        median, most = np.quantile(self.samples, [0.5, share], method="inverted_cdf")
         told = f"{median:.0f} samples" if np.isfinite(median) else "more rounds than there are"
         often = f"{most:.0f}" if np.isfinite(most) else "more rounds than there are"
-        return f"{told} (median of {len(reached)} plants of the spread; 90 %: {often})"
+        return f"{told} (median of {count} plants of the spread; {word}: {often})"
 
 
 class Campaign:
@@ -173,6 +176,7 @@ class Campaign:
         rounds: what each of them brought.
         result: estimate from all records; None before the first.
         reason: why the campaign ended; empty while it goes on.
+        playing: what `ask` returned last, as `Round` names it; empty after the round.
         next: how the coming round was chosen, after the first estimate.
         interrupted: what interrupted `campaign`, such as a signal; empty if nothing did.
         prediction: what was expected before the first round, as a sentence; empty if that was not
@@ -251,7 +255,7 @@ class Campaign:
         self.result: Identification | None = None
         self.next: NextExperiment | None = None
         self.reason, self.interrupted, self.prediction = "", "", ""
-        self._haste, self._asked = 1.0, ""
+        self._haste, self.playing = 1.0, ""
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -260,11 +264,22 @@ class Campaign:
 
     @cached_property
     def opening(self) -> Policy | Replay:
-        """What the first round plays: the policy, or a robust signal, which takes a minute."""
+        """What the first round plays: the policy, or a robust signal, which takes minutes.
+
+        Raises:
+            ValueError: for a signal that reaches a critical level on a plant of the spread.
+        """
         if self.policy is not None:
             return self.policy
         steps, spread = self.steps // 2, self.spread.setting
-        return design(self.declared, steps=steps, spread=spread, coast=self.coast).excitation
+        made = design(self.declared, steps=steps, spread=spread, coast=self.coast)
+        if made.violations:
+            raise ValueError(
+                f"no safe first signal was found: the best one reaches a critical level on "
+                f"{made.violations} of {made.evaluations} plants of the spread {self.spread}; a "
+                "smaller spread, fewer steps or a policy may help"
+            )
+        return made.excitation
 
     def ask(self) -> Policy | Replay | None:
         """What to play in the next round, from rest; None once the campaign has ended.
@@ -284,6 +299,7 @@ class Campaign:
             if self.discrimination.inputs is None:
                 self.reason = self.discrimination.decision
                 return None
+            self.playing = DISCRIMINATING
             return self.discrimination.excitation
         if self.result is not None and self.redesign and self.next is None:
             self.next = self._next(self.result)
@@ -292,7 +308,7 @@ class Campaign:
         if self.next is not None and chosen is None and is_other:
             self.reason = self.next.decision  # the opening may be unsafe on this plant
             return None
-        self._asked = self._opening_name if chosen is None else chosen.name
+        self.playing = self._opening_name if chosen is None else chosen.name
         return self.opening if chosen is None else chosen.excitation
 
     @property
@@ -318,6 +334,7 @@ class Campaign:
         ended: str = COMPLETE,
         unsafe: bool = False,
         goes_on: bool = False,
+        played: str = "",
     ) -> Round:
         """Takes the record of a round, identifies, and decides whether another one follows.
 
@@ -326,6 +343,7 @@ class Campaign:
             ended: why the round ended.
             unsafe: whether it ended because a level was near, or no declared plant explains it.
             goes_on: whether the next record exists already, so that reached targets end nothing.
+            played: what the round played, as `Round` names it; default what `ask` returned last.
 
         Raises:
             ValueError: where the campaign has ended, or for a record of another plant.
@@ -340,7 +358,7 @@ class Campaign:
         if len(record.time) < 2:
             raise ValueError("the record of a round needs at least two samples: got one")
         self.records.append(record)
-        played, structure = self._played(record), ""
+        played, structure = played or self.playing or self._opening_name, ""
         if self.is_undecided:
             structure = self._compare()
         count, status = len(record.time) - 1, structure
@@ -355,7 +373,7 @@ class Campaign:
         known = self.known
         shares = shares_of(self.targets, known)
         if ended == REACHED:  # says the running estimate; the intervals of all records may be wider
-            self._haste = max(self._haste, *shares.values())
+            self._haste = max([self._haste, *(s for s in shares.values() if math.isfinite(s))])
         if goes_on:
             self.reason = ""
         elif unsafe or near >= 1:
@@ -372,7 +390,7 @@ class Campaign:
             decision = f"{structure}; {decision}"
         told = Round(count, played, ended, near, known, status, decision)
         self.rounds.append(told)
-        self.next, self._asked = None, ""
+        self.next, self.playing = None, ""
         return told
 
     def _compare(self) -> str:
@@ -407,19 +425,6 @@ class Campaign:
         sizes = np.concatenate([f.computed["residual"] / sd for f in self.result.fitted]) ** 2
         return chi2_tail(int(np.isfinite(sizes).sum()), float(np.nansum(sizes))) > RARE
 
-    def _played(self, record: Record) -> str:
-        """The name of what a round played; without `ask`, it is taken from the record."""
-        if self.is_undecided:
-            return DISCRIMINATING
-        if self._asked:
-            return self._asked
-        first = self.records[0].inputs[:-1]
-        count = min(len(first), len(record.inputs) - 1)
-        is_opening = self.result is None or "policy_hash" in record.metadata or (
-            self.policy is None and np.array_equal(first[:count], record.inputs[:count])
-        )  # fmt: skip
-        return self._opening_name if is_opening or not self.redesign else REDESIGNED
-
     @property
     def _opening_name(self) -> str:
         return ROBUST if self.policy is None else "policy"
@@ -448,7 +453,7 @@ class Campaign:
 
     @cached_property
     def expected(self) -> Expected:
-        """What the campaign will reach; computed once, which takes seconds.
+        """What the campaign will reach; computed once, in seconds, or a minute without a policy.
 
         With a policy, every round plays it. Without one, the first plays the robust signal, and
         all others what is redesigned for each plant after it.
@@ -461,7 +466,7 @@ class Campaign:
         keys = jax.random.split(jax.random.key(0), count)
         episodes = run_episodes(self.plant, excitation, steps, self.spread, keys)
         first = later = episodes.trajectory.inputs
-        if self.redesign and self.policy is None:
+        if self.redesign and self.policy is None and self.most_rounds > 1:
             later = jnp.stack([
                 self._redesigned(jax.tree.map(lambda x, i=i: x[i], episodes.params), first[i])
                 for i in range(count)
@@ -498,9 +503,9 @@ class Campaign:
             best = target.half * share
             told = f"{100 * best:.2g} %" if target.is_relative else f"{best:.2g}"
             raise ValueError(
-                f"no experiment of {self.most_rounds} x {self.steps} samples "
+                f"no campaign of at most {self.most_rounds} rounds of {self.steps} samples "
                 f"reaches {name} to {target}: at best {told}; ask for less, or for more "
-                "rounds"
+                + ("rounds" if self.policy else "rounds or steps")
             )
         self.prediction = str(self.expected)
 
@@ -528,6 +533,7 @@ class Campaign:
             "warnings": list(self.warnings),
             "expected": self.prediction,
             "reason": self.reason,
+            "playing": self.playing,
             "interrupted": self.interrupted,
             "estimate": self._estimate(),
             "num_samples": self.num_samples,

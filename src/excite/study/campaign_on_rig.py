@@ -23,7 +23,7 @@ from ..excitation import Replay
 from ..files import csv_text, locked_folder, read_json, write_bytes, write_json
 from ..plant.catalogue import PlantLike
 from ..policy import Policy
-from ..record import Record, read_record
+from ..record import read_record
 from ..rig.catalogue import RigOptions, rig_named
 from ..rig.contract import AbstractRig, Sample
 from ..rig.loop import interruptible
@@ -147,13 +147,14 @@ def campaign(
             if (asked := made.ask()) is None:
                 folder.write(made)
                 break
+            folder.write(made)  # what is played, should the round be the last of this process
             played, signals = _played(
                 made, asked, opened(count), folder.path(count), filter, guard,
                 lambda count=count: progress(f"round {count + 1}", count, rounds),
             )  # fmt: skip
             outcome, warned = played.outcome, made.warnings
             if _has_samples(folder.path(count)):
-                on_round(_taken(made, played.record, outcome.reason, outcome.trip))
+                on_round(made.tell(played.record, outcome.reason, outcome.trip in _UNSAFE))
             for sentence in made.warnings:
                 if sentence not in warned:
                     on_warning(sentence)
@@ -208,11 +209,6 @@ def _played(
                     monitor.close()
     signals = [reason for reason in stop.asked if reason != REACHED]
     return cast("RunResult", played), signals  # without dry_run
-
-
-def _taken(made: Campaign, record: Record, reason: str, trip: Trip, goes_on: bool = False) -> Round:
-    """The campaign after a round of a rig."""
-    return made.tell(record, reason, trip in _UNSAFE, goes_on)
 
 
 def _has_samples(path: Path) -> bool:
@@ -273,13 +269,16 @@ class _Folder:
 
     def resume(self, made: Campaign, on_round: Callable[[Round], None]) -> None:
         """Takes the rounds that were played before; one that was hardly begun is played again."""
+        names: list[str] = []
         if self.has_rounds:
-            before = read_json(self.root / "campaign.json", "expected")
+            before = read_json(self.root / "campaign.json", "expected", "rounds")
             made.prediction = str(before["expected"])
+            names = [*(str(r["played"]) for r in before["rounds"]), str(before.get("playing", ""))]
         while _has_samples(path := self.path(len(made.rounds))):
             record = read_record(path, made.declared.description)
             ended = record.metadata.get("ended") or {"reason": "interrupted", "trip": "none"}
             trip = Trip[str(ended["trip"]).upper()]
-            goes_on = _has_samples(self.path(len(made.rounds) + 1))
-            on_round(_taken(made, record, str(ended["reason"]), trip, goes_on))
+            count = len(made.rounds)
+            goes_on, name = _has_samples(self.path(count + 1)), "".join(names[count : count + 1])
+            on_round(made.tell(record, str(ended["reason"]), trip in _UNSAFE, goes_on, name))
         self.write(made)
