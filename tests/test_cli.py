@@ -26,6 +26,7 @@ from excite.cli.options import Lines, progress_bar
 from excite.cli.study import running, study
 from excite.estimation.catalogue import ESTIMATORS
 from excite.excitation.catalogue import EXCITATIONS
+from excite.files import read_columns
 from excite.plant import Aero2
 from excite.plant.catalogue import PLANTS
 from excite.policy import Layout, Policy, read_policy, shipped_policies
@@ -60,6 +61,10 @@ violations = "2/100"
 """
 
 OWN_PLANT = """
+import jax.numpy as jnp
+
+from excite.estimation import NLS
+from excite.excitation.contract import AbstractShape, AbstractSignal
 from excite.description import Input, Output, Parameter, PlantDescription, State
 from excite.plant import AbstractPlant
 
@@ -85,6 +90,27 @@ class Tank(AbstractPlant):
 class Broken(Tank):
     def derivative(self, state, input, params):
         return a_name_that_is_nowhere
+
+
+class Swapped(Tank):
+    def derivative(self, state, params, input):
+        return (input - params.leak * state) / params.area
+
+
+class Steady(AbstractShape):
+    def shape(self, plant, num_steps, key):
+        return jnp.ones((num_steps, 1))
+
+
+class Level(AbstractSignal):
+    level: float
+
+    def sequence(self, plant, num_steps, key):
+        return jnp.full((num_steps, 1), self.level)
+
+
+class Doubtful(NLS):
+    pass
 """
 
 
@@ -822,6 +848,25 @@ BAD: dict[str, tuple[str, tuple[str, ...]]] = {
         "serve --plant aero2+delay_voltage", ("--plant", "letters", "'aero2+delay_voltage'"),
     ),
     "no such plant class": ("simulate own.py:Tanc", ("own.py", "'Tanc'")),
+    "class that is no plant": (
+        "simulate own.py:Steady", ("Steady in own.py is no plant", "derived from AbstractPlant"),
+    ),
+    "plant file of another language": ("simulate study.toml:Tank", ("study.toml", "ends in .py")),
+    "plant with its arguments in another order": (
+        "simulate own.py:Swapped", ("derivative of Swapped", "(self, state, input, params)"),
+    ),
+    "excitation that is none": (
+        "simulate own.py:Tank --excitation own.py:Tank", ("Tank in own.py is no excitation",),
+    ),
+    "excitation that needs arguments": (
+        "simulate own.py:Tank --excitation own.py:Level", ("own.py:Level cannot be made",),
+    ),
+    "estimator that is none": (
+        IDENTIFY.format("good.csv") + " --estimator own.py:Steady", ("is no estimator",),
+    ),
+    "excitation file without a class": (
+        "simulate own.py:Tank --excitation own.py:", ("own.py:Steady or own.py:Level",),
+    ),
     "unknown excitation": (
         "simulate aero2 --excitation chrip --out r.csv", ("'chrip'", "'chirp'?", "multisine"),
     ),
@@ -922,6 +967,25 @@ BAD: dict[str, tuple[str, tuple[str, ...]]] = {
         "identify good.csv --plant aero2 --initial-state maybe", ("maybe", "free", "known"),
     ),
 }  # fmt: skip
+
+
+def test_plant_excitation_and_estimator_of_ones_own_work_from_a_file_to_the_next_experiment(
+    run, here
+):
+    plant = ("--plant", "own.py:Tank")
+    words = ("--excitation", "own.py:Steady", "--set", "amplitude=0.4", "--steps", "80")
+    assert run("simulate", "own.py:Tank", *words, "--out", "steady.csv").code == 0
+    assert read_columns(here / "steady.csv")["flow"][0] == pytest.approx(0.9)
+    found = run("identify", "steady.csv", *plant, "--estimator", "own.py:Doubtful", "--out", "run")
+    assert found.code == 0
+    refused = run("next", "run", "--target", "area=1%")
+    assert refused.code == 2
+    assert "'tank', which does not come with the package: give the plant (--plant)" in refused.err
+    more = ("--target", "area=0.01%", "--steps", "20", "--coast", "5")
+    assert run("next", "run", *plant, *more).code == 0
+    played = ("run", "--rig", "simulated", *plant, *words[:2], "--steps", "20", "--fast")
+    told = run(*played, "--out", "played.csv").out
+    assert "next: excite identify played.csv --plant own.py:Tank" in told
 
 
 def test_a_plant_file_leaves_no_compiled_code(run, here, monkeypatch):

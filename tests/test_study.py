@@ -717,7 +717,7 @@ def test_a_users_plant_is_found_beside_its_study(plant_file, tmp_path, monkeypat
     [
         ("Tanc", "has no plant class 'Tanc'; it has Tank, Half, Nameless, Wide"),
         ("number", "has no plant class 'number'"),
-        ("State", "has no plant class 'State'"),
+        ("State", "State in .* is no plant: it is not derived from AbstractPlant"),
         ("", "is a file: name the plant in it as .*tank.py:Tank or .*tank.py:Half"),
         ("Half", "Half in .* is not a complete plant: .*derivative"),
         ("Wide", r"output of Wide in .* returns shape \(2,\); .*\(1,\) is needed"),
@@ -750,7 +750,7 @@ def test_a_file_without_a_class_names_its_classes(plant_file):
     with pytest.raises(ValueError, match=f"name the plant in it as {plant_file}:Own$"):
         plant_named(f"{plant_file}+delay")
     plant_file.write_text("from excite.plant import Aero2")
-    with pytest.raises(ValueError, match="has no plant class ''; it has none"):
+    with pytest.raises(ValueError, match=r"name the plant in it as .*:ClassName$"):
         plant_named(str(plant_file))
 
 
@@ -800,7 +800,7 @@ def test_no_name_is_evaluated(name, tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=r"unknown plant|no such file"):
         plant_named(name)
     for lookup in (estimator_named, lambda n: excitation_named(n, {}, Aero2())):
-        with pytest.raises(ValueError, match="unknown"):
+        with pytest.raises(ValueError, match=r"unknown|no such file"):
             lookup(name)
     assert list(tmp_path.iterdir()) == []
 

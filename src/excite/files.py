@@ -22,12 +22,14 @@ import tempfile
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeVar
 
 import numpy as np
 import safetensors.numpy
 
 from .description import told
+
+_T = TypeVar("_T")
 
 try:
     import fcntl
@@ -245,6 +247,25 @@ def locked_folder(folder: Path, what: str) -> Iterator[None]:
         yield
 
 
+def is_class_word(name: str) -> bool:
+    """Whether a name is `path/to/file.py:ClassName`."""
+    return name.rpartition(":")[0].endswith(".py")
+
+
+def made_at(name: str, base: type[_T], kind: str) -> _T:
+    """An object of the class `path/to/file.py:ClassName`, made without arguments.
+
+    Raises:
+        ValueError: as `class_at`, and for a class that needs arguments or cannot be made.
+    """
+    path, _, word = name.rpartition(":")
+    made_from = class_at(Path(path), word, base, kind)
+    try:
+        return made_from()
+    except Exception as error:
+        raise ValueError(f"{kind} {name} cannot be made: {told(error)}") from error
+
+
 def class_at(path: Path, word: str, base: type, kind: str) -> Any:
     """A class derived from `base` in a user's file. Importing the file runs its code.
 
@@ -266,9 +287,11 @@ def class_at(path: Path, word: str, base: type, kind: str) -> Any:
         for name, part in vars(module).items()
         if isinstance(part, type) and issubclass(part, base) and part.__module__ == module.__name__
     ]
-    if not word and own:
-        words = " or ".join(f"{path}:{name}" for name in own)
+    if not word:
+        words = " or ".join(f"{path}:{name}" for name in own or ["ClassName"])
         raise ValueError(f"{path} is a file: name the {kind} in it as {words}")
+    if isinstance(found, type):
+        raise ValueError(f"{word} in {path} is no {kind}: it is not derived from {base.__name__}")
     raise ValueError(f"{path} has no {kind} class {word!r}; it has {', '.join(own) or 'none'}")
 
 

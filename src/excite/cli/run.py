@@ -143,7 +143,7 @@ def _run_and_show(as_json: bool, **options: Any) -> int:
     elif isinstance(result, DryRun):
         show_table(result.title, result.header, result.rows())
     else:
-        _show(result)
+        _show(result, options["plant"])
     if isinstance(result, DryRun) or result.outcome.is_complete:
         return 0
     return EXIT_CODES.get(result.outcome.reason, 1)
@@ -156,8 +156,8 @@ def _prepare() -> None:
         click.echo("JAX is not installed: the live estimate and the filter are off", err=True)
 
 
-def _show(result: RunResult) -> None:
+def _show(result: RunResult, plant: str | None) -> None:
     show_table(result.title, ["", ""], result.rows())
-    next_command = f"excite identify {result.path} --plant {result.description.name}"
+    next_command = f"excite identify {result.path} --plant {plant or result.description.name}"
     told = f"; next: {next_command}" if result.outcome.num_samples else ""
     click.echo(f"record: {result.path}{told}")

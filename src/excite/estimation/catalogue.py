@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from ..description import Listing, first_line, unknown, wrong_type
+from ..files import is_class_word, made_at
 from ..plant.fields import with_options
 from .arx import ARX
 from .contract import AbstractEstimator
@@ -63,14 +64,19 @@ def estimator_from(
 
 
 def estimator_named(name: str, options: Mapping[str, Any] | None = None) -> AbstractEstimator:
-    """An estimator by name, with other options where given.
+    """An estimator by name or as `path/to/file.py:ClassName`, with other options where given.
+
+    The user's file is imported, so its code runs.
 
     Raises:
         ValueError: for an unknown name or option, or a value that is not allowed.
     """
-    if name not in ESTIMATORS:
-        raise unknown("estimator", name, ESTIMATORS)
-    default = ESTIMATORS[name]
+    if is_class_word(name):
+        default = made_at(name, AbstractEstimator, "estimator")
+    elif name in ESTIMATORS:
+        default = ESTIMATORS[name]
+    else:
+        raise unknown("estimator", name, [*ESTIMATORS, "path/to/file.py:ClassName"])
     if not options:
         return default
     estimator = with_options(default, name, options)

@@ -35,6 +35,7 @@ NOTHING_SEEN = (
     "input move the plant beyond the noise? or did the search begin too far from the truth "
     "(--start)?"
 )
+PRIOR_TOO = " or is the prior far from the truth (--prior)?"
 _STARTS, _SIZE_OF_MANY_STARTS = 8, 50_000  # measured values up to which so many are tried
 _TELLING = 50  # measured values from which the residual tells whether the search missed something
 _MORE_THAN_CHANCE = 10.0  # of a chi-squared variable of one degree of freedom

@@ -59,6 +59,7 @@ from .diagnosis import (
 from .excerpt import spans_of
 from .fit import (
     NOTHING_SEEN,
+    PRIOR_TOO,
     Fit,
     NothingLeftError,
     Progress,
@@ -229,10 +230,11 @@ def identify(
     experiments = experiments_of(plant, records, known, linear)
     progress("first search", 0.0, 1.0)
     find = partial(_suspects, plant, records, experiments, estimator, begin, linear, progress)
+    too = PRIOR_TOO * bool(num_priors)
     try:
         fit = fit_of(plant, experiments, estimator, begin, progress)
     except NothingLeftError as refusal:
-        raise _with_causes(str(refusal), find(refusal.fit, False)[0]) from None
+        raise _with_causes(str(refusal) + too, find(refusal.fit, False)[0]) from None
     residual = _residuals(plant, records, experiments, estimator, fit)
     fitted = fitted_all(plant, records, experiments, fit.estimate, residual)
     is_normal = isinstance(estimator, NLS) and estimator.likelihood == "normal"
@@ -240,7 +242,7 @@ def identify(
     is_fit = not is_judged or _explains(records, residual, int(fit.free.sum()) - num_priors)
     found, where = find(fit, is_fit and fit.is_successful)
     if not is_fit:
-        raise _with_causes(NOTHING_SEEN, found)
+        raise _with_causes(NOTHING_SEEN + too, found)
     whiteness = {
         name: whiteness_of([finite(r[:, i]) for r in residual], plant.definition.outputs[i].scale)
         for i, name in enumerate(names_of(plant.definition.outputs))
@@ -331,10 +333,15 @@ def plant_named_by(record: RecordLike) -> str:
     is_read = isinstance(record, Record)
     where = (record.source if is_read else str(record)) or "the record"
     name = (record.description if is_read else described_in(Path(record))).name
+    return require_shipped(name, where)
+
+
+def require_shipped(name: str, where: str) -> str:
+    """The name of a plant that a record or a result is of; ValueError for a user's own plant."""
     if name.partition("+")[0] not in PLANTS:
         raise ValueError(
             f"{where} is of plant {name!r}, which does not come with the package: give the plant "
-            "as path/to/file.py:ClassName, as an object or as a class"
+            "(--plant) as path/to/file.py:ClassName, or in Python as an object or a class"
         )
     return name
 

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..description import Listing, first_line, unknown, wrong_type
+from ..files import is_class_word, made_at
 from ..plant import AbstractPlant, floats
 from ..plant.fields import with_options
 from ..policy import POLICY_ENDING, Policy, mismatch, policy_path, read_policy, shipped_policies
@@ -113,7 +114,11 @@ def excitation_and_origin(
         if name.endswith(SIGNAL_ENDINGS):
             signal = _recorded(name, options, plant)
             return signal, {"signal_hash": hashlib.sha256(Path(name).read_bytes()).hexdigest()}
-        excitation = _classical(name, options, plant)
+        if is_class_word(name):
+            own = made_at(name, AbstractExcitation, "excitation")
+            excitation = with_options(own, name, options)
+        else:
+            excitation = _classical(name, options, plant)
     else:
         excitation = _object(given, name, options, plant)
     _check_excitation(excitation, plant)
@@ -172,7 +177,8 @@ def _classical(name: str, options: Mapping[str, Any], plant: AbstractPlant) -> A
     shape = name.removeprefix(LOOP)
     if shape not in EXCITATIONS:
         known = [*EXCITATIONS, *(LOOP + word for word in EXCITATIONS), *shipped_policies()]
-        raise unknown("excitation", name, [*known, f"path/to/policy{POLICY_ENDING}"])
+        files = [f"path/to/policy{POLICY_ENDING}", "path/to/file.py:ClassName"]
+        raise unknown("excitation", name, [*known, *files])
     if shape == name:
         return with_options(EXCITATIONS[name](), name, options)
     own = {k: v for k, v in options.items() if k in ("amplitude", "gain", "damping")}

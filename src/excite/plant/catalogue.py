@@ -97,6 +97,8 @@ def plant_named(name: str) -> AbstractPlant:
         return extended(plant_named(f"{path}{colon}{plain}"), extensions)
     if name in PLANTS:
         return PLANTS[name]()
+    if not path.endswith(".py") and Path(path or name).is_file():
+        raise ValueError(f"{path or name} is no file of a plant: the name of one ends in .py")
     if not colon or not path.endswith(".py"):
         known = [*PLANTS, "path/to/file.py:ClassName", f"path/to/plant{PLANT_ENDING}"]
         raise unknown("plant", name, known)
@@ -251,9 +253,15 @@ def _traced(plant: AbstractPlant, name: str, arguments: tuple[Any, ...], what: s
     except KeyboardInterrupt:
         raise
     except BaseException as error:  # also sys.exit
-        raise _missing_name(plant, error, what) or ValueError(
-            f"{what} fails: {told(error)}"
-        ) from error
+        hint = _missing_name(plant, error, what)
+        raise hint or ValueError(f"{what} fails: {told(error)}{_SHAPES[name]}") from error
+
+
+_SHAPES = {
+    "derivative": "; its arguments are (self, state, input, params), arrays and a tuple: input[0]",
+    "output": "; its arguments are (self, state, params), the first an array: state[0]",
+    "delay": "; its arguments are (self, params)",
+}
 
 
 def _missing_name(plant: AbstractPlant, error: BaseException, what: str) -> ValueError | None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..description import Spread, SpreadLike, names_of, wrong_type
 from ..environment import prior_sd_of
-from ..estimation.identify import RecordLike, identify, plant_named_by
+from ..estimation.identify import RecordLike, identify, plant_named_by, require_shipped
 from ..estimation.prior import Prior
 from ..estimation.prior_knowledge import PriorLike, prior_of_run, run_with_estimate, with_prior
 from ..estimation.result import Identification
@@ -110,7 +110,7 @@ def known_from(
         raise ValueError("a result has its prior: a prior is given with records alone")
     own, reach = plant_from(plant) if plant is not None else _plant_of(parts[0]), Spread.of(spread)
     for part in results:
-        name = _plant_of(part).definition.name
+        name = _plant_name(part)
         if name != own.definition.name:
             raise ValueError(f"a result is of plant {name!r}, and not of {own.definition.name!r}")
     before = Prior.product([prior_of_run(own, part) for part in results]) if results else None
@@ -172,12 +172,20 @@ def region_of(
 
 def _plant_of(part: Any) -> AbstractPlant:
     """The plant of a record, a result or a run folder."""
+    if (basis := getattr(part, "basis", None)) is not None:
+        return basis.plant
+    if not _is_result(part):
+        return plant_from(plant_named_by(part))
+    where = str(part) if isinstance(part, str | Path) else "the result"
+    return plant_from(require_shipped(_plant_name(part), where))
+
+
+def _plant_name(part: Identification | str | Path) -> str:
+    """The name of the plant of a result or a run folder."""
     if isinstance(part, Identification):
-        return plant_from(part.plant.name) if part.basis is None else part.basis.plant
-    if _is_result(part):
-        path = run_with_estimate(Path(part)) / "estimate.json"
-        return plant_from(EstimateSummary.read(path, "identify the records again").plant)
-    return plant_from(plant_named_by(part))
+        return part.plant.name
+    path = run_with_estimate(Path(part)) / "estimate.json"
+    return EstimateSummary.read(path, "identify the records again").plant
 
 
 def _is_result(part: object) -> bool:

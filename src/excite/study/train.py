@@ -31,6 +31,7 @@ def train(
     window: int | None = None,
     clock: float | Sequence[float] = (),
     training: Mapping[str, object] | None = None,
+    updates: int | None = None,
     seeds: int = 1,
     spread: SpreadLike = 0.3,
     uncertainty: Mapping[str, Range] | None = None,
@@ -49,8 +50,8 @@ def train(
     Rerun with the same arguments and the same `out` to resume an interrupted training.
 
         >>> import excite as ex
-        >>> brief = {"num_updates": 1, "num_plants": 2, "hidden": [4]}
-        >>> policy = ex.train("aero2", steps=40, window=5, episodes=2, training=brief)
+        >>> small = {"num_plants": 2, "hidden": [4]}
+        >>> policy = ex.train("aero2", steps=40, window=5, episodes=2, updates=1, training=small)
         >>> policy.layout.num_steps
         40
 
@@ -66,6 +67,7 @@ def train(
         window: number of samples observed, default 80.
         clock: frequencies [Hz] whose sine and cosine are observed too.
         training: hyper-parameters of the method (`excite.training.settings`).
+        updates: gradient updates, default 1000; the hyper-parameter `num_updates`.
         seeds: independent trainings; the best policy is returned.
         spread: plants are drawn from nominal values ± this fraction, or within a factor
             (`factor:3`).
@@ -90,6 +92,13 @@ def train(
         raise ValueError(
             "ppo does not train against an uncertainty: leave it out, or take the method gradient"
         )
+    own = by_name("training", training)
+    if updates is not None:
+        if method == "ppo":
+            raise ValueError("ppo has no updates (--updates): set its total_steps (--set)")
+        if "num_updates" in own:
+            raise ValueError("updates and num_updates are the same: give one of the two")
+        own["num_updates"] = updates
     rewards = rewards_of(objective, by_name("goal", goal, "a dict by parameter"))
     decision = {
         **decision_of(rewards.values()),
@@ -102,7 +111,7 @@ def train(
         "targets": _several("target", target, str, "the name of a parameter, or several") or None,
         "method": method,
         "decision": {n: v for n, v in decision.items() if v not in (None, [], {})},
-        "training": by_name("training", training),
+        "training": own,
     }
     settings = {
         "episodes": episodes,

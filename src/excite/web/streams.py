@@ -16,6 +16,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, StreamingResponse
 from starlette.routing import Route
 
+from ..files import is_class_word
 from .events import (
     Episode,
     ExperimentRequest,
@@ -103,7 +104,7 @@ def _identification(asked: Asked, plants: Mapping[str, str]) -> IdentificationRe
     """An identification, likewise."""
     return {
         "plant": plant_of(asked, plants),
-        "estimator": word(asked, "estimator"),
+        "estimator": _estimator(word(asked, "estimator")),
         "initial_state": word(asked, "initial_state"),
         "columns": texts(asked, "columns"),
         "scales": numbers(asked, "scales"),
@@ -112,6 +113,13 @@ def _identification(asked: Asked, plants: Mapping[str, str]) -> IdentificationRe
         "hold_input": word({"hold_input": "constant", **asked}, "hold_input"),
         "effect": word(asked, "effect") if asked.get("effect") else "",
     }
+
+
+def _estimator(name: str) -> str:
+    """A shipped one: a request runs no file's code."""
+    if is_class_word(name):
+        raise RefusedError(400, f"estimator: {name!r} is not one that can be chosen here")
+    return name
 
 
 def _streamed(session: Session, events: Callable[[asyncio.Event], Events]) -> StreamingResponse:
