@@ -249,15 +249,33 @@ def test_a_study_is_answered_by_the_most_informative_excitation_without_a_violat
     assert "learned tells most about the plant: log det 55.0" in first
     assert "4 times smaller than those of chirp" in first  # 0.4 over 0.1
     assert second.startswith("It reached a critical level in 0 of 100 experiments (sampled; 95 %")
-    assert third == "Largest output found: 0.97."
-    unsearched = answered(ROWS, FACTS, {"learned": "no certificate: no search was made"})
-    assert unsearched.sentences[2] == "No search was made."
+    assert third == "Search for violations: largest output found: 0.97; found, not proved."
+    for claims in ({"learned": "no certificate: no search for violations"}, {}):
+        told = answered(ROWS, FACTS, claims).sentences[2]
+        assert told == "It was not searched for violations (excite falsify)."
     assert [cells[0] for cells in found.table()[1]] == ["learned", "chirp", "loud"]
     none = answered([ROWS[2]], FACTS, {})
     assert none.best is None
     assert none.sentences == (
         "No excitation was without a violation: loud had the fewest, 3 of 100.",
     )
+
+
+def test_an_answer_keeps_its_sense_at_the_edges():
+    unknown = row("drifting", "nls", math.nan, math.nan)
+    assert [r.method for r in answered([unknown, *ROWS], FACTS, {}).rows][-2:] == [
+        "drifting", "loud",
+    ]  # fmt: skip
+    alone = answered([unknown, row("chirp", "nls", math.nan, math.nan)], FACTS, {})
+    assert "standard errors" not in alone.sentences[0]
+    equal = answered([row("learned", "nls", 55.0, 0.4), ROWS[1]], FACTS, {})
+    assert "that it allows are about those of chirp" in equal.sentences[0]
+    large = answered([row("learned", "nls", 55.0, 0.003), ROWS[1]], FACTS, {})
+    assert "133 times smaller than those of chirp" in large.sentences[0]
+    failing = [r.model_copy(update={"failed": 95}) for r in ROWS if r.estimator == "nls"]
+    assert answered([*failing, ROWS[0]], FACTS, {}).rows[0].estimator == "arx"
+    reference = answered([ROWS[4]], FACTS, {})
+    assert (reference.best, reference.sentences) == (None, ())
 
 
 @pytest.mark.parametrize("name", ["frontier", "table1"])

@@ -13,7 +13,9 @@ from .study_table import violations_cell
 from .tables import Table
 
 KNOWS_THE_PLANT = "clairvoyant"  # a reference, and no excitation that could be played
-_USUAL = "chirp"  # of the classical excitations, what others are compared with
+_USUAL = "chirp"  # of the methods that are not trained, what others are compared with
+_OFTEN = 0.05  # of the experiments: an estimator that fails more often is not chosen
+_NEARLY = 1.05  # a ratio of standard errors below it is no difference
 _MOST_ROWS = 14  # of a table that fits a screen
 
 
@@ -22,8 +24,8 @@ class Answer:
     """The answer of a study.
 
     Attributes:
-        rows: one for each excitation, with the estimator of the smallest errors; those without a
-            violation first, and of them the most informative.
+        rows: one for each excitation, with the estimator whose errors are nearest to the
+            Cramér-Rao bound; those without a violation first, and of them the most informative.
         best: the first of them; None where every excitation had violations.
         usual: what it is compared with; None where there is nothing else.
         sentences: two, and a third on what a search found.
@@ -66,31 +68,48 @@ def answered(rows: Sequence[Row], study: StudyFacts, claims: Mapping[str, str]) 
         claims: by agent, what a search for violations found.
     """
     estimator = min({row.estimator: None for row in rows}, key=lambda name: _excess(rows, name))
-    own = [r for r in rows if r.estimator == estimator and r.method != KNOWS_THE_PLANT]
-    ranked = sorted(own, key=lambda row: (row.violations > 0, -row.log_det_information))
+    own = [row for row in rows if row.estimator == estimator]
+    ranked = sorted([r for r in own if r.method != KNOWS_THE_PLANT], key=_rank)
     if not ranked:
-        ranked = [row for row in rows if row.estimator == estimator]
+        return Answer(tuple(own), None, None, ())
     safe = [row for row in ranked if row.violations == 0]
     best = safe[0] if safe else None
     classical = [row for row in ranked if row.method in study.methods and row is not best]
     usual = next((r for r in classical if r.method == _USUAL), classical[0] if classical else None)
     told = _told(ranked, safe, best, usual)
-    claim = claims.get(best.method) if best else None
-    searched = (claim or "").partition(";")[0].removeprefix("no certificate: ")
-    last = (f"{searched[0].upper()}{searched[1:]}.",) if searched else ()
-    return Answer(tuple(ranked), best, usual, (*told, *last))
+    if best is not None:
+        found = claims.get(best.method, _UNSEARCHED)
+        is_searched = not found.startswith(_UNSEARCHED)
+        last = f"search for violations: {found}" if is_searched else _NOBODY
+        told = (*told, f"{last[0].upper()}{last[1:]}.")
+    return Answer(tuple(ranked), best, usual, told)
 
 
-def _excess(rows: Sequence[Row], estimator: str) -> float:
-    """How far an estimator's errors lie above the Cramér-Rao bound, in the middle of all rows."""
+_UNSEARCHED = "no certificate"
+_NOBODY = "it was not searched for violations (excite falsify)"
+
+
+def _rank(row: Row) -> tuple[bool, float]:
+    """Excitations without a violation first, then by information; what is not finite is last."""
+    worth = row.log_det_information
+    return row.violations > 0, -worth if math.isfinite(worth) else math.inf
+
+
+def _excess(rows: Sequence[Row], estimator: str) -> tuple[bool, float]:
+    """Whether an estimator fails often, and how far its errors lie above the Cramér-Rao bound.
+
+    The second is the median over rows and parameters of the error's root mean square over the
+    bound.
+    """
+    own = [row for row in rows if row.estimator == estimator]
     ratios = [
         error.rms / row.cramer_rao_percent[name]
-        for row in rows
-        if row.estimator == estimator
+        for row in own
         for name, error in row.relative_error_percent.items()
         if math.isfinite(error.rms) and row.cramer_rao_percent[name] > 0
     ]
-    return statistics.median(ratios) if ratios else math.inf
+    fails = any(row.failed > _OFTEN * row.evaluations for row in own)
+    return fails, statistics.median(ratios) if ratios else math.inf
 
 
 def _told(
@@ -105,16 +124,16 @@ def _told(
         )
     many = f"Of {len(safe)} excitations" if len(safe) > 1 else "The only excitation"
     told = f"{many} that reached no critical level in these experiments"
-    told += f", {best.method} tells most" if len(safe) > 1 else f" is {best.method}"
-    told += f" about the plant: log det {best.log_det_information:.1f} of the Fisher information"
-    if usual is not None:
-        names = best.parameters
-        ratios = [usual.cramer_rao_percent[n] / best.cramer_rao_percent[n] for n in names]
-        gain = math.exp(statistics.fmean(map(math.log, ratios)))
-        word = f"{gain:.2g} times smaller" if gain >= 1 else f"{1 / gain:.2g} times larger"
+    told += f", {best.method} tells most about the plant" * (len(safe) > 1)
+    told += f" is {best.method}" * (len(safe) == 1)
+    told += f": log det {best.log_det_information:.1f} of the Fisher information"
+    if usual is not None and (gain := _gain(best, usual)) is not None:
+        size = max(gain, 1 / gain)
+        word = f"{size:.0f}" if size >= 10 else f"{size:.2g}"
+        word += f" times {'smaller' if gain > 1 else 'larger'} than"
         told += (
-            f". The standard errors that it allows are {word} than those of {usual.method} "
-            "(Cramér-Rao bound, geometric mean over the parameters)"
+            f". The standard errors that it allows are {word if size >= _NEARLY else 'about'} "
+            f"those of {usual.method} (Cramér-Rao bound, geometric mean over the parameters)"
         )
     most = 100 * best.violation_rate.ci95[1]
     return (
@@ -122,3 +141,12 @@ def _told(
         f"It reached a critical level in 0 of {best.evaluations} experiments (sampled; 95 %: at "
         f"most {most:.2g} %).",
     )
+
+
+def _gain(best: Row, usual: Row) -> float | None:
+    """How much smaller the standard errors can be; None where a bound is missing."""
+    ratios = [usual.cramer_rao_percent[n] / best.cramer_rao_percent[n] for n in best.parameters
+              if best.cramer_rao_percent[n] > 0]  # fmt: skip
+    if len(ratios) < len(best.parameters) or not all(0 < r < math.inf for r in ratios):
+        return None
+    return math.exp(statistics.fmean(map(math.log, ratios)))
