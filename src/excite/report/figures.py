@@ -86,20 +86,25 @@ def knowledge_figure(
     samples: Int[np.ndarray, " sample"],
     shares: Mapping[str, Float[np.ndarray, " sample"]],
     ends: Sequence[int],
+    decided: Mapping[str, Sequence[float]],
 ) -> matplotlib.figure.Figure:
     """Half of the 95 % intervals over those asked for, after every sample of a campaign.
+
+    Lines are the Cramér-Rao bound for the declared noise; dots are the intervals of the estimates.
 
     Args:
         title: of the figure.
         samples: counted from the first of the campaign.
         shares: by parameter; its target is reached at one.
         ends: of the rounds, in samples.
+        decided: by parameter, the share by which each round was judged.
     """
     figure, axes = new_figure(1)
     axis = axes[0, 0]
     for i, (name, share) in enumerate(shares.items()):
         shown = np.where(np.isfinite(share), share, np.nan)
         axis.plot(samples, shown, color=colour_of(i), lw=1.4, label=name)
+        axis.plot(ends, decided[name], "o", color=colour_of(i), ms=5)
     axis.axhline(1, color="black", lw=0.8, ls="--", label="asked for")
     for end in ends[:-1]:
         axis.axvline(end, color=GREY, lw=0.8, ls=":")

@@ -631,7 +631,12 @@ class Campaign:
             for t in self.targets
         }
         ends = np.cumsum([r.num_samples for r in self.rounds]).tolist()
-        return knowledge_figure(self.title, samples, shares, ends)
+        allowed = self._allowed()
+        decided = {
+            n: [r.known[n].ci95_half / half if n in r.known else math.nan for r in self.rounds]
+            for n, half in allowed.items()
+        }
+        return knowledge_figure(self.title, samples, shares, ends, decided)
 
 
 @eqx.filter_jit

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -102,12 +103,19 @@ class CampaignRun(Run):
         samples, allowed = self.knowledge["sample"], self.content["allowed"]
         shares = {n: self.knowledge[n] / half for n, half in allowed.items()}
         ends = np.cumsum([r["num_samples"] for r in self.content["rounds"]]).tolist()
-        drawn = knowledge_figure("", samples.astype(int), shares, ends)
+        decided = {
+            n: [r["known"].get(n, {}).get("ci95_half", math.nan) / half
+                for r in self.content["rounds"]]
+            for n, half in allowed.items()
+        }  # fmt: skip
+        drawn = knowledge_figure("", samples.astype(int), shares, ends, decided)
         return figure(
             drawn,
             f"{name}-known",
-            "Half of each 95 % interval over the one asked for, by the Cramér-Rao bound at the "
-            "final estimate, for the inputs that were played. Rounds end at the dotted lines.",
+            "Half of each 95 % interval over the one asked for. Lines: the Cramér-Rao bound at the "
+            "final estimate, for the declared noise and the inputs that were played. Dots: the "
+            "intervals of the estimates, by which the rounds were judged; they know the noise of "
+            "the records. Rounds end at the dotted lines.",
         )
 
 
