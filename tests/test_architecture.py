@@ -21,6 +21,7 @@ modules = pytest.mark.parametrize("module", MODULES)
 
 ORDER = (
     "__init__",
+    "progress",
     "description",
     "files",
     "record",
@@ -77,6 +78,7 @@ DOORS = {
     "rich": ["cli"],
 }
 WITHOUT_JAX = (
+    "progress",
     "description",
     "files",
     "policy",

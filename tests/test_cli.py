@@ -30,6 +30,7 @@ from excite.files import read_columns
 from excite.plant import Aero2
 from excite.plant.catalogue import PLANTS
 from excite.policy import Layout, Policy, read_policy, shipped_policies
+from excite.progress import SHOWN
 from excite.record import read_record
 from excite.report.numbers import number
 from excite.study.catalogue import studies
@@ -438,7 +439,7 @@ def test_where_stderr_is_no_terminal_lines_tell_how_far_it_is(monkeypatch, capsy
 
 def test_the_time_left_counts_neither_start_up_nor_earlier_work(monkeypatch):
     now = [0.0]
-    monkeypatch.setattr("excite.cli.options.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("excite.progress.time.monotonic", lambda: now[0])
     lines = Lines("resumed")
     for now[0], done, words in (
         (0.0, 0.80, "80 %, 0 s so far"),
@@ -452,6 +453,25 @@ def test_the_time_left_counts_neither_start_up_nor_earlier_work(monkeypatch):
     ):
         lines.update("", done, 1.0)
         assert lines.line() == f"resumed, {words}"
+
+
+def test_a_function_of_the_library_shows_a_line_every_ten_seconds(monkeypatch, capsys):
+    now = [100.0]
+    monkeypatch.setattr("excite.progress.time.monotonic", lambda: now[0])
+    monkeypatch.setenv("EXCITE_PROGRESS", "10")
+    for _ in range(2):  # two computations, one after the other
+        began = now[0]
+        for seconds, done in ((0, 0), (4, 1), (11, 2), (19, 3), (22, 4)):
+            now[0] = began + seconds
+            SHOWN("update", done, 8)
+        assert capsys.readouterr().err.splitlines() == [
+            "update, 25 %, 42 s left",
+            "update, 50 %, 24 s left",
+        ]
+        now[0] += 1000
+    monkeypatch.setenv("EXCITE_PROGRESS", "0")
+    SHOWN("update", 5, 8)
+    assert capsys.readouterr().err == ""
 
 
 # Plants, doctor

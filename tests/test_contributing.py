@@ -2,6 +2,7 @@
 
 import importlib
 import re
+import shlex
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 import test_plant
 from catalogue import TwoMasses
+from commands import excite
 
 import excite as ex
 from excite import estimation
@@ -82,6 +84,21 @@ def test_the_estimator_passes_its_test(added, monkeypatch):
     assert ex.identify(record, "aero2", OneStep).status == "successful"
     with pytest.raises(ValueError, match="known initial state"):
         ex.identify(record, "aero2", OneStep, initial_state="free")
+
+
+def test_classes_in_a_file_of_ones_own_work_from_python_and_the_command_line(tmp_path, monkeypatch):
+    page = (ROOT / "docs/how-to/use-your-own-excitation.md").read_text()
+    triangle, use, one_step, compare, _ = re.findall(r"```python\n(.*?)```", page, re.S)
+    (tmp_path / "own.py").write_text(triangle + one_step)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    names: dict[str, Any] = {}
+    exec(use + compare, names)
+    assert abs(ex.identify(names["record"], "aero2", estimator=names["OneStep"]).params.J_p
+               - 0.0233) < 1e-4  # fmt: skip
+    sys.modules.pop("own")
+    for command in re.findall(r"```sh\n(.*?)```", page, re.S)[0].splitlines():
+        assert excite(*shlex.split(command)[1:]).returncode == 0
 
 
 def test_the_objective_rewards_little_input(added):

@@ -14,7 +14,6 @@ import shutil
 import signal
 import sys
 import threading
-import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -23,6 +22,7 @@ from typing import Any, Generic, ParamSpec, Self, TypeVar
 import click
 
 from ..description import Spread
+from ..progress import Course, Progress, seconds_between
 
 Callback = TypeVar("Callback", bound=Callable[..., object])
 P = ParamSpec("P")
@@ -259,19 +259,12 @@ def cache_folder() -> Path:
     return Path(own) if own else Path(base) / "excite"
 
 
-class Lines:
-    """Progress of a command: a line on stderr every ten seconds, if stderr is no terminal.
-
-    EXCITE_PROGRESS sets another time between two lines [s]; 0 means none.
-    """
+class Lines(Course):
+    """Progress of a command: a line on stderr every ten seconds, if stderr is no terminal."""
 
     def __init__(self, what: str) -> None:
         """`what` the command does."""
-        self._what, self._text = what, ""
-        self._began = time.monotonic()
-        self._share = math.nan
-        # Time and share when it first grew: what came before is work done earlier, and start-up.
-        self._first: tuple[float, float] | None = None
+        super().__init__(what)
         self._end = threading.Event()
         self._teller = threading.Thread(target=self._tell, daemon=True)
 
@@ -285,38 +278,10 @@ class Lines:
         self._end.set()
         self._teller.join()
 
-    def update(self, text: str, done: float, total: float) -> None:
-        """Sets the current step, how much is done (NaN: it is not known), and the total."""
-        share = done / total if total else 0.0
-        if share > self._share:
-            self._first = self._first or (time.monotonic(), share)
-        elif share != self._share:  # what is resumed may begin before what was told first
-            self._first = None
-        self._text, self._share = text, share
-
-    def line(self) -> str:
-        """The current step, how much of it is done, and the time left or elapsed."""
-        now, share = time.monotonic(), self._share
-        since, before = self._first or (now, share)
-        if share > before:
-            how_long = f"{_duration((now - since) * (1 - share) / (share - before))} left"
-        else:
-            how_long = f"{_duration(now - self._began)} so far"
-        words = f"{100 * share:.0f} %, {how_long}" if share > 0 else how_long
-        return f"{': '.join(filter(None, (self._what, self._text)))}, {words}"
-
     def _tell(self) -> None:
-        seconds = float(os.environ.get("EXCITE_PROGRESS", "10"))
+        seconds = seconds_between()
         while seconds > 0 and not self._end.wait(seconds):
             click.echo(self.line(), err=True)
-
-
-def _duration(seconds: float) -> str:
-    """A duration in hours, minutes or seconds."""
-    hours, minutes = divmod(round(seconds / 60), 60)
-    if hours:
-        return f"{hours} h {minutes} min"
-    return f"{minutes} min" if seconds >= 90 else f"{seconds:.0f} s"
 
 
 def show_warning(message: Warning | str, *_: object, **__: object) -> None:
@@ -334,7 +299,7 @@ def warnings_shown() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def progress_bar(what: str) -> Iterator[Callable[[str, float, float], None]]:
+def progress_bar(what: str) -> Iterator[Progress]:
     """Shows the progress of a command on stderr: a bar on a terminal, lines elsewhere.
 
     Yields a function that sets the current step, how much is done (NaN: it is not known), and the
@@ -342,12 +307,15 @@ def progress_bar(what: str) -> Iterator[Callable[[str, float, float], None]]:
     """
     with contextlib.ExitStack() as stack:
         if sys.stderr.isatty() or os.environ.get("FORCE_COLOR"):
+            from rich import progress as shown
             from rich.console import Console
-            from rich.progress import BarColumn, Progress, TaskProgressColumn, TimeRemainingColumn
 
             console = Console(stderr=True)
-            columns = "{task.description}", BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
-            bar = stack.enter_context(Progress(*columns, console=console, transient=True))
+            columns = (
+                "{task.description}", shown.BarColumn(), shown.TaskProgressColumn(),
+                shown.TimeRemainingColumn(),
+            )  # fmt: skip
+            bar = stack.enter_context(shown.Progress(*columns, console=console, transient=True))
             task = bar.add_task(what, total=None)
 
             def show(text: str, done: float, total: float) -> None:

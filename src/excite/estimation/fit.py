@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -13,6 +13,7 @@ import numpy as np
 from ..description import RARE, names_of
 from ..information.identifiability import STRUCTURALLY_NOT, worst_seen
 from ..plant import AbstractPlant, Params, floats
+from ..progress import Progress
 from .contract import (
     AbstractEstimator,
     AbstractSearch,
@@ -29,7 +30,6 @@ from .held import structure_of
 from .nls import NLS
 from .pem import PEM
 
-Progress = Callable[[str, float, float], None]
 NOTHING_SEEN = (
     "no parameter is identifiable from the data; are columns, signs and units right, and does the "
     "input move the plant beyond the noise? or did the search begin too far from the truth "

@@ -27,6 +27,7 @@ from ..information.identifiability import UNSEEN_SD, identifiability
 from ..plant import AbstractPlant, Params, params_from
 from ..plant.catalogue import PLANTS, PlantLike, plant_from
 from ..plant.extension import plain_kind
+from ..progress import SHOWN, Progress
 from ..record import (
     Record,
     described_in,
@@ -62,7 +63,6 @@ from .fit import (
     PRIOR_TOO,
     Fit,
     NothingLeftError,
-    Progress,
     fit_of,
     is_centred,
     is_noise,
@@ -129,7 +129,7 @@ def identify(
     set_inputs: Mapping[str, float] | None = None,
     dt: float | None = None,
     rows: slice | str | None = None,
-    progress: Progress = lambda *_: None,
+    progress: Progress = SHOWN,
 ) -> Identification:
     """Parameters of one plant from one or several records.
 

@@ -17,7 +17,7 @@ stochastic gradient approach to designing Bayesian-optimal experiments, 2020).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -34,13 +34,12 @@ from ..excitation.catalogue import ExcitationLike
 from ..information import require_noise
 from ..plant import AbstractPlant, Params
 from ..plant.catalogue import PlantLike
+from ..progress import SHOWN, Progress
 from ..report.tables import html_table, text_table
 from ..simulation import Experiment, response, run_episode
 from .evidence import Fit, nearest
 from .prior import Prior
 from .prior_knowledge import PriorLike, with_prior
-
-Progress = Callable[[str, int, int], None]
 
 _STEPS, _STARTS = 30, 8  # of the search for the most probable parameters
 _WIDE, _SHARES = 2.0, (0.5, 0.375, 0.125)  # of the proposal: normal, a wider one, the prior
@@ -278,7 +277,7 @@ def information_gain(
     samples: int = 1000,
     from_prior: bool = False,
     seed: int = 0,
-    progress: Progress = lambda *_: None,
+    progress: Progress = SHOWN,
 ) -> InformationGain:
     """What an experiment is expected to tell of the parameters, in nats.
 

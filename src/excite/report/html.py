@@ -11,6 +11,7 @@ import matplotlib
 from .. import __version__
 from ..description import path_from, wrong_type
 from ..files import require_new_file, write_bytes
+from ..progress import SHOWN, Progress
 from ..record.figure import MAX_POINTS, at_most
 from .sections.campaign import read_campaign
 from .sections.elements import Marker, Run, Section, paragraph, text
@@ -62,7 +63,7 @@ def report(
     out: str | Path | None = None,
     *,
     overwrite: bool = False,
-    progress: Callable[[str, int, int], None] = lambda *_: None,
+    progress: Progress = SHOWN,
 ) -> str:
     """A report of run folders and records as one self-contained HTML page.
 

@@ -23,13 +23,13 @@ from ..excitation import Replay
 from ..files import csv_text, locked_folder, read_json, write_bytes, write_json
 from ..plant.catalogue import PlantLike
 from ..policy import Policy
+from ..progress import SHOWN, Progress
 from ..record import read_record
 from ..rig.catalogue import RigOptions, rig_named
 from ..rig.contract import AbstractRig, Sample
 from ..rig.loop import interruptible
 from ..rig.session import RunResult, run
 from ..safety import Trip
-from ..training.checkpoint import Progress
 from .campaign import REACHED, WHOLE, Campaign, Round
 from .discrimination import RivalLike
 from .targets import TargetLike
@@ -59,7 +59,7 @@ def campaign(
     guard: bool = False,
     pause: float = 0.0,
     command: str = "",
-    progress: Progress = lambda *_: None,
+    progress: Progress = SHOWN,
     on_round: Callable[[Round], None] = lambda _: None,
     on_warning: Callable[[str], None] = lambda _: None,
 ) -> Campaign:

@@ -36,11 +36,11 @@ from ..information import require_noise
 from ..plant import AbstractPlant
 from ..plant.catalogue import PlantLike, plant_from
 from ..plant.uncertainty import Range, Uncertainty
+from ..progress import SHOWN, Progress
 from ..record import Record, require_record_path, write_record
 from ..report.numbers import digits_for, number
 from ..report.tables import html_table, text_table
 from ..rig.contract import Interval
-from ..training.checkpoint import Progress
 from ..training.design import designed_record
 from ..training.discrimination import discriminating, error_bound
 from ..training.redesign import first_signals
@@ -251,7 +251,7 @@ def discriminate(
     seed: int = 0,
     out: str | Path | None = None,
     overwrite: bool = False,
-    progress: Progress = lambda *_: None,
+    progress: Progress = SHOWN,
 ) -> Discrimination:
     """Which of several plants is the true one, and which experiment, from rest, tells them apart.
 

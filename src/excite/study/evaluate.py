@@ -12,8 +12,8 @@ from ..plant import AbstractARXPlant
 from ..plant.catalogue import PlantLike
 from ..plant.uncertainty import Range
 from ..policy import POLICY_ENDING, Policy, mismatch, read_policy
+from ..progress import SHOWN, Progress
 from ..report.study_table import StudyTable
-from ..training.checkpoint import Progress
 from .methods import compared
 from .spec import plant_tables, study_from
 
@@ -31,7 +31,7 @@ def evaluate(
     estimators: str | Sequence[str] | None = None,
     rig: bool = False,
     filter: bool = False,
-    progress: Progress = lambda *_: None,
+    progress: Progress = SHOWN,
 ) -> StudyTable:
     """Evaluates a policy, not a plant, on plants drawn at random.
 

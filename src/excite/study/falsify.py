@@ -41,6 +41,7 @@ from ..plant.catalogue import (
 from ..plant.contract import with_nominal
 from ..plant.uncertainty import Range, Uncertainty
 from ..policy import POLICY_ENDING, Policy, policy_path, read_policy, shown_nearness
+from ..progress import SHOWN, Progress
 from ..record import Record
 from ..report.numbers import number
 from ..report.tables import html_table, text_table
@@ -51,7 +52,6 @@ from ..rig.guard_design import guard_for
 from ..rig.simulated import NO_FILTER
 from ..safety import watched_levels
 from ..simulation import Experiment, Trajectory, experiment_length, run_episode
-from ..training.checkpoint import Progress
 
 if TYPE_CHECKING:
     import matplotlib.figure
@@ -278,7 +278,7 @@ def falsify(
     rig: bool = False,
     filter: bool = False,
     guard: bool = False,
-    progress: Progress = lambda *_: None,
+    progress: Progress = SHOWN,
 ) -> Falsification:
     """Searches a declared uncertainty for the plant on which an excitation is least safe.
 

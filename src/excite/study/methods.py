@@ -21,13 +21,13 @@ from ..estimation import AbstractEstimator, stack_experiments
 from ..excitation import AbstractExcitation
 from ..information import d_optimality, require_noise
 from ..plant import AbstractPlant
+from ..progress import Progress
 from ..report.rows import BoundByLength, Row, StudyFacts
 from ..report.study_table import StudyTable
 from ..rig.filter import SafetyFilter
 from ..rig.simulated import drawn_hardware, evaluate_on_rig, readings_per_sample
 from ..safety import Supervision, Trip
 from ..simulation import Trajectory
-from ..training.checkpoint import Progress
 from .spec import Study
 from .statistics import Scores, table_row
 

@@ -31,11 +31,11 @@ from ..information import running_information
 from ..plant import AbstractPlant
 from ..plant.catalogue import PlantLike
 from ..policy import Policy, mismatch, read_policy
+from ..progress import SHOWN, Progress
 from ..record import Record, require_record_path, write_record
 from ..report.tables import html_table, text_table
 from ..rig.contract import Interval
 from ..simulation import response, run_episode
-from ..training.checkpoint import Progress
 from ..training.design import designed_record
 from ..training.redesign import JUDGES, Region, first_signals, redesigned
 from .knowledge import KnownLike, intervals_in, known_from
@@ -370,7 +370,7 @@ def next_experiment(
     seed: int = 0,
     out: str | Path | None = None,
     overwrite: bool = False,
-    progress: Progress = lambda *_: None,
+    progress: Progress = SHOWN,
 ) -> NextExperiment:
     """Which experiment to make next, from rest, and what it will bring.
 

@@ -34,13 +34,13 @@ from ..files import (
 )
 from ..plant import AbstractPlant
 from ..policy import POLICY_ENDING, read_policy
+from ..progress import SHOWN, Progress
 from ..record.figure import image
 from ..record.read import SIGNAL_ENDINGS
 from ..report.frontier import frontier_figure, lengths_figure
 from ..report.rows import CountsBySeed, Rows
 from ..report.study_figures import agents_figure, curves_figure
 from ..report.study_table import StudyTable, differences_csv
-from ..training.checkpoint import Progress
 from .catalogue import study_path
 from .cluster import dask_engine
 from .engine import Engine, local_engine, run
@@ -84,7 +84,7 @@ def run_study(
     workers: int | None = None,
     address: str | None = None,
     overwrite: bool = False,
-    progress: Progress = lambda *_: None,
+    progress: Progress = SHOWN,
     on_done: Callable[[str], None] = lambda _: None,
     on_wait: Callable[[], None] = lambda: None,
     command: str = "",
@@ -390,7 +390,7 @@ def run_tasks(
     study: Study,
     folder: Path,
     engine: Engine | None,
-    progress: Progress = lambda *_: None,
+    progress: Progress = SHOWN,
     on_done: Callable[[str], None] = lambda _: None,
     command: str = "",
     overwrite: bool = False,

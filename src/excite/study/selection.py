@@ -37,11 +37,11 @@ from ..information import experiment_information, require_noise
 from ..information.exchange import exchanged
 from ..plant import AbstractPlant, Params, Sensor, draw_params, floats
 from ..plant.catalogue import PlantLike, plant_from
+from ..progress import SHOWN, Progress
 from ..report.numbers import number
 from ..report.tables import html_table, text_table
 from ..rig.contract import Interval
 from ..simulation import Experiment, run_episode
-from ..training.checkpoint import Progress
 from ..training.redesign import JUDGES, POINTS, Region
 from .knowledge import KnownLike, intervals_in, known_before, known_from
 from .next_experiment import COAST, LARGEST
@@ -272,7 +272,7 @@ def choose_experiments(
     budget: float | None = None,
     coast: int = COAST,
     seed: int = 0,
-    progress: Progress = lambda *_: None,
+    progress: Progress = SHOWN,
 ) -> Selection:
     """Which of several experiments to make, and in which order.
 

@@ -12,7 +12,7 @@ from ..plant import AbstractARXPlant
 from ..plant.catalogue import PlantLike
 from ..plant.uncertainty import Range
 from ..policy import Policy, read_policy
-from ..training.checkpoint import Progress
+from ..progress import SHOWN, Progress
 from .folder import seed_folder
 from .objectives import decision_of, rewards_of
 from .run import run_study
@@ -41,7 +41,7 @@ def train(
     episodes: int = 100,
     output_scale: Mapping[str, float] | None = None,
     workers: int | None = 1,
-    progress: Progress = lambda *_: None,
+    progress: Progress = SHOWN,
     on_done: Callable[[str], None] = lambda _: None,
     command: str = "",
 ) -> Policy:

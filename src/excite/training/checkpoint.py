@@ -13,9 +13,6 @@ from ..policy import Weights
 
 FORMAT = "excite checkpoint 1"
 
-Progress: TypeAlias = Callable[[str, int, int], None]
-"""Called with what is being computed, how much is done, and the total."""
-
 
 @dataclass(frozen=True)
 class Checkpoint:

@@ -34,10 +34,10 @@ from ..information import d_optimality, require_noise
 from ..plant import AbstractPlant
 from ..plant.catalogue import PlantLike, plant_from, require_inputs, with_sensor
 from ..plant.uncertainty import Range, Uncertainty
+from ..progress import SHOWN, Progress
 from ..record import Record, require_record_path, write_record
 from ..report.tables import html_table
 from ..simulation import response, run_episode
-from .checkpoint import Progress
 from .signals import (
     CLAIRVOYANT,
     CLAIRVOYANT_STARTS,
@@ -155,7 +155,7 @@ def design(
     trials: int | None = None,
     out: str | Path | None = None,
     overwrite: bool = False,
-    progress: Progress = lambda *_: None,
+    progress: Progress = SHOWN,
 ) -> Design:
     """Designs an open-loop input within a plant's limits, safe for uncertain parameters.
 

@@ -27,7 +27,7 @@ from ..excitation import Multisine, Replay
 from ..plant import AbstractPlant
 from ..plant.uncertainty import Uncertainty
 from ..policy import Layout, scaled_action
-from .checkpoint import Progress
+from ..progress import Progress
 from .gradient import GradientSettings, Optimisation, Scores, experiments, update_all
 
 

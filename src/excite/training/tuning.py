@@ -23,8 +23,8 @@ from ..environment import Env, run_episodes
 from ..excitation.catalogue import LOOP, excitation_named
 from ..information import a_optimality, d_optimality, e_optimality
 from ..plant import AbstractPlant
+from ..progress import Progress
 from ..safety import critical_levels, watched_output
-from .checkpoint import Progress
 
 VIOLATION_COST = 5000.0
 """Penalty on the criterion when every experiment of a signal is a violation."""
