@@ -761,6 +761,44 @@ def test_the_run_folder_is_listed_as_it_is(page: TestClient, runs: Path):
     assert served_file.headers["content-disposition"].startswith("attachment")
 
 
+@pytest.mark.parametrize("name", ["b\u00a0c", "測定\u3000一", "a\tb"])
+def test_a_run_has_any_name_that_is_text(name: str, tmp_path: Path, scratch: Path):
+    for word in (name, os.fsdecode(b"\xff")):
+        (tmp_path / "runs" / word).mkdir(parents=True)
+        for file in ("run.json", "table.md", os.fsdecode(b"\xff.csv")):
+            (tmp_path / "runs" / word / file).write_text("{}")
+    page = guarded(tmp_path / "runs", scratch)
+    page.post("/api/session", json={})
+    assert [run["name"] for run in page.get("/api/runs").json()["runs"]] == [name]
+    content = page.get("/api/run", params={"name": name}).json()
+    assert content["files"] == ["run.json", "table.md"]
+
+
+def test_a_run_that_is_being_written_is_listed(
+    page: TestClient, runs: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Temporary files are hidden, and any file may be gone before it is looked at."""
+    run = runs / "some" / "study"
+    [before] = page.get("/api/runs").json()["runs"]
+    hidden, renamed = run / ".table.md.part", run / "table.json.part"
+    for path in (hidden, renamed):
+        path.touch()
+        os.utime(path, (4e9, 4e9))
+    look = Path.lstat
+
+    def gone(path: Path) -> os.stat_result:
+        if path in (hidden, renamed):
+            raise FileNotFoundError(path)
+        return look(path)
+
+    monkeypatch.setattr(Path, "lstat", gone)
+    assert page.get("/api/runs").json()["runs"] == [before]
+    monkeypatch.undo()
+    renamed.unlink()
+    assert page.get("/api/runs").json()["runs"] == [before]
+    hidden.unlink()
+
+
 def test_a_campaign_is_shown_with_what_is_known_and_its_rounds(page: TestClient, runs: Path):
     folder = runs / "known"
     folder.mkdir()
