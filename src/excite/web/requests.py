@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 import re
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 
 from starlette.requests import Request
 
@@ -14,6 +15,9 @@ MAX_STEPS = 5000
 """Largest number of samples of a simulated experiment."""
 MAX_BODY = 64 * 2**10
 """Largest size of a request that is not an upload [bytes]."""
+
+SILENCE = 30.0
+"""Seconds that a request's body may pause."""
 
 Asked = Mapping[str, object]
 """The content of a request, as JSON."""
@@ -36,6 +40,16 @@ class RefusedError(Exception):
     def __init__(self, status: int, sentence: str) -> None:
         super().__init__(sentence)
         self.status, self.sentence = status, sentence
+
+
+async def parts(request: Request) -> AsyncIterator[bytes]:
+    """The parts of a request's body as they come, until it ends or stops."""
+    body = request.stream()
+    try:
+        while part := await asyncio.wait_for(anext(body, b""), SILENCE):
+            yield part
+    except TimeoutError:
+        raise RefusedError(408, "the upload stopped") from None
 
 
 # ------------------------------------------------------------- what a browser may ask for
