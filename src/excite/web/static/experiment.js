@@ -2,7 +2,7 @@
 
 import { command, download, el, get, options, say, symbol, Task, tell } from "./api.js";
 import { COLOURS } from "./curves.js";
-import { digits, Plot, range, shown } from "./plot.js";
+import { digits, empty, Plot, range, shown } from "./plot.js";
 
 const section = document.getElementById("experiment"), form = section.querySelector("form");
 const at = (id) => document.getElementById(id);
@@ -121,8 +121,7 @@ function run() {
 function clear() {
   shownRun?.halt();
   at("outcome").hidden = at("player").hidden = true;
-  for (const plots of ["signals", "estimates", "overlays"]) at(plots).replaceChildren();
-  section.querySelector(".view").group?.show(null);
+  empty(at("signals"), at("estimates"), at("overlays"));
 }
 
 /** Draws the events of an experiment and its comparisons, of which there are so many. */

@@ -7,7 +7,7 @@ const colour = (name) => getComputedStyle(document.documentElement).getPropertyV
 const plots = new Set();
 /** The plots on the page; those that were taken away are given up. */
 function alive() {
-  for (const plot of plots) if (plot.u && !plot.chart.isConnected) plot.end();
+  for (const plot of plots) if (!plot.chart.isConnected) plot.end();
   return [...plots];
 }
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => alive().forEach((plot) => plot.draw(true)));
@@ -48,7 +48,8 @@ export function range(values, ...always) {
     if (value < low) low = value;
     if (value > high) high = value;
   }
-  if (!(high > low)) { low -= 1; high += 1; }
+  if (low > high) low = high = 0; // there is no number
+  if (low === high) { low -= 1; high += 1; }
   const room = 0.06 * (high - low);
   return [low - room, high + room];
 }
@@ -84,10 +85,21 @@ class Group {
   }
 }
 
+/** The part of the page around a place, whose plots share cross-hair and zoom. */
+const viewOf = (place) => place.closest(".own, .shared") ?? place;
+
+/** Takes away the plots in some places; their views show all of the axis again. */
+export function empty(...places) {
+  for (const place of places) {
+    place.replaceChildren();
+    viewOf(place).group?.show(null);
+  }
+}
+
 export class Plot {
   /** A figure in `parent`; `about` says in words what is drawn. Plots of a view share cross-hair and zoom. */
   constructor(parent, title, about) {
-    const view = parent.closest(".own, .shared") ?? parent; // plots of one experiment
+    const view = viewOf(parent);
     this.group = (view.group ??= new Group());
     this.note = el("span");
     this.read = el("span", { class: "read" });
@@ -122,17 +134,22 @@ export class Plot {
   get size() { return { width: this.chart.clientWidth, height: this.chart.clientHeight }; }
 
   end() {
-    this.u.destroy();
+    this.u?.destroy();
     resized.unobserve(this.chart);
     plots.delete(this);
   }
 
-  resize() { if (this.u) this.u.setSize(this.size); else this.draw(); }
+  resize() {
+    this.u?.setSize(this.size);
+    this.draw();
+  }
 
+  /** Draws what is to be shown; where the plot is hidden, as soon as it is not. */
   draw(isNew = false) {
+    if (isNew) this.made = "";
     if (!this.what || !this.chart.clientWidth) return;
     const kind = JSON.stringify([this.what.unit, this.what.log, this.lines.map(({ x, y, ...how }) => how)]);
-    if (this.u && !isNew && kind === this.made) this.u.setData(this.data());
+    if (this.u && kind === this.made) this.u.setData(this.data());
     else {
       this.u?.destroy();
       this.made = kind;

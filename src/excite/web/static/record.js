@@ -1,7 +1,7 @@
 // A recorded experiment: drop a file, map its columns, identify.
 
 import { command, download, el, options, say, symbol, Task, tell, upload } from "./api.js";
-import { digits, Plot, range, shown } from "./plot.js";
+import { digits, empty, Plot, range, shown } from "./plot.js";
 
 const section = document.getElementById("record"), form = section.querySelector("form");
 const at = (id) => document.getElementById(id);
@@ -52,7 +52,7 @@ function preview() {
   at("first-rows").replaceChildren(
     el("thead", {}, el("tr", {}, ...names.map((name) => el("th", { scope: "col" }, name)))),
     el("tbody", {}, ...Array.from({ length: rows }, (_, k) => el("tr", {}, ...names.map((name) => el("td", {}, file.previews[name].first[k] ?? ""))))));
-  at("columns").replaceChildren();
+  empty(at("columns"));
   for (const name of names) {
     const { index: x, values: y } = file.previews[name];
     if (y.length < 2) continue;
@@ -137,8 +137,7 @@ function show({ identification, plant: fitted, result, time, inputs, outputs, si
   correlations(Object.keys(identification.params), identification.correlation ?? []);
   at("record-again").replaceChildren(command(again));
   const parent = at("record-signals"), x = [time[0], time.at(-1)];
-  parent.replaceChildren();
-  at("residual-echoes").replaceChildren();
+  empty(parent, at("residual-echoes"));
   const title = (part) => el("span", {}, part.name, " ", el("span", { class: "unit" }, part.shown_unit));
   fitted.inputs.forEach((part, i) => {
     const y = inputs.map((row) => row[i]);
