@@ -208,6 +208,56 @@ def test_a_run_is_stopped(address: str, page: Page):
     page.locator("#experiment .stop").click()
     expect(status(page)).to_have_text("Stopped.", timeout=WAIT)
     expect(page.get_by_role("button", name="Run", exact=True)).to_be_enabled()
+    # What there is of it is played again.
+    time, play = page.locator("#player output"), page.get_by_role("button", name="Play")
+    expect(play).to_be_visible()
+    last = time.inner_text()
+    page.get_by_label("Time that is shown").fill("1")
+    expect(time).to_have_text("0 s")
+    play.click()
+    expect(time).to_have_text(last, timeout=WAIT)
+    expect(play).to_be_visible(timeout=WAIT)
+
+
+def test_what_tells_nothing_of_a_parameter_is_told(address: str, page: Page):
+    ready(page, address)
+    page.locator("#amplitude").fill("0")
+    page.get_by_label("Played in").select_option("0")
+    for label in ("First", "Second"):
+        page.get_by_label(label, exact=True).select_option("chirp")  # nothing to compare with
+    page.get_by_role("button", name="Run", exact=True).click()
+    expect(status(page)).to_have_text("Done.", timeout=WAIT)
+    for i in range(2, 6):
+        low, high = page.evaluate(PLOT.format("#overlays .chart", i) + ".what.y")
+        assert low < high  # None is neither
+    notes = page.locator("#overlays figcaption", has_text="chirp: not identifiable")
+    expect(notes).to_have_count(3)
+
+
+def test_long_lines_of_a_stream_are_read_once(address: str, page: Page):
+    """How often a character is looked at does not grow with the number of parts of its line."""
+    page.goto(address)
+    looked = """async () => {
+      const { stream } = await import("/static/api.js");
+      const line = JSON.stringify("x".repeat(5e4)), whole = `${line}\n[1]\n${line}\n`, told = [];
+      const parts = new ReadableStream({ start(own) {
+        const bytes = new TextEncoder().encode(whole);
+        for (let i = 0; i < bytes.length; i += 1000) own.enqueue(bytes.slice(i, i + 1000));
+        own.close();
+      } });
+      const { fetch } = window, { split } = String.prototype;
+      let looked = 0;
+      window.fetch = async () => new Response(parts);
+      String.prototype.split = function (...how) {
+        looked += this.length;
+        return split.apply(this, how);
+      };
+      await stream("", {}, (event) => told.push(event));
+      Object.assign(window, { fetch });
+      String.prototype.split = split;
+      return [told.map(({ length }) => length), told[1], looked / whole.length];
+    }"""
+    assert page.evaluate(looked) == [[50_000, 1, 50_000], [1], 1]
 
 
 def test_a_value_that_is_not_allowed_is_one_sentence(address: str, page: Page):
@@ -489,7 +539,7 @@ def test_a_line_is_hidden_and_a_plot_is_saved(address: str, page: Page, tmp_path
 
 def test_an_experiment_is_paused_and_played_again(address: str, page: Page):
     ready(page, address)
-    page.get_by_label("Played in").select_option("5")
+    page.get_by_label("Played in").select_option("20")
     page.get_by_role("button", name="Run", exact=True).click()
     expect(status(page)).to_have_text(re.compile("^Running"), timeout=WAIT)
     page.get_by_role("button", name="Pause").click()
@@ -560,29 +610,80 @@ def test_a_file_is_previewed_and_its_units_are_taken_from_the_names(address: str
     assert page.evaluate("navigator.clipboard.readText()") == command
 
 
+def test_a_file_that_fails_late_says_nothing_about_the_next(address: str, page: Page):
+    page.goto(f"{address}/#record")
+    expect(page.locator("#record-plant option").first).to_be_attached(timeout=WAIT)
+    held: list[Route] = []
+    page.route("**/api/uploads?name=late.csv", lambda route: held.append(route))
+
+    def choose(name: str) -> None:
+        content: Any = {"name": name, "mimeType": "", "buffer": b"time,x\n0,1\n1,2\n"}
+        page.locator("#file").set_input_files(content)
+
+    with page.expect_request("**/api/uploads?name=late.csv"):
+        choose("late.csv")
+    choose("next.csv")
+    expect(status(page, "record")).to_contain_text("next.csv: 2 columns", timeout=WAIT)
+    page.evaluate("""() => {
+      const said = (window.sentences_said = []);
+      const status = document.querySelector("#record .status");
+      const watch = new MutationObserver(() => said.push(status.textContent));
+      watch.observe(status, { childList: true });
+    }""")
+    with page.expect_response("**/api/uploads?name=late.csv") as late:
+        held[0].fulfill(status=422, json={"sentence": "too late"})
+    late.value.finished()
+    choose("third.csv")
+    expect(status(page, "record")).to_contain_text("third.csv: 2 columns", timeout=WAIT)
+    said = page.evaluate("window.sentences_said")
+    assert "too late" not in said
+    assert said[0] == "Reading third.csv…"
+
+
+def test_a_unit_that_is_not_known_is_told(address: str, page: Page):
+    page.goto(f"{address}/#record")
+    expect(page.locator("#record-plant option").first).to_be_attached(timeout=WAIT)
+    content = b"t [minutes],voltage [mV],pitch\n0,1,1\n1,2,1\n"
+    page.locator("#file").set_input_files({"name": "a.csv", "mimeType": "", "buffer": content})
+    hints = page.locator("#mapping .map .hint")
+    expect(hints).to_have_text(['unit "minutes" is not known: choose one', "", ""], timeout=WAIT)
+    page.locator("#unit-time").select_option("ms")
+    expect(hints).to_have_text(["", "", ""])
+
+
 def test_what_the_plant_leaves_out_is_estimated_by_one_click(
     address: str, page: Page, tmp_path: Path
 ):
+    """Besides those that were chosen, whatever plant is chosen for the next file."""
     late = ex.simulate("aero2+delay_voltage", "chirp", params={"delay_voltage": 0.06}, steps=300)
     late.save(tmp_path / "late.csv")
     page.goto(f"{address}/#record")
     expect(page.locator("#record-plant option").first).to_be_attached(timeout=WAIT)
     page.locator("#file").set_input_files(tmp_path / "late.csv")
     expect(status(page, "record")).to_contain_text("301 samples", timeout=WAIT)
+    page.locator("#record form summary").click()
+    page.get_by_label("bias_pitch").check()
     page.get_by_role("button", name="Identify").click()
     cause = page.get_by_role("button", name="Estimate delay_voltage, too")
     expect(cause).to_be_visible(timeout=WAIT)
     cause.click()
-    expect(page.locator("#identified tbody tr")).to_have_count(4, timeout=WAIT)
-    found = page.locator("#identified tbody tr").nth(3).locator("td").first.inner_text()
-    assert float(found) == pytest.approx(0.06, rel=0.01)
-    expect(page.locator("#effect")).to_have_value("delay_voltage")
+    expect(page.locator("#identified tbody tr")).to_have_count(5, timeout=WAIT)
+    expect(page.get_by_label("delay_voltage")).to_be_checked()
+    page.get_by_label("delay_voltage").uncheck()
+    page.get_by_role("button", name="Identify").click()
+    expect(cause).to_be_visible(timeout=WAIT)
+    page.locator("#record-plant").select_option("dc_motor")
+    cause.click()
+    expect(page.locator("#identified tbody tr")).to_have_count(5, timeout=WAIT)
+    expect(page.get_by_label("delay_voltage")).not_to_be_checked()  # another plant's
+    found = page.locator("#identified tbody tr", has_text="delay").locator("td").first
+    assert float(found.inner_text()) == pytest.approx(0.06, rel=0.01)
     command = page.locator("#record-again pre").text_content()
     assert command is not None
-    assert "--plant aero2+delay_voltage" in command
+    assert "--plant aero2+bias_pitch+delay_voltage" in command
     page.get_by_text("Correlation of the estimates").click()
     cells = page.locator("#correlations td")
-    expect(cells).to_have_count(16)
+    expect(cells).to_have_count(25)
     expect(cells.first).to_have_text("1.00")
     # The residual is white now: about 95 % of 30 correlations within the band.
     plot = PLOT.format("#residual-echoes .chart", 0) + ".what"
@@ -630,14 +731,15 @@ def test_a_slow_list_of_runs_does_not_undo_a_later_address(address: str, page: P
     with page.expect_request("**/api/runs"):
         page.evaluate("location.hash = 'runs/a_study'")
     page.evaluate("location.hash = 'runs/nothing'")
-    missing = "The run folder has no run nothing."
-    expect(status(page, "runs")).to_have_text(missing)
+    expect(status(page, "runs")).to_have_text("The run folder has no run nothing.")
+    shown = list[str]()
+    page.on("request", lambda sent: shown.append(sent.url.partition("/api/run?")[2]))
     with page.expect_response("**/api/runs") as late:
         held[0].continue_()
     late.value.finished()
-    page.wait_for_timeout(200)
-    expect(status(page, "runs")).to_have_text(missing)
-    assert page.locator("#run-view h2").count() == 0
+    page.evaluate("location.hash = 'runs/damaged'")
+    expect(page.locator("#run-view h2")).to_have_text("damaged")
+    assert [name for name in shown if name] == ["name=damaged"]
 
 
 def test_runs_are_looked_at(address: str, page: Page):
@@ -651,11 +753,17 @@ def test_runs_are_looked_at(address: str, page: Page):
 
 def test_a_campaign_is_followed_while_it_runs(address: str, folder: Path, page: Page):
     write_campaign(folder / "the_campaign", ["go on: D_p is 3 times as uncertain as asked"])
+    page.clock.install()
     page.goto(f"{address}/#runs")
     page.get_by_role("button", name="the_campaign").click()
     shown = page.get_by_role("region", name="Rounds").locator("tbody tr")
     expect(shown).to_have_count(1)
     expect(page.locator("#run-view")).to_contain_text("Not finished")
+    # It is followed again after a look at another part of the page.
+    page.get_by_role("link", name="Training").click()
+    expect(page.locator("#runs")).to_be_hidden()
+    page.clock.fast_forward(60_000)
+    page.get_by_role("link", name="Runs").click()
     write_campaign(folder / "the_campaign", ["go on", "end"], "every target is reached")
     expect(shown).to_have_count(2, timeout=WAIT)
     expect(page.get_by_role("link", name="Report")).to_be_visible()

@@ -63,6 +63,14 @@ def word(asked: Asked, key: str) -> str:
     return value
 
 
+def words(asked: Asked, key: str, most: int) -> list[str]:
+    """Such names, at most so many."""
+    value = asked.get(key, [])
+    if not isinstance(value, list) or len(value) > most:
+        raise RefusedError(400, f"{key}: a list of at most {most} names is needed")
+    return [word({key: name}, key) for name in value]
+
+
 def plant_of(asked: Asked, plants: Mapping[str, str]) -> str:
     """The name of a shipped plant, or the file of one that the server was started with."""
     name = word(asked, "plant")
