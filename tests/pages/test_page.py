@@ -531,10 +531,50 @@ def test_a_line_is_hidden_and_a_plot_is_saved(address: str, page: Page, tmp_path
     drawn = ElementTree.fromstring(made["SVG"])
     assert len(drawn.findall(".//{*}polyline[@stroke-width='1.6']")) == 2
     header, *rows = made["CSV"].decode().splitlines()
-    assert (header, len(rows)) == ("time,chirp,aero2", 501)
+    assert (header, len(rows)) == ("time [s],chirp [deg],aero2 [deg]", 501)
     expected = np.degrees(ex.simulate("aero2", "chirp", noise={"pitch": 1e-12}).outputs[:, 0])
     found = [float(row.split(",")[1]) for row in rows]
     np.testing.assert_allclose(found, expected, atol=2e-3)  # five digits are kept
+
+
+def test_a_plot_is_saved_as_it_is_shown(address: str, page: Page, tmp_path: Path):
+    """With dots, gaps, levels and marks; the numbers are those of the part that is shown."""
+    page.goto(address)
+    page.evaluate("""async () => {
+      const { Plot } = await import("/static/plot.js"), { el } = await import("/static/api.js");
+      const place = el("div", { id: "place" }), x = [0, 1, 2, 3, 4, 5];
+      document.querySelector("main").prepend(place);
+      const title = el("span", {}, "Volt ", el("span", { class: "unit" }, "V"));
+      const plot = new Plot(place, title, "a"), color = "critical";
+      plot.show({
+        x: [0, 5], y: [-4, 4], unit: "s",
+        levels: [{ y: 1, until: 1.1, color: "warning", word: "" }, { y: 1.1, color, word: "high" }],
+        marks: [{ x: 1.5, color, word: "passed" }, { x: 4.5, color, word: "later" }],
+        lines: [
+          { x, y: [0, 1, null, 1, 2, 3], name: "own", color: "output", dots: true },
+          { x, y: [0, -1, -1, -1, -2, -3], name: "bound", color: "bound" },
+          { x, y: [0, -2, -1, -1, -2, -3], name: "bound", color: "bound", step: true },
+        ],
+      });
+      plot.group.show([0.5, 4.25]);
+    }""")
+    poll(page, PLOT.format("#place .chart", 0) + ".u?.scales.x.max === 4.25")
+    made = {}
+    for kind in ("SVG", "CSV"):
+        with page.expect_download() as waiting:
+            page.locator("#place").get_by_role("button", name=kind).click()
+        waiting.value.save_as(tmp_path / kind)
+        made[kind] = (tmp_path / kind).read_text()
+    header, *rows = made["CSV"].splitlines()
+    assert header == "time [s],own [V],bound [V],bound (2) [V]"
+    assert rows == ["1,1,-1,-2", "2,,-1,-1", "3,1,-1,-1", "4,2,-2,-2"]
+    drawing = ElementTree.fromstring(made["SVG"])
+    words = [text.text for text in drawing.iterfind(".//{*}text")]
+    assert words[-2:] == ["high", "passed"]
+    assert len(drawing.findall(".//{*}rect[@opacity='0.1']")) == 2
+    assert len(drawing.findall(".//{*}circle")) == 5
+    lines = drawing.findall(".//{*}g/{*}polyline[@stroke-width='1.6']")
+    assert [len(line.attrib["points"].split()) for line in lines] == [2, 3, 6, 11]
 
 
 def test_an_experiment_is_paused_and_played_again(address: str, page: Page):
