@@ -29,13 +29,13 @@ MAPPED: Any = {
     "initial_state": "free",
     "columns": {"pitch": "theta (deg)", "voltage": "u"},
     "scales": {"pitch": 3.141592653589793 / 180},
-    "units": {}, "intervals": "linear", "hold_input": "constant", "effect": "",
+    "units": {}, "intervals": "linear", "hold_input": "constant", "effects": [],
 }  # fmt: skip
 OPTIONS = {
     "a scale": {},
-    "a unit and an effect": {
+    "a unit and two effects": {
         "estimator": "nls", "scales": {}, "units": {"pitch": "deg"}, "hold_input": "linear",
-        "effect": "delay_voltage",
+        "effects": ["delay_voltage", "bias_pitch"],
     },
     "profiles": {"estimator": "nls", "intervals": "profile"},
 }  # fmt: skip

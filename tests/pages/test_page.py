@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from cluster import wait_for
 from commands import PATIENCE
 from served import MAX_GAP, TRIES, served
 
@@ -172,7 +173,8 @@ def test_a_run_from_choosing_to_the_report(address: str, page: Page, tmp_path: P
     entry = "performance.getEntriesByName('first-paint')[0]?.startTime"  # it may come after load
     for _ in range(TRIES):
         page.reload()
-        paints.append(page.wait_for_function(entry, timeout=WAIT).json_value())
+        poll(page, f"{entry} > 0")
+        paints.append(page.evaluate(entry))
         if min(paints) < 1000:
             break
     assert min(paints) < 1000, paints
@@ -206,6 +208,54 @@ def test_a_run_is_stopped(address: str, page: Page):
     page.locator("#experiment .stop").click()
     expect(status(page)).to_have_text("Stopped.", timeout=WAIT)
     expect(page.get_by_role("button", name="Run", exact=True)).to_be_enabled()
+    # What there is of it is played again.
+    time, play = page.locator("#player output"), page.get_by_role("button", name="Play")
+    expect(play).to_be_visible()
+    last = time.inner_text()
+    page.get_by_label("Time that is shown").fill("1")
+    expect(time).to_have_text("0 s")
+    play.click()
+    expect(time).to_have_text(last, timeout=WAIT)
+    expect(play).to_be_visible(timeout=WAIT)
+
+
+def test_what_tells_nothing_of_a_parameter_is_told(address: str, page: Page):
+    ready(page, address)
+    page.locator("#amplitude").fill("0")
+    page.get_by_label("Played in").select_option("0")
+    for label in ("First", "Second"):
+        page.get_by_label(label, exact=True).select_option("chirp")  # nothing to compare with
+    page.get_by_role("button", name="Run", exact=True).click()
+    expect(status(page)).to_have_text("Done.", timeout=WAIT)
+    for i in range(2, 6):
+        low, high = page.evaluate(PLOT.format("#overlays .chart", i) + ".what.y")
+        assert low < high  # None is neither
+    notes = page.locator("#overlays figcaption", has_text="chirp: not identifiable")
+    expect(notes).to_have_count(3)
+
+
+def test_long_lines_of_a_stream_are_read_once(address: str, page: Page):
+    """How often a character is looked at does not grow with the number of parts of its line."""
+    page.goto(f"{address}/static/first.json")  # where no other script runs
+    looked = """async () => {
+      const { stream } = await import("/static/api.js");
+      const line = JSON.stringify("x".repeat(5e4)), whole = `${line}\n[1]\n${line}\n`, told = [];
+      const parts = new ReadableStream({ start(own) {
+        const bytes = new TextEncoder().encode(whole);
+        for (let i = 0; i < bytes.length; i += 1000) own.enqueue(bytes.slice(i, i + 1000));
+        own.close();
+      } });
+      const { split } = String.prototype;
+      let looked = 0;
+      window.fetch = async () => new Response(parts);
+      String.prototype.split = function (...how) {
+        looked += this.length;
+        return split.apply(this, how);
+      };
+      await stream("", {}, (event) => told.push(event));
+      return [told.map(({ length }) => length), told[1], looked / whole.length];
+    }"""
+    assert page.evaluate(looked) == [[50_000, 1, 50_000], [1], 1]
 
 
 def test_a_value_that_is_not_allowed_is_one_sentence(address: str, page: Page):
@@ -351,6 +401,11 @@ def shown_range(page: Page, which: str, i: int) -> list[float]:
     return page.evaluate(f"[{u}.min, {u}.max]")
 
 
+def poll(page: Page, truth: str) -> None:
+    """Waits until something is true; the page itself evaluates no text."""
+    assert wait_for(lambda: bool(page.evaluate(truth)), PATIENCE), truth
+
+
 def prepared(page: Page, address: str) -> Page:
     """The page with its prepared result, in the middle of the screen."""
     page.goto(address)
@@ -403,6 +458,58 @@ def test_plots_share_a_cross_hair_and_a_zoom(address: str, page: Page):
     assert shown_range(page, "#signals .chart", 0) == [0, 50]
 
 
+def test_a_hidden_plot_shows_the_newest_when_it_is_seen_again(address: str, page: Page):
+    ready(page, address)
+    page.get_by_label("Played in").select_option("2")
+    page.get_by_role("button", name="Run", exact=True).click()
+    expect(status(page)).to_have_text(re.compile("^Running"), timeout=WAIT)
+    plot = PLOT.format("#signals .chart", 1)
+    poll(page, f"{plot}.u?.data[0].length > 0")
+    bright = page.evaluate(f"{plot}.u.series[1].stroke()")
+    page.get_by_role("link", name="Runs").click()
+    expect(page.locator("#experiment")).to_be_hidden()
+    expect(status(page)).to_have_text("Done.", timeout=WAIT)
+    page.emulate_media(color_scheme="dark")
+    page.get_by_role("link", name="Experiment").click()
+    poll(page, f"{plot}.u.data[0].length === 501")
+    poll(page, f"{plot}.u.series[1].stroke() !== {bright!r}")
+
+
+def test_a_plot_that_was_never_drawn_is_given_up(address: str, page: Page):
+    page.goto(address)
+    made = """async () => {
+      const { Plot } = await import("/static/plot.js");
+      const place = document.createElement("div");
+      document.body.append(place);
+      const plot = new Plot(place, "a", "a");
+      const before = plot.group.plots.length;
+      place.remove();
+      return [before, plot.group.plots.length];
+    }"""
+    assert page.evaluate(made) == [1, 0]
+
+
+def test_another_file_is_shown_whole(address: str, page: Page, tmp_path: Path):
+    page.goto(f"{address}/#record")
+    expect(page.locator("#record-plant option").first).to_be_attached(timeout=WAIT)
+    for steps in (200, 100):
+        ex.simulate("aero2", "chirp", steps=steps).save(tmp_path / f"{steps}.csv")
+        page.locator("#file").set_input_files(tmp_path / f"{steps}.csv")
+        expect(status(page, "record")).to_contain_text(f"{steps + 1} samples", timeout=WAIT)
+        poll(page, f"{PLOT.format('#columns .chart', 0)}.u !== null")
+        assert shown_range(page, "#columns .chart", 0) == [0, steps]
+        page.get_by_role("button", name="Identify").click()
+        expect(status(page, "record")).to_have_text("Done: successful.", timeout=WAIT)
+        poll(page, f"{PLOT.format('#residual-echoes .chart', 0)}.u !== null")
+        assert shown_range(page, "#record-signals .chart", 0) == [0, steps / 10]
+        assert shown_range(page, "#residual-echoes .chart", 0) == [0, 30.5]
+        for place in ("columns", "record-signals", "residual-echoes"):
+            page.locator(f"#{place} .chart").first.focus()
+            for key in ("End", "+", "+"):
+                page.keyboard.press(key)
+            assert shown_range(page, f"#{place} .chart", 0)[0] > 0
+
+
 def test_a_line_is_hidden_and_a_plot_is_saved(address: str, page: Page, tmp_path: Path):
     prepared(page, address)
     figure = page.locator("#overlays figure").nth(1)
@@ -422,15 +529,55 @@ def test_a_line_is_hidden_and_a_plot_is_saved(address: str, page: Page, tmp_path
     drawn = ElementTree.fromstring(made["SVG"])
     assert len(drawn.findall(".//{*}polyline[@stroke-width='1.6']")) == 2
     header, *rows = made["CSV"].decode().splitlines()
-    assert (header, len(rows)) == ("time,chirp,aero2", 501)
+    assert (header, len(rows)) == ("time [s],chirp [deg],aero2 [deg]", 501)
     expected = np.degrees(ex.simulate("aero2", "chirp", noise={"pitch": 1e-12}).outputs[:, 0])
     found = [float(row.split(",")[1]) for row in rows]
     np.testing.assert_allclose(found, expected, atol=2e-3)  # five digits are kept
 
 
+def test_a_plot_is_saved_as_it_is_shown(address: str, page: Page, tmp_path: Path):
+    """With dots, gaps, levels and marks; the numbers are those of the part that is shown."""
+    page.goto(address)
+    page.evaluate("""async () => {
+      const { Plot } = await import("/static/plot.js"), { el } = await import("/static/api.js");
+      const place = el("div", { id: "place" }), x = [0, 1, 2, 3, 4, 5];
+      document.querySelector("main").prepend(place);
+      const title = el("span", {}, "Volt ", el("span", { class: "unit" }, "V"));
+      const plot = new Plot(place, title, "a"), color = "critical";
+      plot.show({
+        x: [0, 5], y: [-4, 4], unit: "s",
+        levels: [{ y: 1, until: 1.1, color: "warning", word: "" }, { y: 1.1, color, word: "high" }],
+        marks: [{ x: 1.5, color, word: "passed" }, { x: 4.5, color, word: "later" }],
+        lines: [
+          { x, y: [0, 1, null, 1, 2, 3], name: "own", color: "output", dots: true },
+          { x, y: [0, -1, -1, -1, -2, -3], name: "bound", color: "bound" },
+          { x, y: [0, -2, -1, -1, -2, -3], name: "bound", color: "bound", step: true },
+        ],
+      });
+      plot.group.show([0.5, 4.25]);
+    }""")
+    poll(page, PLOT.format("#place .chart", 0) + ".u?.scales.x.max === 4.25")
+    made = {}
+    for kind in ("SVG", "CSV"):
+        with page.expect_download() as waiting:
+            page.locator("#place").get_by_role("button", name=kind).click()
+        waiting.value.save_as(tmp_path / kind)
+        made[kind] = (tmp_path / kind).read_text()
+    header, *rows = made["CSV"].splitlines()
+    assert header == "time [s],own [V],bound [V],bound (2) [V]"
+    assert rows == ["1,1,-1,-2", "2,,-1,-1", "3,1,-1,-1", "4,2,-2,-2"]
+    drawing = ElementTree.fromstring(made["SVG"])
+    words = [text.text for text in drawing.iterfind(".//{*}text")]
+    assert words[-2:] == ["high", "passed"]
+    assert len(drawing.findall(".//{*}rect[@opacity='0.1']")) == 2
+    assert len(drawing.findall(".//{*}circle")) == 5
+    lines = drawing.findall(".//{*}g/{*}polyline[@stroke-width='1.6']")
+    assert [len(line.attrib["points"].split()) for line in lines] == [2, 3, 6, 11]
+
+
 def test_an_experiment_is_paused_and_played_again(address: str, page: Page):
     ready(page, address)
-    page.get_by_label("Played in").select_option("5")
+    page.get_by_label("Played in").select_option("20")
     page.get_by_role("button", name="Run", exact=True).click()
     expect(status(page)).to_have_text(re.compile("^Running"), timeout=WAIT)
     page.get_by_role("button", name="Pause").click()
@@ -501,29 +648,80 @@ def test_a_file_is_previewed_and_its_units_are_taken_from_the_names(address: str
     assert page.evaluate("navigator.clipboard.readText()") == command
 
 
+def test_a_file_that_fails_late_says_nothing_about_the_next(address: str, page: Page):
+    page.goto(f"{address}/#record")
+    expect(page.locator("#record-plant option").first).to_be_attached(timeout=WAIT)
+    held: list[Route] = []
+    page.route("**/api/uploads?name=late.csv", lambda route: held.append(route))
+
+    def choose(name: str) -> None:
+        content: Any = {"name": name, "mimeType": "", "buffer": b"time,x\n0,1\n1,2\n"}
+        page.locator("#file").set_input_files(content)
+
+    with page.expect_request("**/api/uploads?name=late.csv"):
+        choose("late.csv")
+    choose("next.csv")
+    expect(status(page, "record")).to_contain_text("next.csv: 2 columns", timeout=WAIT)
+    page.evaluate("""() => {
+      const said = (window.sentences_said = []);
+      const status = document.querySelector("#record .status");
+      const watch = new MutationObserver(() => said.push(status.textContent));
+      watch.observe(status, { childList: true });
+    }""")
+    with page.expect_response("**/api/uploads?name=late.csv") as late:
+        held[0].fulfill(status=422, json={"sentence": "too late"})
+    late.value.finished()
+    choose("third.csv")
+    expect(status(page, "record")).to_contain_text("third.csv: 2 columns", timeout=WAIT)
+    said = page.evaluate("window.sentences_said")
+    assert "too late" not in said
+    assert said[0] == "Reading third.csv…"
+
+
+def test_a_unit_that_is_not_known_is_told(address: str, page: Page):
+    page.goto(f"{address}/#record")
+    expect(page.locator("#record-plant option").first).to_be_attached(timeout=WAIT)
+    content = b"t [minutes],voltage [mV],pitch\n0,1,1\n1,2,1\n"
+    page.locator("#file").set_input_files({"name": "a.csv", "mimeType": "", "buffer": content})
+    hints = page.locator("#mapping .map .hint")
+    expect(hints).to_have_text(['unit "minutes" is not known: choose one', "", ""], timeout=WAIT)
+    page.locator("#unit-time").select_option("ms")
+    expect(hints).to_have_text(["", "", ""])
+
+
 def test_what_the_plant_leaves_out_is_estimated_by_one_click(
     address: str, page: Page, tmp_path: Path
 ):
+    """Besides those that were chosen, whatever plant is chosen for the next file."""
     late = ex.simulate("aero2+delay_voltage", "chirp", params={"delay_voltage": 0.06}, steps=300)
     late.save(tmp_path / "late.csv")
     page.goto(f"{address}/#record")
     expect(page.locator("#record-plant option").first).to_be_attached(timeout=WAIT)
     page.locator("#file").set_input_files(tmp_path / "late.csv")
     expect(status(page, "record")).to_contain_text("301 samples", timeout=WAIT)
+    page.locator("#record form summary").click()
+    page.get_by_label("bias_pitch").check()
     page.get_by_role("button", name="Identify").click()
     cause = page.get_by_role("button", name="Estimate delay_voltage, too")
     expect(cause).to_be_visible(timeout=WAIT)
     cause.click()
-    expect(page.locator("#identified tbody tr")).to_have_count(4, timeout=WAIT)
-    found = page.locator("#identified tbody tr").nth(3).locator("td").first.inner_text()
-    assert float(found) == pytest.approx(0.06, rel=0.01)
-    expect(page.locator("#effect")).to_have_value("delay_voltage")
+    expect(page.locator("#identified tbody tr")).to_have_count(5, timeout=WAIT)
+    expect(page.get_by_label("delay_voltage")).to_be_checked()
+    page.get_by_label("delay_voltage").uncheck()
+    page.get_by_role("button", name="Identify").click()
+    expect(cause).to_be_visible(timeout=WAIT)
+    page.locator("#record-plant").select_option("dc_motor")
+    cause.click()
+    expect(page.locator("#identified tbody tr")).to_have_count(5, timeout=WAIT)
+    expect(page.get_by_label("delay_voltage")).not_to_be_checked()  # another plant's
+    found = page.locator("#identified tbody tr", has_text="delay").locator("td").first
+    assert float(found.inner_text()) == pytest.approx(0.06, rel=0.01)
     command = page.locator("#record-again pre").text_content()
     assert command is not None
-    assert "--plant aero2+delay_voltage" in command
+    assert "--plant aero2+bias_pitch+delay_voltage" in command
     page.get_by_text("Correlation of the estimates").click()
     cells = page.locator("#correlations td")
-    expect(cells).to_have_count(16)
+    expect(cells).to_have_count(25)
     expect(cells.first).to_have_text("1.00")
     # The residual is white now: about 95 % of 30 correlations within the band.
     plot = PLOT.format("#residual-echoes .chart", 0) + ".what"
@@ -571,14 +769,15 @@ def test_a_slow_list_of_runs_does_not_undo_a_later_address(address: str, page: P
     with page.expect_request("**/api/runs"):
         page.evaluate("location.hash = 'runs/a_study'")
     page.evaluate("location.hash = 'runs/nothing'")
-    missing = "The run folder has no run nothing."
-    expect(status(page, "runs")).to_have_text(missing)
+    expect(status(page, "runs")).to_have_text("The run folder has no run nothing.")
+    shown = list[str]()
+    page.on("request", lambda sent: shown.append(sent.url.partition("/api/run?")[2]))
     with page.expect_response("**/api/runs") as late:
         held[0].continue_()
     late.value.finished()
-    page.wait_for_timeout(200)
-    expect(status(page, "runs")).to_have_text(missing)
-    assert page.locator("#run-view h2").count() == 0
+    page.evaluate("location.hash = 'runs/damaged'")
+    expect(page.locator("#run-view h2")).to_have_text("damaged")
+    assert [name for name in shown if name] == ["name=damaged"]
 
 
 def test_runs_are_looked_at(address: str, page: Page):
@@ -592,11 +791,17 @@ def test_runs_are_looked_at(address: str, page: Page):
 
 def test_a_campaign_is_followed_while_it_runs(address: str, folder: Path, page: Page):
     write_campaign(folder / "the_campaign", ["go on: D_p is 3 times as uncertain as asked"])
+    page.clock.install()
     page.goto(f"{address}/#runs")
     page.get_by_role("button", name="the_campaign").click()
     shown = page.get_by_role("region", name="Rounds").locator("tbody tr")
     expect(shown).to_have_count(1)
     expect(page.locator("#run-view")).to_contain_text("Not finished")
+    # It is followed again after a look at another part of the page.
+    page.get_by_role("link", name="Training").click()
+    expect(page.locator("#runs")).to_be_hidden()
+    page.clock.fast_forward(60_000)
+    page.get_by_role("link", name="Runs").click()
     write_campaign(folder / "the_campaign", ["go on", "end"], "every target is reached")
     expect(shown).to_have_count(2, timeout=WAIT)
     expect(page.get_by_role("link", name="Report")).to_be_visible()

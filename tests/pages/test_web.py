@@ -19,7 +19,6 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
 import h5py
 import httpx2 as httpx
@@ -27,12 +26,10 @@ import numpy as np
 import pandas
 import pytest
 import scipy.io
-import uvicorn
 from bags import write
 from cluster import wait_for
 from commands import PATIENCE, excite
 from served import EXPERIMENT, MAX_GAP, TRIES, Told, browser, served, streamed
-from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.testclient import TestClient
 
@@ -43,8 +40,7 @@ from excite.record import READ_ENDINGS
 from excite.record.bags import BAG_ENDINGS
 from excite.report.html import report_html
 from excite.study.objectives import OBJECTIVES
-from excite.web import application, connections
-from excite.web.connections import MAX_SILENT
+from excite.web import _Server, application, connections, listening_at, requests
 from excite.web.first import FILE, events
 from excite.web.places import _file_name, _receive
 from excite.web.requests import MAX_UPLOAD, RefusedError
@@ -117,19 +113,34 @@ def printed(*words: str, folder: Path) -> dict[str, Any]:
 # -------------------------------------------------------------------------------- numbers
 
 
-def test_connections_that_ask_nothing_hold_nobody_up(address: str):
+@contextlib.contextmanager
+def in_this_process(listening: socket.socket, folder: Path) -> Iterator[None]:
+    """A page without workers, served by a thread of this process."""
+    ended, app = list[int](), application(PageSettings(folder, num_workers=0), folder)
+    thread = threading.Thread(target=_Server(app, ended).run, args=([listening],))
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.append(signal.SIGINT)
+        thread.join()
+
+
+def test_connections_that_ask_nothing_hold_nobody_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     """More than are kept, with unfinished heads; the oldest are closed, and the page answers."""
-    where = urlsplit(address)
-    assert where.hostname
-    with contextlib.ExitStack() as stack:
-        opened = []
-        for _ in range(MAX_SILENT + 100):
-            one = stack.enter_context(socket.create_connection((where.hostname, where.port)))
-            one.sendall(b"GET / HTTP/1.1\r\nHost: ")
-            opened.append(one)
-        assert httpx.get(address + "/", timeout=PATIENCE).status_code == 200
-        for one in opened[:50]:
-            one.settimeout(PATIENCE)
+    monkeypatch.setattr(connections, "PATIENCE", PATIENCE)
+    monkeypatch.setattr(connections, "MAX_SILENT", 20)
+    listening, opened = listening_at("127.0.0.1", 0), list[socket.socket]()
+    where = listening.getsockname()
+    with in_this_process(listening, tmp_path), contextlib.ExitStack() as stack:
+        for _ in range(50):
+            opened.append(stack.enter_context(socket.create_connection(where, PATIENCE)))
+            opened[-1].sendall(b"GET / HTTP/1.1\r\nHost: ")
+        answer = httpx.get(f"http://127.0.0.1:{where[1]}/", timeout=PATIENCE)
+        assert answer.status_code == 200
+        for one in opened[:30]:
             with contextlib.suppress(ConnectionResetError):
                 assert one.recv(1) == b""
         opened[-1].setblocking(False)
@@ -137,22 +148,41 @@ def test_connections_that_ask_nothing_hold_nobody_up(address: str):
             opened[-1].recv(1)
 
 
-@pytest.mark.parametrize("sent", [b"", b"GET / HT", b"POST /api/session HTTP/1.1\r\nHost: x\r\n"])
-def test_a_request_that_does_not_come_is_not_awaited(sent: bytes, monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize("sent", [b"", b"GET / HT"])
+def test_a_request_that_does_not_come_is_not_awaited(
+    sent: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.setattr(connections, "PATIENCE", 0.4)
-    config = uvicorn.Config(Starlette(), http=connections.Connection, log_level="error", port=0)
-    server = uvicorn.Server(config)
-    listening = socket.create_server(("127.0.0.1", 0))
-    thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]})
-    thread.start()
-    try:
-        with socket.create_connection(listening.getsockname()) as one:
-            one.settimeout(PATIENCE)
-            one.sendall(sent)
+    listening = listening_at("127.0.0.1", 0)
+    with socket.create_connection(listening.getsockname(), PATIENCE) as one:
+        one.sendall(sent)
+        with in_this_process(listening, tmp_path):
             assert one.recv(1) == b""
-    finally:
-        server.should_exit = True
-        thread.join()
+
+
+@pytest.mark.parametrize(
+    ("origin", "status", "sentence"),
+    [("http://{}:{}", 408, "the upload stopped"), ("http://foreign.example", 403, "not come from")],
+)
+def test_a_body_that_stops_is_refused_and_its_connection_is_closed(
+    origin: str, status: int, sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """In a sentence; also where the answer does not wait for the body, and more of it comes."""
+    monkeypatch.setattr(connections, "PATIENCE", 1.0)
+    monkeypatch.setattr(requests, "SILENCE", 3.0)
+    listening = listening_at("127.0.0.1", 0)
+    where = listening.getsockname()
+    head = f"Host: {where[0]}:{where[1]}\r\nOrigin: {origin.format(*where)}\r\n"
+    with socket.create_connection(where, PATIENCE) as one:
+        one.sendall(f"POST /api/session HTTP/1.1\r\n{head}Content-Length: 9\r\n\r\n{{".encode())
+        with in_this_process(listening, tmp_path):
+            answer = one.recv(2**16)
+            with contextlib.suppress(ConnectionError):
+                one.sendall(b" ")
+                while more := one.recv(2**16):
+                    answer += more
+    assert answer.startswith(f"HTTP/1.1 {status} ".encode())
+    assert sentence in json.loads(answer.partition(b"\r\n\r\n")[2])["sentence"]
 
 
 def test_what_the_page_shows_first_is_what_its_workers_compute():
@@ -761,6 +791,44 @@ def test_the_run_folder_is_listed_as_it_is(page: TestClient, runs: Path):
     assert served_file.headers["content-disposition"].startswith("attachment")
 
 
+@pytest.mark.parametrize("name", ["b\u00a0c", "測定\u3000一", "a\tb"])
+def test_a_run_has_any_name_that_is_text(name: str, tmp_path: Path, scratch: Path):
+    for word in (name, os.fsdecode(b"\xff")):
+        (tmp_path / "runs" / word).mkdir(parents=True)
+        for file in ("run.json", "table.md", os.fsdecode(b"\xff.csv")):
+            (tmp_path / "runs" / word / file).write_text("{}")
+    page = guarded(tmp_path / "runs", scratch)
+    page.post("/api/session", json={})
+    assert [run["name"] for run in page.get("/api/runs").json()["runs"]] == [name]
+    content = page.get("/api/run", params={"name": name}).json()
+    assert content["files"] == ["run.json", "table.md"]
+
+
+def test_a_run_that_is_being_written_is_listed(
+    page: TestClient, runs: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Temporary files are hidden, and any file may be gone before it is looked at."""
+    run = runs / "some" / "study"
+    [before] = page.get("/api/runs").json()["runs"]
+    hidden, renamed = run / ".table.md.part", run / "table.json.part"
+    for path in (hidden, renamed):
+        path.touch()
+        os.utime(path, (4e9, 4e9))
+    look = Path.lstat
+
+    def gone(path: Path) -> os.stat_result:
+        if path in (hidden, renamed):
+            raise FileNotFoundError(path)
+        return look(path)
+
+    monkeypatch.setattr(Path, "lstat", gone)
+    assert page.get("/api/runs").json()["runs"] == [before]
+    monkeypatch.undo()
+    renamed.unlink()
+    assert page.get("/api/runs").json()["runs"] == [before]
+    hidden.unlink()
+
+
 def test_a_campaign_is_shown_with_what_is_known_and_its_rounds(page: TestClient, runs: Path):
     folder = runs / "known"
     folder.mkdir()
@@ -899,7 +967,7 @@ def test_a_full_store_takes_no_more(page: TestClient, monkeypatch: pytest.Monkey
 
 
 def test_a_file_that_stops_coming_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("excite.web.places._SILENCE", 0.05)
+    monkeypatch.setattr(requests, "SILENCE", 0.05)
     come = iter([{"type": "http.request", "body": b"time", "more_body": True}])
 
     async def receive() -> Any:

@@ -30,7 +30,7 @@ from starlette.staticfiles import StaticFiles
 from .connections import Connection
 from .events import Catalogue
 from .places import routes as place_routes
-from .requests import MAX_BODY, RefusedError
+from .requests import MAX_BODY, RefusedError, parts
 from .runs import routes as run_routes
 from .runs import run_of
 from .security import Guard
@@ -112,7 +112,7 @@ async def _session(request: Request) -> JSONResponse:
 async def _body(request: Request) -> dict[str, object]:
     """A request's JSON, an object of limited size."""
     content = bytearray()
-    async for part in request.stream():
+    async for part in parts(request):
         content += part
         if len(content) > MAX_BODY:
             raise RefusedError(413, "the request is too large")

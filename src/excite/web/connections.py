@@ -1,4 +1,4 @@
-"""Connections to the server: how many may be silent, and how long a request may take to come."""
+"""Connections to the server: how many may be silent, and for how long."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 MAX_SILENT = 256
 """Connections that ask nothing; the oldest of more is closed."""
 PATIENCE = 10.0
-"""Seconds until the head of a request must be complete, and the longest pause in its body."""
+"""Seconds that a connection may be silent."""
 
 
 class Connection(H11Protocol):
@@ -19,7 +19,7 @@ class Connection(H11Protocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Takes a new connection; the oldest silent one makes room."""
         super().connection_made(transport)
-        self._since = self._heard = self.loop.time()
+        self._since = self.loop.time()
         self._timer = self.loop.call_later(PATIENCE, self._look)
         silent = [c for c in self.connections if isinstance(c, Connection) and c.is_silent]
         if len(silent) > MAX_SILENT:
@@ -27,12 +27,14 @@ class Connection(H11Protocol):
 
     @property
     def is_silent(self) -> bool:
-        """Whether no complete head of a request has come since the last answer."""
-        return self.conn.their_state is h11.IDLE and not self.transport.is_closing()
+        """Whether no head of a request has come, or the last request is answered already."""
+        asks_nothing = self.conn.their_state is h11.IDLE or self.conn.our_state is h11.DONE
+        return asks_nothing and not self.transport.is_closing()
 
     def data_received(self, data: bytes) -> None:
-        """Takes a part of a request."""
-        self._heard = self.loop.time()
+        """Takes a part of a request; those of a head do not prolong it."""
+        if self.conn.their_state is not h11.IDLE:
+            self._since = self.loop.time()
         super().data_received(data)
 
     def on_response_complete(self) -> None:
@@ -46,10 +48,8 @@ class Connection(H11Protocol):
         super().connection_lost(exc)
 
     def _look(self) -> None:
-        """Closes the connection if it waited too long."""
-        last = self._since if self.is_silent else self._heard
-        is_awaited = self.is_silent or self.conn.their_state is h11.SEND_BODY
-        if is_awaited and self.loop.time() - last >= PATIENCE:
+        """Closes the connection if it was silent for too long."""
+        if self.is_silent and self.loop.time() - self._since >= PATIENCE:
             self.transport.close()
         else:
             self._timer = self.loop.call_later(PATIENCE / 4, self._look)

@@ -37,7 +37,7 @@ class IdentificationRequest(TypedDict):
     units: dict[str, str]
     intervals: str
     hold_input: str
-    effect: str
+    effects: list[str]
 
 
 class StartedEvent(TypedDict):

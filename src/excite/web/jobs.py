@@ -254,7 +254,7 @@ def _experiment_again(asked: ExperimentRequest) -> str:
 
 def _identification_again(asked: IdentificationRequest, name: str) -> str:
     """The command that makes the same run folder of a file."""
-    plant = f"{asked['plant']}+{asked['effect']}" if asked["effect"] else asked["plant"]
+    plant = "+".join([asked["plant"], *asked["effects"]])
     words = [
         "excite", "identify", f"./{name}" if name[0] == "-" else name,
         "--plant", plant, "--estimator", asked["estimator"],
@@ -378,7 +378,7 @@ def identified(
     with contextlib.chdir(source):
         result = identify(
             Path(name),
-            extended(plant, [asked["effect"]]) if asked["effect"] else plant,
+            extended(plant, asked["effects"]) if asked["effects"] else plant,
             asked["estimator"],
             intervals=cast(Intervals, asked["intervals"]),
             hold_input=asked["hold_input"],

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import tempfile
 from collections.abc import Callable, Mapping
@@ -14,12 +13,11 @@ from starlette.routing import Route
 
 from ..record import READ_ENDINGS, WRONG_ENDING
 from .events import JobEvent
-from .requests import MAX_UPLOAD, RefusedError
+from .requests import MAX_UPLOAD, RefusedError, parts
 from .sessions import MAX_STORED, Session
 from .workers import Job, Workers
 
 _MAX_NAME = 200  # bytes of a file's name
-_SILENCE = 30.0  # seconds without a part of a file
 _DOWNLOADS = {
     "record.csv": "text/csv",
     "record.json": "application/json",
@@ -126,15 +124,12 @@ async def _receive(request: Request, path: Path, scratch: Path) -> None:
         raise too_large
     if _stored(scratch) > MAX_STORED:
         raise RefusedError(507, "the server's storage is full; try again later")
-    parts = request.stream()
     try:
         with path.open("wb") as file:
-            while part := await asyncio.wait_for(anext(parts, b""), _SILENCE):
+            async for part in parts(request):
                 file.write(part)
                 if file.tell() > MAX_UPLOAD:
                     raise too_large
-    except TimeoutError:
-        raise RefusedError(408, "the upload stopped") from None
     except OSError as error:
         raise RefusedError(507, f"the file cannot be stored ({error.strerror})") from None
     if not path.stat().st_size:

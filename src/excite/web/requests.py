@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 import re
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 
 from starlette.requests import Request
 
@@ -14,6 +15,9 @@ MAX_STEPS = 5000
 """Largest number of samples of a simulated experiment."""
 MAX_BODY = 64 * 2**10
 """Largest size of a request that is not an upload [bytes]."""
+
+SILENCE = 30.0
+"""Seconds that a request's body may pause."""
 
 Asked = Mapping[str, object]
 """The content of a request, as JSON."""
@@ -38,6 +42,16 @@ class RefusedError(Exception):
         self.status, self.sentence = status, sentence
 
 
+async def parts(request: Request) -> AsyncIterator[bytes]:
+    """The parts of a request's body as they come, until it ends or stops."""
+    body = request.stream()
+    try:
+        while part := await asyncio.wait_for(anext(body, b""), SILENCE):
+            yield part
+    except TimeoutError:
+        raise RefusedError(408, "the upload stopped") from None
+
+
 # ------------------------------------------------------------- what a browser may ask for
 
 
@@ -47,6 +61,14 @@ def word(asked: Asked, key: str) -> str:
     if not (isinstance(value, str) and WORD.fullmatch(value)):
         raise RefusedError(400, f"{key}: a name from the page is needed")
     return value
+
+
+def words(asked: Asked, key: str, most: int) -> list[str]:
+    """Such names, at most so many."""
+    value = asked.get(key, [])
+    if not isinstance(value, list) or len(value) > most:
+        raise RefusedError(400, f"{key}: a list of at most {most} names is needed")
+    return [word({key: name}, key) for name in value]
 
 
 def plant_of(asked: Asked, plants: Mapping[str, str]) -> str:

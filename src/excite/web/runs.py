@@ -6,6 +6,7 @@ becomes a path. Links are not followed.
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import json
 import math
@@ -64,14 +65,18 @@ def found(folder: Path) -> dict[str, Path]:
     for place, folders, files in os.walk(folder, followlinks=False):
         path = Path(place)
         name = path.relative_to(folder).as_posix()
-        is_text = name.isprintable()  # bytes that are no text come as lone surrogates
-        if "run.json" in files and is_text and len(runs) < _MAX_RUNS:
+        if "run.json" in files and _is_text(name) and len(runs) < _MAX_RUNS:
             runs[name] = path
             folders.clear()
         folders[:] = [f for f in sorted(folders) if f[0] != "." and not (path / f).is_symlink()]
         if len(path.relative_to(folder).parts) >= _DEPTH:
             folders.clear()
     return runs
+
+
+def _is_text(name: str) -> bool:
+    """Whether a name can be sent; bytes that are no text come as lone surrogates."""
+    return name.encode(errors="ignore").decode() == name
 
 
 def run_of(folder: Path, request: Request) -> Path:
@@ -90,10 +95,11 @@ def _files(run: Path) -> dict[str, Path]:
         yield from run.iterdir()
         yield from run.glob("seeds/*/*/policy.safetensors")
 
+    named = {path.relative_to(run).as_posix(): path for path in sorted(each())}
     return {
-        path.relative_to(run).as_posix(): path
-        for path in sorted(each())
-        if path.suffix in _TYPES and _is_inside(path, run)
+        name: path
+        for name, path in named.items()
+        if path.suffix in _TYPES and _is_text(name) and _is_inside(path, run)
     }
 
 
@@ -141,7 +147,10 @@ def _summary(name: str, run: Path) -> dict[str, object]:
 
 def _changed(run: Path) -> str:
     """When the newest file of a run was written, in UTC; empty where there is none."""
-    times = [path.lstat().st_mtime for path in run.iterdir()]
+    times = list[float]()
+    for path in run.glob("[!.]*"):
+        with contextlib.suppress(OSError):  # removed in the meantime
+            times.append(path.lstat().st_mtime)
     if not times:
         return ""
     return datetime.fromtimestamp(max(times), UTC).isoformat(timespec="seconds")

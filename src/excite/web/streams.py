@@ -37,6 +37,7 @@ from .requests import (
     texts,
     whole,
     word,
+    words,
 )
 from .sessions import Session
 from .workers import Workers
@@ -85,9 +86,6 @@ def routes(workers: Workers, plants: Mapping[str, str], body: Body) -> list[Rout
 
 def _experiment(asked: Asked, plants: Mapping[str, str]) -> ExperimentRequest:
     """An experiment for `excite.web.jobs`: only checked names and numbers."""
-    others = asked.get("others")
-    if not isinstance(others, list) or len(others) > 2:
-        raise RefusedError(400, "others: at most two excitations can be compared")
     return {
         "plant": plant_of(asked, plants),
         "excitation": word(asked, "excitation"),
@@ -96,7 +94,7 @@ def _experiment(asked: Asked, plants: Mapping[str, str]) -> ExperimentRequest:
         "params": numbers(asked, "params"),
         "steps": whole(asked, "steps", 50, MAX_STEPS),
         "seed": whole(asked, "seed", 0, 2**53),
-        "others": [word({"others": name}, "others") for name in others],
+        "others": words(asked, "others", 2),
     }
 
 
@@ -111,7 +109,7 @@ def _identification(asked: Asked, plants: Mapping[str, str]) -> IdentificationRe
         "units": texts(asked, "units"),
         "intervals": word({"intervals": "linear", **asked}, "intervals"),
         "hold_input": word({"hold_input": "constant", **asked}, "hold_input"),
-        "effect": word(asked, "effect") if asked.get("effect") else "",
+        "effects": words(asked, "effects", 32),
     }
 
 

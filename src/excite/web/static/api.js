@@ -60,7 +60,8 @@ export async function stream(address, content, onEvent) {
   for (let rest = ""; ;) {
     const { done, value } = await reader.read();
     if (done) return;
-    const lines = (rest + value).split("\n");
+    const lines = value.split("\n");
+    lines[0] = rest + lines[0];
     rest = lines.pop();
     lines.forEach((line) => onEvent(JSON.parse(line)));
   }

@@ -17,7 +17,7 @@ export function curves(parent, every) {
   const names = Object.keys(every[0]?.columns ?? {}).filter((name) => name.startsWith("relative_error_"));
   const plots = ["return", "violation_rate", ...names].map((name) => {
     const word = name.replace("relative_error_", "");
-    const title = name === word ? name.replace("_", " ") : el("span", {}, `${wordOf(every)} of `, symbol(word), " %");
+    const title = name === word ? name.replace("_", " ") : el("span", {}, `${wordOf(every)} of `, symbol(word), " ", el("span", { class: "unit" }, "%"));
     return [name, new Plot(parent, title, `${name === word ? name.replace("_", " ") : `${wordOf(every)} of ${word}`} over the steps of the training`)];
   });
   const draw = (now) => {

@@ -2,7 +2,7 @@
 
 import { command, download, el, get, options, say, symbol, Task, tell } from "./api.js";
 import { COLOURS } from "./curves.js";
-import { digits, Plot, range, shown } from "./plot.js";
+import { digits, empty, Plot, range, shown } from "./plot.js";
 
 const section = document.getElementById("experiment"), form = section.querySelector("form");
 const at = (id) => document.getElementById(id);
@@ -110,19 +110,19 @@ function asked() {
 const waiting = (live) => (live.found.length ? "Estimating and comparing…"
   : "Compiling the estimator for this plant and length; only needed for the first run…");
 
-function run() {
+async function run() {
   const wanted = asked();
   clear();
   say(form, "Waiting for a worker…");
-  task.run("api/experiments", wanted, follower(wanted.others.length + 1));
+  await task.run("api/experiments", wanted, follower(wanted.others.length + 1));
+  if (shownRun && !shownRun.isFull) shownRun.halt(); // no more samples come
 }
 
 /** Takes away what is shown of the run before. */
 function clear() {
   shownRun?.halt();
   at("outcome").hidden = at("player").hidden = true;
-  for (const plots of ["signals", "estimates", "overlays"]) at(plots).replaceChildren();
-  section.querySelector(".view").group?.show(null);
+  empty(at("signals"), at("estimates"), at("overlays"));
 }
 
 /** Draws the events of an experiment and its comparisons, of which there are so many. */
@@ -197,7 +197,7 @@ class Live {
     button.onclick = () => {
       if (button.textContent === "Pause") { this.halt(); move(this.count); return; }
       button.textContent = "Pause";
-      if (!this.isFull) { this.until = null; this.draw(); return; }
+      if (task.isBusy && !this.isFull) { this.until = null; this.draw(); return; }
       const first = this.count < this.time.length ? this.count : 0, length = 1000 * Math.min(10, this.end), begin = performance.now();
       const next = (now) => {
         move(Math.min(this.time.length, Math.round(first + ((now - begin) / length) * this.time.length)));
@@ -312,11 +312,13 @@ function overlay({ plant, num_samples: count }, compared) {
     plot.note.textContent = marks.map(({ word }) => word).join("; ");
   });
   const gained = lines({}, (own) => after(own.log_det)), seen = gained.flatMap(({ y }) => y.slice(Math.ceil(y.length / 10))).filter(Number.isFinite);
-  plots.shift().show({ x, unit, y: range(seen, ...seen.slice(0, 1)), lines: gained });
+  plots.shift().show({ x, unit, y: range(seen), lines: gained });
   for (const { name } of plant.parameters) {
-    const found = lines({}, (own) => after(own.bound_percent[name].map((v) => (v === null ? null : Math.log10(v)))));
-    const ends = found.map(({ y }) => y.at(-1)).filter(Number.isFinite), low = Math.min(...ends);
-    plots.shift().show({ x, unit, log: true, y: [Math.floor(low), Math.floor(low) + Math.max(2, Math.ceil(Math.max(...ends) - Math.floor(low)) + 1)], lines: found });
+    const found = lines({}, (own) => after(own.bound_percent[name].map((v) => (v === null ? null : Math.log10(v))))), plot = plots.shift();
+    const isKnown = ({ y }) => Number.isFinite(y.at(-1)), known = found.filter(isKnown), ends = known.length ? known.map(({ y }) => y.at(-1)) : [0];
+    const low = Math.floor(Math.min(...ends)), high = Math.max(low + 2, Math.ceil(Math.max(...ends)) + 1);
+    plot.show({ x, unit, log: true, y: [low, high], lines: found });
+    plot.note.textContent = found.filter((line) => !isKnown(line)).map((line) => `${line.name}: not identifiable`).join("; ");
   }
 }
 

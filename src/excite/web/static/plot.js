@@ -7,7 +7,7 @@ const colour = (name) => getComputedStyle(document.documentElement).getPropertyV
 const plots = new Set();
 /** The plots on the page; those that were taken away are given up. */
 function alive() {
-  for (const plot of plots) if (plot.u && !plot.chart.isConnected) plot.end();
+  for (const plot of plots) if (!plot.chart.isConnected) plot.end();
   return [...plots];
 }
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => alive().forEach((plot) => plot.draw(true)));
@@ -48,7 +48,8 @@ export function range(values, ...always) {
     if (value < low) low = value;
     if (value > high) high = value;
   }
-  if (!(high > low)) { low -= 1; high += 1; }
+  if (low > high) low = high = 0; // there is no number
+  if (low === high) { low -= 1; high += 1; }
   const room = 0.06 * (high - low);
   return [low - room, high + room];
 }
@@ -84,10 +85,21 @@ class Group {
   }
 }
 
+/** The part of the page around a place, whose plots share cross-hair and zoom. */
+const viewOf = (place) => place.closest(".own, .shared") ?? place;
+
+/** Takes away the plots in some places; their views show all of the axis again. */
+export function empty(...places) {
+  for (const place of places) {
+    place.replaceChildren();
+    viewOf(place).group?.show(null);
+  }
+}
+
 export class Plot {
   /** A figure in `parent`; `about` says in words what is drawn. Plots of a view share cross-hair and zoom. */
   constructor(parent, title, about) {
-    const view = parent.closest(".own, .shared") ?? parent; // plots of one experiment
+    const view = viewOf(parent);
     this.group = (view.group ??= new Group());
     this.note = el("span");
     this.read = el("span", { class: "read" });
@@ -122,17 +134,22 @@ export class Plot {
   get size() { return { width: this.chart.clientWidth, height: this.chart.clientHeight }; }
 
   end() {
-    this.u.destroy();
+    this.u?.destroy();
     resized.unobserve(this.chart);
     plots.delete(this);
   }
 
-  resize() { if (this.u) this.u.setSize(this.size); else this.draw(); }
+  resize() {
+    this.u?.setSize(this.size);
+    this.draw();
+  }
 
+  /** Draws what is to be shown; where the plot is hidden, as soon as it is not. */
   draw(isNew = false) {
+    if (isNew) this.made = "";
     if (!this.what || !this.chart.clientWidth) return;
     const kind = JSON.stringify([this.what.unit, this.what.log, this.lines.map(({ x, y, ...how }) => how)]);
-    if (this.u && !isNew && kind === this.made) this.u.setData(this.data());
+    if (this.u && kind === this.made) this.u.setData(this.data());
     else {
       this.u?.destroy();
       this.made = kind;
@@ -308,37 +325,60 @@ export class Plot {
     canvas.toBlob((blob) => keep(`${this.file}.png`, blob));
   }
 
+  /** The numbers of the lines in the part that is shown; a name that comes again has its number. */
   csv() {
-    const name = (line) => line.name ?? this.name.textContent.trim();
+    const title = this.name.cloneNode(true), own = title.querySelector(".unit"), { unit, log } = this.what, { min, max } = this.u.scales.x;
+    own?.remove();
+    const names = this.lines.map(({ name }) => name ?? title.textContent.trim());
+    const unique = names.map((name, i) => [name, names.slice(0, i).filter((other) => other === name).length + 1]);
+    const heads = unique.map(([name, count]) => name + (count > 1 ? ` (${count})` : "") + (own ? ` [${own.textContent}]` : ""));
     const quoted = (text) => (/[",\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text);
-    const head = [this.what.unit === "s" ? "time" : this.what.unit ?? "x", ...this.lines.map(name)].map(quoted);
-    const value = (y, i) => (isNumber(y) ? (this.what.log && i ? 10 ** y : y) : "");
+    const value = (y) => (isNumber(y) ? (log ? 10 ** y : y) : "");
     const [times, ...columns] = this.u.data;
-    const rows = times.map((x, k) => [x, ...columns.map((own) => own[k])].map(value).join(","));
-    keep(`${this.file}.csv`, new Blob([[head.join(","), ...rows, ""].join("\n")], { type: "text/csv" }));
+    const rows = times.flatMap((x, k) => (x < min || x > max ? [] : [[x, ...columns.map((y) => value(y[k]))].join(",")]));
+    const head = [unit === "s" ? "time [s]" : unit ?? "x", ...heads].map(quoted).join(",");
+    keep(`${this.file}.csv`, new Blob([[head, ...rows, ""].join("\n")], { type: "text/csv" }));
   }
 
+  /** What is drawn on the canvas, in the same order. */
   svg() {
-    const { u } = this, { width, height } = this.size, [y0, y1] = [u.scales.y.min, u.scales.y.max], [x0, x1] = [u.scales.x.min, u.scales.x.max];
-    const left = 54, right = width - 18, top = 8, bottom = height - 26, two = (v) => v.toFixed(2);
+    const { width, height } = this.size, { x: { min: x0, max: x1 }, y: { min: y0, max: y1 } } = this.u.scales;
+    const left = 54, right = width - 18, top = 8, bottom = height - 26, two = (v) => +v.toFixed(2);
     const X = (x) => two(left + ((x - x0) / (x1 - x0)) * (right - left)), Y = (y) => two(bottom - ((y - y0) / (y1 - y0)) * (bottom - top));
-    const text = (x, y, anchor, word) => `<text x="${x}" y="${y}" text-anchor="${anchor}" fill="${colour("soft")}">${word.replaceAll("&", "&amp;").replaceAll("<", "&lt;")}</text>`;
-    const line = (points, color, more = "") => `<polyline points="${points}" fill="none" stroke="${colour(color)}" ${more}/>`;
-    const { log, unit, levels = [], bands = [] } = this.what, marks = ticks(x0, x1, Math.max(2, (right - left) / 90));
-    const parts = [
-      ...ticks(y0, y1, 4).filter((y) => !log || Math.abs(y - Math.round(y)) < 1e-6).map((y) => line(`${left},${Y(y)} ${right},${Y(y)}`, "line") + text(left - 6, +Y(y) + 4, "end", log ? shown(10 ** y, 1) : label(y))),
-      ...marks.map((x, i) => text(X(x), height - 8, "middle", label(x) + (i === marks.length - 1 && unit ? ` ${unit}` : ""))),
-      ...bands.map(({ x, lower, upper, color }) => `<polygon points="${[...x.map((v, i) => `${X(v)},${Y(lower[i])}`), ...x.map((v, i) => `${X(v)},${Y(upper[i])}`).reverse()].join(" ")}" fill="${colour(color)}" clip-path="url(#c)"/>`),
-      ...levels.filter(({ y }) => y >= y0 && y <= y1).map(({ y, color, word }) => line(`${left},${Y(y)} ${right},${Y(y)}`, color, 'stroke-dasharray="6 4"') + (word ? text(right - 4, +Y(y) - 3, "end", word) : "")),
-      ...this.lines.map(({ x, y, color, step, dash, points, width: thick }) => {
-        const there = x.map((v, i) => i).filter((i) => isNumber(y[i]) && x[i] >= x0 && x[i] <= x1);
-        if (points) return there.map((i) => `<circle cx="${X(x[i])}" cy="${Y(y[i])}" r="1.7" fill="${colour(color)}"/>`).join("");
-        const path = there.map((i, n) => (step && n ? `${X(x[i])},${Y(y[there[n - 1]])} ` : "") + `${X(x[i])},${Y(y[i])}`).join(" ");
-        return line(path, color, `stroke-width="${thick ?? 1.6}" clip-path="url(#c)"${dash ? ` stroke-dasharray="${dash.join(" ")}"` : ""}`);
-      }),
+    const text = (x, y, anchor, word, color = "soft") => `<text x="${x}" y="${y}" text-anchor="${anchor}" fill="${colour(color)}">${word.replaceAll("&", "&amp;").replaceAll("<", "&lt;")}</text>`;
+    const line = (points, color, more = "") => `<polyline points="${points.join(" ")}" fill="none" stroke="${colour(color)}" ${more}/>`;
+    const { log, unit, levels = [], bands = [], marks = [] } = this.what, times = ticks(x0, x1, Math.max(2, (right - left) / 90));
+    const grid = [
+      ...times.map((x, i) => line([`${X(x)},${top}`, `${X(x)},${bottom}`], "line") + text(X(x), height - 8, "middle", label(x) + (i === times.length - 1 && unit ? ` ${unit}` : ""))),
+      ...ticks(y0, y1, 4).filter((y) => !log || Math.abs(y - Math.round(y)) < 1e-6).map((y) => line([`${left},${Y(y)}`, `${right},${Y(y)}`], "line") + text(left - 6, Y(y) + 4, "end", log ? shown(10 ** y, 1) : label(y))),
     ];
+    const band = ({ x, lower, upper, color }) => `<polygon points="${[...x.map((v, i) => `${X(v)},${Y(lower[i])}`), ...x.map((v, i) => `${X(v)},${Y(upper[i])}`).reverse()].join(" ")}" fill="${colour(color)}"/>`;
+    const level = ({ y, until, color, word }) => {
+      const at = Y(y), end = until === undefined ? (y > 0 ? top : bottom) : Y(until);
+      return `<rect x="${left}" y="${Math.min(at, end)}" width="${right - left}" height="${two(Math.abs(end - at))}" fill="${colour(color)}" opacity="0.1"/>`
+        + line([`${left},${at}`, `${right},${at}`], color, 'stroke-dasharray="6 4"')
+        + (word && Math.abs(end - at) > 14 ? text(right - 4, at + (y > 0 ? -3 : 13), "end", word, color) : "");
+    };
+    const drawn = ({ x, y, color, step, dash, points, dots, width: thick }) => {
+      const paths = [[]], circles = []; // a path ends at a gap
+      x.forEach((v, i) => {
+        if ((x[i + 1] ?? v) < x0 || (x[i - 1] ?? v) > x1) return;
+        if (!isNumber(y[i])) { paths.push([]); return; }
+        const path = paths.at(-1), at = [X(v), Y(y[i])];
+        if (step && path.length) path.push([at[0], path.at(-1)[1]]);
+        path.push(at);
+        if (dots || points) circles.push(`<circle cx="${at[0]}" cy="${at[1]}" r="${points ? 1.75 : 2.5}" fill="${colour(color)}"/>`);
+      });
+      const how = `stroke-width="${thick ?? 1.6}"${dash ? ` stroke-dasharray="${dash.join(" ")}"` : ""}`;
+      return [...(points ? [] : paths.filter((path) => path.length > 1).map((path) => line(path, color, how))), ...circles].join("");
+    };
+    const mark = ({ x, color, word }) => {
+      const at = X(x), [anchor, by] = at > (left + right) / 2 ? ["end", -4] : ["start", 4];
+      return at < left || at > right ? "" : line([`${at},${top}`, `${at},${bottom}`], color, 'stroke-width="1.5"') + text(at + by, bottom - 5, anchor, word, color);
+    };
     const head = `<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 ${width} ${height}" font-family="system-ui, sans-serif" font-size="12">`;
     const clip = `<clipPath id="c"><rect x="${left}" y="${top}" width="${right - left}" height="${bottom - top}"/></clipPath><rect width="100%" height="100%" fill="${colour("card")}"/>`;
-    keep(`${this.file}.svg`, new Blob([head, clip, ...parts, "</svg>\n"], { type: "image/svg+xml" }));
+    const inside = ['<g clip-path="url(#c)">', ...bands.map(band), ...levels.map(level), ...this.lines.map(drawn), "</g>"];
+    keep(`${this.file}.svg`, new Blob([head, clip, ...grid, ...inside, ...marks.map(mark), "</svg>\n"], { type: "image/svg+xml" }));
   }
 }

@@ -1,7 +1,7 @@
 // A recorded experiment: drop a file, map its columns, identify.
 
 import { command, download, el, options, say, symbol, Task, tell, upload } from "./api.js";
-import { digits, Plot, range, shown } from "./plot.js";
+import { digits, empty, Plot, range, shown } from "./plot.js";
 
 const section = document.getElementById("record"), form = section.querySelector("form");
 const at = (id) => document.getElementById(id);
@@ -20,7 +20,7 @@ export function begin(known) {
   section.addEventListener("dragover", over(true));
   section.addEventListener("dragleave", over(false));
   section.addEventListener("drop", (event) => { over(false)(event); take(event.dataTransfer.files[0]); });
-  form.addEventListener("submit", (event) => { event.preventDefault(); identify(); });
+  form.addEventListener("submit", (event) => { event.preventDefault(); identify(asked()); });
 }
 
 async function take(chosen) {
@@ -41,7 +41,7 @@ async function take(chosen) {
     const counts = Object.values(file.columns);
     say(form, `${chosen.name}: ${counts.length} columns, ${Math.max(...counts)} samples. ${task.isBusy ? "Another file is still being identified; wait, or stop it." : "Map them, then identify."}`);
   } catch (error) {
-    say(form, error.message, true);
+    if (own === reading) say(form, error.message, true);
   }
 }
 
@@ -52,7 +52,7 @@ function preview() {
   at("first-rows").replaceChildren(
     el("thead", {}, el("tr", {}, ...names.map((name) => el("th", { scope: "col" }, name)))),
     el("tbody", {}, ...Array.from({ length: rows }, (_, k) => el("tr", {}, ...names.map((name) => el("td", {}, file.previews[name].first[k] ?? ""))))));
-  at("columns").replaceChildren();
+  empty(at("columns"));
   for (const name of names) {
     const { index: x, values: y } = file.previews[name];
     if (y.length < 2) continue;
@@ -60,7 +60,8 @@ function preview() {
   }
 }
 
-const effects = () => at("effect").replaceChildren(el("option", { value: "" }, "nothing"), ...plant().effects.map((name) => el("option", { value: name }, name)));
+const effects = () => at("effects").replaceChildren(...plant().effects.map((name) => el("label", {}, el("input", { type: "checkbox", value: name }), name)));
+const boxes = () => [...at("effects").querySelectorAll("input")];
 
 const plant = () => catalogue.plants[at("record-plant").value];
 const needed = () => ["time", ...plant().inputs.map((p) => p.name), ...plant().outputs.map((p) => p.name)];
@@ -78,25 +79,32 @@ function showMapping() {
     options(select, there, likely);
     if (likely === undefined) select.prepend(el("option", { value: "", selected: true }, "choose…"));
     const unit = el("select", { id: `unit-${name}` });
-    const guess = () => options(unit, unitsOf(name).map((word) => word || "1"), unitIn(select.value));
+    const hint = el("p", { class: "hint", role: "status" });
+    const guess = () => {
+      const words = unitsOf(name).map((word) => word || "1"), word = unitIn(select.value);
+      options(unit, words, word);
+      hint.textContent = word === undefined || words.includes(word) ? "" : `unit "${word}" is not known: choose one`;
+    };
+    unit.addEventListener("change", () => { hint.textContent = ""; });
     select.addEventListener("change", () => { guess(); task.refresh(); });
     guess();
     return el("div", { class: "map" },
       el("div", { class: "field" }, el("label", { for: select.id }, name), select),
       el("div", { class: "field" }, el("label", { for: unit.id }, "unit", el("span", { class: "unseen" }, ` of ${name}`)), unit),
       el("div", { class: "field" }, el("label", { for: `scale-${name}` }, "scale", el("span", { class: "unseen" }, ` of ${name}`)),
-        el("input", { id: `scale-${name}`, type: "number", step: "any", placeholder: "none" })));
+        el("input", { id: `scale-${name}`, type: "number", step: "any", placeholder: "none" })),
+      hint);
   }));
   task.refresh();
 }
 
-function identify() {
+function asked() {
   const scales = {}, units = {};
   for (const name of needed()) {
     if (at(`scale-${name}`).value !== "") scales[name] = +at(`scale-${name}`).value;
     else if (at(`unit-${name}`).selectedIndex) units[name] = at(`unit-${name}`).value;
   }
-  const wanted = {
+  return {
     upload: file.upload,
     plant: at("record-plant").value,
     columns: Object.fromEntries(needed().map((name) => [name, at(`column-${name}`).value])),
@@ -104,24 +112,30 @@ function identify() {
     units,
     estimator: at("estimator").value,
     initial_state: at("initial").value,
-    effect: at("effect").value,
+    effects: boxes().filter((box) => box.checked).map((box) => box.value),
     hold_input: at("hold-input").value,
     intervals: at("intervals").value,
   };
+}
+
+async function identify(wanted) {
   hideResults();
   say(form, "Waiting for a worker…");
   const start = Date.now();
-  task.run("api/identifications", wanted, (event) => {
+  let found = null;
+  await task.run("api/identifications", wanted, (event) => {
     if (event.kind === "started") say(form, "Identifying…");
     else if (event.kind === "pulse") tell(form, `${Math.round((Date.now() - start) / 1000)} s`);
-    else if (event.kind === "identified") show(event);
+    else if (event.kind === "identified") found = event;
   });
+  if (found) show(wanted, found);
 }
 
 const results = () => section.querySelectorAll(".view > section:not(#preview)");
 const hideResults = () => results().forEach((part) => { part.hidden = true; });
 
-function show({ identification, plant: fitted, result, time, inputs, outputs, simulated, is_whole: isWhole, command: again }) {
+/** Shows what was found for a request. */
+function show(wanted, { identification, plant: fitted, result, time, inputs, outputs, simulated, is_whole: isWhole, command: again }) {
   results().forEach((part) => { part.hidden = false; });
   say(form, `Done: ${identification.status}.`);
   section.querySelector(".view h2").textContent = `Identified: ${identification.files.join(", ")}, ${fitted.name}`;
@@ -133,12 +147,11 @@ function show({ identification, plant: fitted, result, time, inputs, outputs, si
     download(`api/results/${result}/record.csv`, "Record"),
     download(`api/results/${result}/record.json`, "Sidecar"),
     download(`api/results/${result}/estimate.json`, "Estimate"));
-  causes(identification.suspects ?? []);
+  causes(wanted, identification.suspects ?? []);
   correlations(Object.keys(identification.params), identification.correlation ?? []);
   at("record-again").replaceChildren(command(again));
   const parent = at("record-signals"), x = [time[0], time.at(-1)];
-  parent.replaceChildren();
-  at("residual-echoes").replaceChildren();
+  empty(parent, at("residual-echoes"));
   const title = (part) => el("span", {}, part.name, " ", el("span", { class: "unit" }, part.shown_unit));
   fitted.inputs.forEach((part, i) => {
     const y = inputs.map((row) => row[i]);
@@ -163,11 +176,15 @@ function show({ identification, plant: fitted, result, time, inputs, outputs, si
   });
 }
 
-/** Buttons that estimate what the plant may leave out, the likeliest first. */
-function causes(suspects) {
-  const possible = suspects.filter(({ name }) => plant().effects.includes(name));
+/** Buttons that estimate what the plant may leave out, too, the likeliest first. */
+function causes(wanted, suspects) {
+  const possible = suspects.filter(({ name }) => catalogue.plants[wanted.plant].effects.includes(name));
   at("causes").replaceChildren(...possible.slice(0, 3).map(({ name }, i) => el("button", {
-    type: "button", click: () => { at("effect").value = name; identify(); },
+    type: "button", click: () => {
+      const more = { ...wanted, effects: [...wanted.effects, name] };
+      if (at("record-plant").value === wanted.plant) boxes().forEach((box) => { box.checked = more.effects.includes(box.value); });
+      identify(more);
+    },
   }, i ? `Or estimate ${name}` : `Estimate ${name}, too`)));
 }
 

@@ -10,8 +10,9 @@ let all = [], asked = "", chosen = "", following = 0;
 filter.addEventListener("input", list);
 order.addEventListener("change", list);
 
-/** Lists the runs; one that the address names is shown. */
-export async function open(name) {
+/** Lists the runs; the one that the address names is shown, or else the one that was chosen before. */
+export async function open(wanted) {
+  const name = wanted || chosen;
   asked = name;
   try {
     all = (await get("api/runs")).runs;
@@ -44,6 +45,7 @@ function list() {
 
 async function show(run) {
   section.querySelectorAll("#run-list button").forEach((b) => b.setAttribute("aria-pressed", String(b.dataset.name === run.name)));
+  const isNew = chosen !== run.name;
   chosen = run.name;
   clearTimeout(following);
   say(section, "");
@@ -70,7 +72,7 @@ async function show(run) {
     const isFollowed = content.kind === "campaign" && !content.is_finished && !content.campaign.interrupted;
     if (isFollowed) following = setTimeout(() => chosen === run.name && !section.hidden && show(run), 2000);
     view.replaceChildren(card);
-    if (!isFollowed && view.getBoundingClientRect().top > innerHeight / 2) view.scrollIntoView();
+    if (isNew && view.getBoundingClientRect().top > innerHeight / 2) view.scrollIntoView();
     if (content.curves.length) {
       const learnt = el("section", { class: "card" }, el("h2", {}, "Learning curves"), el("div", { class: "plots small" }));
       view.append(learnt);
