@@ -25,20 +25,18 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import ndtr
 from jaxtyping import Array, Float, Key, PRNGKeyArray
 
 from ..description import LARGEST_SEED, Spread, SpreadLike, names_of, require_whole
 from ..excitation import AbstractExcitation
 from ..excitation.catalogue import ExcitationLike
 from ..information import require_noise
-from ..plant import AbstractPlant, Params
 from ..plant.catalogue import PlantLike
 from ..progress import SHOWN, Progress
 from ..report.tables import html_table, text_table
-from ..simulation import Experiment, response, run_episode
+from ..simulation import Experiment, predicted, require_likelihood, run_episode
 from .evidence import Fit, nearest
-from .prior import Prior
+from .prior import PriorPlants
 from .prior_knowledge import PriorLike, with_prior
 
 _STEPS, _STARTS = 30, 8  # of the search for the most probable parameters
@@ -47,35 +45,6 @@ _CHUNK = 16  # records at a time
 _BLOCK = 1000  # samples at a time
 _NEAR_CAP = 1.0  # nats below the largest value of a lower bound, at which it says little
 _FEW = 10.0  # effective samples
-
-
-class PriorPlants(eqx.Module):
-    """Parameters as functions of independent standard normal coordinates z.
-
-    Attributes:
-        plant: has the parameters.
-        normal: distribution of some parameters, or of their logarithms; None for none.
-        spread: of the others, which are uniform in their box.
-    """
-
-    plant: AbstractPlant
-    normal: Prior | None
-    spread: Spread = eqx.field(static=True)
-
-    def params(self, z: Float[Array, " param"]) -> Params:
-        """The parameters at some coordinates, in their units."""
-        d, values = self.plant.definition, {}
-        names = () if self.normal is None else self.normal.names
-        if self.normal is not None:
-            index = np.array([names_of(d.parameters).index(name) for name in names])
-            drawn = self.normal.mean + jnp.linalg.solve(self.normal.root, z[index])
-            parts = zip(names, self.normal.logarithmic, drawn, strict=True)
-            values = {n: jnp.exp(v) if is_log else v for n, is_log, v in parts}
-        for i, parameter in enumerate(d.parameters):
-            if parameter.name not in values:
-                unit, nominal = 2 * ndtr(z[i]) - 1, self.plant.nominal[i]
-                values[parameter.name] = self.spread.value(parameter, nominal, unit)
-        return self.plant.Params(**values)
 
 
 class Gains(eqx.Module):
@@ -113,7 +82,7 @@ def gains(
         num_samples: of the evidence of each record.
         from_prior: whether these are drawn from the prior, not near the posterior.
     """
-    plant, sd = prior.plant, prior.plant.sensor.sd
+    plant = prior.plant
     count = len(plant.nominal)
     unknown = Fit(jnp.zeros(count), jnp.eye(count), jnp.zeros(()), jnp.zeros(()))
 
@@ -123,7 +92,7 @@ def gains(
         run = run_episode(plant, prior.params(true), excitation, num_steps, run_key)
 
         def residual(z: Array) -> Array:
-            outputs = response(plant, prior.params(z), run.inputs)
+            outputs, sd = predicted(plant, prior.params(z), run.inputs, run.measured)
             return ((run.measured - outputs) / sd[None]).ravel()
 
         def log_likelihood(z: Array) -> Array:
@@ -312,7 +281,8 @@ def information_gain(
         plant, excitation, options=options, steps=steps, noise=noise, resolution=resolution,
         seed=seed,
     )  # fmt: skip
-    require_noise(e.plant)
+    if not require_likelihood(e.plant):
+        require_noise(e.plant)
     reach, normal, words = Spread.of(spread), None, str(Spread.of(spread))
     if prior is not None:
         bounded, normal, _ = with_prior(e.plant, prior, e.plant.nominal, {}, {})

@@ -32,10 +32,11 @@ from ..description import (
     SpreadLike,
     names_of,
     path_from,
+    prior_sd_of,
     require_whole,
     wrong_type,
 )
-from ..environment import prior_sd_of, run_episodes
+from ..environment import run_episodes
 from ..estimation import Status
 from ..estimation.diagnosis import chi2_tail
 from ..estimation.identify import RecordLike, identify
