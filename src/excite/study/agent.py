@@ -296,7 +296,8 @@ class Agent:
             "training": {
                 name: value
                 for name, value in dataclasses.asdict(self.training).items()
-                if is_uncertain or name not in AGAINST_UNCERTAINTY
+                if (is_uncertain or name not in AGAINST_UNCERTAINTY)
+                and (name, value) != ("starts", 1)
             },
             **({"uncertainty": dict(self.ranges(ranges))} if is_uncertain else {}),
         }
