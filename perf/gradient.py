@@ -17,7 +17,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from excite.environment import Env, InformationGain, prior_sd_of
+from excite.description import prior_sd_of
+from excite.environment import Env, InformationGain
 from excite.plant import Aero2
 from excite.policy import Layout
 from excite.training import gradient, ppo

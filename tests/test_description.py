@@ -44,8 +44,12 @@ def simple(**changes) -> PlantDescription:
 def test_hash_is_the_sha256_of_the_canonical_json():
     description = simple()
     data = {"format": 1, **dataclasses.asdict(description)}
+    assert data.pop("integrator") == "runge_kutta"  # what is not used is left out
+    assert [state.pop("noise_sd") for state in data["states"]] == [0.0, 0.0]
     text = json.dumps(data, sort_keys=True, separators=(",", ":"))
     assert description.hash == hashlib.sha256(text.encode()).hexdigest()
+    noisy = simple(states=(State("x", "m", noise_sd=0.1), State("v", "m/s")), integrator="euler")
+    assert noisy.hash != simple(integrator="euler").hash != description.hash
 
 
 def test_hash_of_a_known_description_never_changes():

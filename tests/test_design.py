@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from catalogue import PLANTS
 
-from excite.description import Input, Output, Parameter, PlantDescription, State
-from excite.environment import prior_sd_of, run_episodes
+from excite.description import Input, Output, Parameter, PlantDescription, State, prior_sd_of
+from excite.environment import run_episodes
 from excite.excitation import Chirp, Replay
 from excite.excitation.catalogue import EXCITATIONS, LOOP
 from excite.plant import AbstractPlant, Aero2

@@ -12,7 +12,7 @@ import pytest
 from catalogue import LONG
 from jaxtyping import Array
 
-from excite.description import Input, Output, Parameter, PlantDescription, State
+from excite.description import Input, Output, Parameter, PlantDescription, State, prior_sd_of
 from excite.environment import (
     AbstractObjective,
     Env,
@@ -21,7 +21,6 @@ from excite.environment import (
     OutputError,
     StepData,
     WeightedSum,
-    prior_sd_of,
 )
 from excite.environment.falsification import Cases, OnPlant
 from excite.estimation import NLS, stack_experiments

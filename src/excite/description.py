@@ -92,6 +92,9 @@ class _Named:
 class State(_Named):
     """One component of the state: its value at rest and a typical size, in `unit`.
 
+    `noise_sd` is the standard deviation of what a disturbance adds to it in every `dt`
+    (process noise).
+
     >>> import excite as ex
     >>> ex.State("pitch", "rad", scale=0.5).initial
     0.0
@@ -101,10 +104,12 @@ class State(_Named):
     unit: str
     initial: float = 0.0
     scale: float = 1.0
+    noise_sd: float = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
         _require(self.scale > 0, f"scale of state {self.name!r} must be positive")
+        _require(self.noise_sd >= 0, f"noise_sd of state {self.name!r} must not be negative")
 
 
 @dataclass(frozen=True)
@@ -254,6 +259,7 @@ _PARTS = {
     "constants": Constant,
 }
 _MOST_SUBSTEPS = 10_000
+INTEGRATORS = ("runge_kutta", "euler")
 
 
 @dataclass(frozen=True, repr=False)
@@ -282,7 +288,9 @@ class PlantDescription:
         states, inputs, outputs, parameters, constants: in the order of their arrays. A plant may
             have no inputs: a free decay, a reaction, a body that cools.
         dt: sampling time [s]; inputs are held over it.
-        substeps: Runge-Kutta steps in one `dt`.
+        substeps: of the integration, in one `dt`.
+        integrator: `runge_kutta` (of order 4) or `euler`, whose process with noise is that of
+            Euler and Maruyama.
         band: lowest and highest frequency [Hz] that a signal excites by default; left out, a
             hundredth and a half of the largest one, half the sampling rate.
     """
@@ -296,6 +304,7 @@ class PlantDescription:
     band: tuple[float, float] = (0.0, 0.0)
     constants: tuple[Constant, ...] = ()
     substeps: int = 1
+    integrator: str = "runge_kutta"
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str):
@@ -314,6 +323,8 @@ class PlantDescription:
             f"{reprlib.repr(substeps)}",
         )
         object.__setattr__(self, "substeps", int(substeps))
+        if self.integrator not in INTEGRATORS:
+            raise unknown("integrator", str(self.integrator), INTEGRATORS)
         _require(
             0 < self.band[0] < self.band[1] <= 0.5 / self.dt,
             f"band must increase and end at or below {0.5 / self.dt:g} Hz, half the sampling "
@@ -366,13 +377,32 @@ class PlantDescription:
         return next(p for p in self.parameters if p.name == name)
 
     @property
+    def is_disturbed(self) -> bool:
+        """Whether a state has process noise."""
+        return any(state.noise_sd for state in self.states)
+
+    @property
+    def observes_state(self) -> bool:
+        """Whether the outputs are the states, which have noise, and are measured without error."""
+        is_exact = not any(o.noise_sd or o.resolution for o in self.outputs)
+        is_state = names_of(self.outputs) == names_of(self.states)
+        return is_exact and is_state and all(state.noise_sd for state in self.states)
+
+    @property
     def columns(self) -> tuple[str, ...]:
         """Columns of an experiment file: time, inputs, outputs."""
         return ("time", *names_of(self.inputs), *names_of(self.outputs))
 
     def to_dict(self) -> dict[str, Any]:
         """The description as JSON-ready data; `from_dict` reads it back."""
-        return {"format": FORMAT, **asdict(self)}
+        content = {"format": FORMAT, **asdict(self)}
+        # What a plant does not have is left out: the hashes of others stay what they were.
+        if self.integrator == INTEGRATORS[0]:
+            del content["integrator"]
+        for state in content["states"]:
+            if not state["noise_sd"]:
+                del state["noise_sd"]
+        return content
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> PlantDescription:
@@ -550,6 +580,12 @@ SpreadLike: TypeAlias = float | str | Spread
 """A fraction of each parameter's scale, or a factor such as `factor:3`."""
 
 LARGEST_FACTOR = 1000.0
+
+
+def prior_sd_of(spread: SpreadLike) -> float:
+    """Standard deviation of a relative parameter, uniform within the spread."""
+    # Without a spread, the prior standard deviation is one percent.
+    return max(Spread.of(spread).relative, 0.01) / 3**0.5
 
 
 def told(error: BaseException) -> str:

@@ -66,7 +66,10 @@ def step(
     def at(fraction: Array | float) -> Array:
         return input if next_input is None else input + fraction * (next_input - input)
 
-    def substep(x: Array, k: Array) -> tuple[Array, None]:
+    def euler(x: Array, k: Array) -> tuple[Array, None]:
+        return x + h * plant.derivative(x, at(k / n), params), None
+
+    def runge_kutta(x: Array, k: Array) -> tuple[Array, None]:
         first, middle, last = at(k / n), at((k + 0.5) / n), at((k + 1) / n)
         k1 = plant.derivative(x, first, params)
         k2 = plant.derivative(x + h / 2 * k1, middle, params)
@@ -74,7 +77,17 @@ def step(
         k4 = plant.derivative(x + h * k3, last, params)
         return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4), None
 
-    return over_substeps(substep, state, n)
+    is_euler = plant.definition.integrator == "euler"
+    return over_substeps(euler if is_euler else runge_kutta, state, n)
+
+
+def disturbed(
+    plant: AbstractPlant, state: Float[Array, " state"], key: PRNGKeyArray
+) -> Float[Array, " state"]:
+    """The state after the process noise of one sampling time."""
+    if not plant.definition.is_disturbed:
+        return state
+    return state + plant.process_noise_sd * jax.random.normal(key, state.shape, float)
 
 
 def over_substeps(
@@ -178,6 +191,43 @@ def response(
     return jnp.concatenate([plant.output(start, params)[None], outputs])
 
 
+@eqx.filter_jit
+def predicted(
+    plant: AbstractPlant,
+    params: Params,
+    inputs: Float[Array, "time input"],
+    measured: Float[Array, "time+1 output"],
+) -> tuple[Float[Array, "time+1 output"], Float[Array, " output"]]:
+    """What the model expects of the measurements, and their standard deviations about it.
+
+    Where the state is observed, each sample is predicted from the one before, and differs from
+    that by process noise: the likelihood of a record is that of its transitions. Otherwise it is
+    the response, from which a measurement differs by the noise of its sensor.
+
+    Raises:
+        ValueError: for process noise and a state that is not observed.
+    """
+    if not require_likelihood(plant):
+        return response(plant, params, inputs), plant.sensor.sd
+    steps = acting(plant, params, inputs, None, None)
+    after = jax.vmap(lambda state, now: step(plant, state, now[0], params, next_input=now[2]))(
+        measured[:-1], steps
+    )
+    return jnp.concatenate([measured[:1], after]), plant.process_noise_sd
+
+
+def require_likelihood(plant: AbstractPlant) -> bool:
+    """Whether the state is observed; ValueError for process noise where it is not."""
+    d = plant.definition
+    if d.is_disturbed and not d.observes_state:
+        raise ValueError(
+            f"plant {d.name!r} has process noise, and its state is not observed: name its outputs "
+            "as its states, without sensor noise, and give every state a noise_sd; or leave the "
+            "process noise out"
+        )
+    return d.observes_state
+
+
 def measure(
     plant: AbstractPlant, output: Float[Array, " output"], key: PRNGKeyArray
 ) -> Float[Array, " output"]:
@@ -220,8 +270,7 @@ def run_episode(
 ) -> Trajectory:
     """One experiment in closed loop: measure, excite, clip to the limits, integrate.
 
-    The sensor noise depends on the key alone: with one key it is the same for every
-    excitation.
+    The noise depends on the key alone: with one key it is the same for every excitation.
 
     Args:
         noise: in place of that of the key, in standard deviations of the sensor.
@@ -238,6 +287,8 @@ def run_episode(
         first, last = _delayed_step(past, delay / plant.dt, k)
         return step(plant, state, first, params, next_input=last), past
 
+    disturbance_key = jax.random.fold_in(key, 0)
+
     def advance(carry: tuple, now: tuple) -> tuple[tuple, tuple]:
         (state, past, memory), (noise, k) = carry, now
         output, shown = plant.true_and_shown(state, params)
@@ -245,6 +296,7 @@ def run_episode(
         memory, input = excitation(memory, measured)
         input = jnp.clip(input, lower, upper)
         state, past = moved(state, past, input, k)
+        state = disturbed(plant, state, jax.random.fold_in(disturbance_key, k))
         return (state, past, memory), (input, measured, output)
 
     past = jnp.zeros((0 if delay is None else num_steps, len(lower)))

@@ -13,7 +13,6 @@ from .objective import MAX_ERROR as MAX_ERROR
 from .objective import MAX_SENSITIVITY as MAX_SENSITIVITY
 from .objective import AbstractObjective as AbstractObjective
 from .objective import StepData as StepData
-from .objective import prior_sd_of as prior_sd_of
 from .objective import target_mask as target_mask
 from .process import Batch as Batch
 from .process import Env as Env

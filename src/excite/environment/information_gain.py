@@ -7,9 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ..estimation.prior import PriorPlants
 from ..information import relative_size
 from ..plant import AbstractPlant, Params
 from ..plant.fields import floats
+from ..safety import safe_input
 from .objective import (
     MAX_SENSITIVITY,
     AbstractObjective,
@@ -21,9 +23,10 @@ from .objective import (
 
 
 class InformationMemory(Knowledge):
-    """The information so far, and the criterion at the last reward."""
+    """The information so far, the criterion at the last reward, and the last input."""
 
     value: Float[Array, ""]
+    input: Float[Array, " input"]
 
 
 class InformationGain(AbstractObjective):
@@ -43,6 +46,10 @@ class InformationGain(AbstractObjective):
             (`D`), of its trace (`A`), or of its largest eigenvalue (`E`).
         dense: whether every step is rewarded by its increment, or the last by the total.
         max_sensitivity: larger ones are scaled down, see MAX_SENSITIVITY.
+        prior: of the parameters, in place of `prior_sd`. With the weight one half and the criterion
+            D, the total is the information gained in nats, by the posterior's normal
+            approximation.
+        change_price: of the squared change of the input, subtracted at every step.
     """
 
     targets: tuple[bool, ...] = eqx.field(static=True)
@@ -51,6 +58,8 @@ class InformationGain(AbstractObjective):
     criterion: str = eqx.field(static=True, default="D")
     dense: bool = eqx.field(static=True, default=True)
     max_sensitivity: Float[Array, ""] = eqx.field(converter=floats, default=MAX_SENSITIVITY)
+    prior: PriorPlants | None = None
+    change_price: Float[Array, ""] = eqx.field(converter=floats, default=0.0)
 
     def __check_init__(self) -> None:
         """Raises ValueError for an unknown criterion."""
@@ -60,36 +69,63 @@ class InformationGain(AbstractObjective):
     def init(self, plant: AbstractPlant, measured: Float[Array, " output"]) -> InformationMemory:
         """The prior's information; the initial state is known."""
         del measured
-        known = prior_knowledge(plant, len(self.targets), self.prior_sd)
-        return InformationMemory(*known, self._value(known[1]))
+        sd = 1.0 if self.prior is not None else self.prior_sd
+        known = prior_knowledge(plant, len(self.targets), jnp.asarray(sd))
+        rest = jnp.asarray(safe_input(plant.definition))
+        value = jnp.zeros(()) if self.prior is not None else self._value(known[1])
+        return InformationMemory(*known, value, rest)
 
     def update(
         self, plant: AbstractPlant, memory: InformationMemory, sample: StepData, k: Int[Array, ""]
     ) -> tuple[InformationMemory, Float[Array, ""]]:
         """Sensitivities after one step, and the information of the measurement at its end."""
         del k
-        known = next_knowledge(plant, memory, sample, self.max_sensitivity)[:2]
+        own = plant, memory, sample, self.max_sensitivity, self.prior
+        known = next_knowledge(*own)[:2]
+        cost = self.change_price * jnp.sum((sample.input - memory.input) ** 2)
         if not self.dense:
-            return InformationMemory(*known, memory.value), jnp.zeros(())
-        value = self._value(known[1])
-        gain = self.weight * (value - memory.value)
-        return InformationMemory(*known, value), gain
+            return InformationMemory(*known, memory.value, sample.input), -cost
+        value = self._worth(plant, known[1], sample.params)
+        gain = self.weight * (value - memory.value) - cost
+        return InformationMemory(*known, value, sample.input), gain
 
     def final(
         self, plant: AbstractPlant, memory: InformationMemory, params: Params
     ) -> Float[Array, ""]:
         """The total gain, unless it was rewarded at every step."""
-        del plant, params
         if self.dense:
             return jnp.zeros(())
-        return self.weight * (self._value(memory.information) - memory.value)
+        return self.weight * (self._worth(plant, memory.information, params) - memory.value)
 
     def relative_errors(
         self, plant: AbstractPlant, memory: InformationMemory, params: Params
     ) -> Float[Array, " param"]:
         """Smallest relative standard deviations (Cramér-Rao with the prior)."""
-        deviation = jnp.sqrt(jnp.diagonal(jnp.linalg.inv(memory.information)))
-        return deviation * relative_size(plant, params) / jnp.abs(jnp.stack(params))
+        covariance = jnp.linalg.inv(memory.information)
+        if self.prior is None:
+            deviation = jnp.sqrt(jnp.diagonal(covariance)) * relative_size(plant, params)
+        else:
+            changes = self.prior.changes(params)
+            deviation = jnp.sqrt(jnp.diagonal(changes @ covariance @ changes.T))
+        return deviation / jnp.abs(jnp.stack(params))
+
+    def _worth(
+        self, plant: AbstractPlant, information: Float[Array, "param param"], params: Params
+    ) -> Float[Array, ""]:
+        """The criterion; with a prior, what the experiment adds to it."""
+        if self.prior is None:
+            return self._value(information)
+        changes = self.prior.changes(params) / relative_size(plant, params)[:, None]
+        after = changes @ jnp.linalg.inv(information) @ changes.T
+        return self._of_covariance(after) - self._of_covariance(changes @ changes.T)
+
+    def _of_covariance(self, covariance: Float[Array, "param param"]) -> Float[Array, ""]:
+        """The criterion of the relative parameters' covariance."""
+        chosen = np.flatnonzero(self.targets)
+        own = covariance[np.ix_(chosen, chosen)]
+        if self.criterion == "D":
+            return -jnp.linalg.slogdet(own)[1]
+        return -jnp.log(jnp.trace(own) if self.criterion == "A" else jnp.linalg.eigvalsh(own)[-1])
 
     def _value(self, information: Float[Array, "param param"]) -> Float[Array, ""]:
         chosen = np.flatnonzero(self.targets)

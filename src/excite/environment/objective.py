@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
-from ..description import PlantDescription, Spread, SpreadLike, names_of
+from ..description import PlantDescription, names_of
+from ..estimation.prior import PriorPlants
 from ..information import relative_size
 from ..plant import AbstractPlant, Params
 from ..plant.fields import floats, optional_floats
@@ -164,17 +165,29 @@ def prior_knowledge(
 
 
 def next_knowledge(
-    plant: AbstractPlant, memory: Knowledge, sample: StepData, limit: Float[Array, ""]
+    plant: AbstractPlant,
+    memory: Knowledge,
+    sample: StepData,
+    limit: Float[Array, ""],
+    prior: PriorPlants | None = None,
 ) -> tuple[
     Float[Array, "state param"], Float[Array, "param param"], Float[Array, "output param"], Array
 ]:
     """Sensitivity and information after one step.
 
+    Args:
+        prior: whose standard deviations are the units of the parameters; else they are relative.
+
     Returns:
         Both; sensitivities of the outputs over their standard deviation; the true outputs.
     """
-    sensitivity, of_outputs, output = sensitivities(plant, memory.sensitivity, sample, limit)
-    weighted = of_outputs / plant.sensor.sd[:, None]
+    own = plant, memory.sensitivity, sample, limit, prior
+    sensitivity, of_outputs, output = sensitivities(*own)
+    if plant.definition.observes_state:  # the next step begins with what is measured
+        sensitivity, sd = jnp.zeros_like(sensitivity), plant.process_noise_sd
+    else:
+        sd = plant.sensor.sd
+    weighted = of_outputs / sd[:, None]
     return sensitivity, memory.information + weighted.T @ weighted, weighted, output
 
 
@@ -183,12 +196,14 @@ def sensitivities(
     sensitivity: Float[Array, "state param"],
     sample: StepData,
     limit: Float[Array, ""],
+    prior: PriorPlants | None = None,
 ) -> tuple[Float[Array, "state param"], Float[Array, "output param"], Float[Array, " output"]]:
-    """Relative sensitivities of state and outputs after one step, and the true outputs."""
+    """Sensitivities of state and outputs after one step, and the true outputs."""
     theta, size = jnp.stack(sample.params), relative_size(plant, sample.params)
+    changes = None if prior is None else prior.changes(sample.params)
 
     def response(state: Array, change: Array) -> tuple[Array, Array]:
-        params = plant.Params(*(theta + size * change))
+        params = plant.Params(*(theta + (size * change if changes is None else changes @ change)))
         state = step(plant, state, sample.input, params)
         return state, plant.output(state, params)
 
@@ -223,9 +238,3 @@ def target_mask(description: PlantDescription, targets: Sequence[str] | None) ->
     if not targets:
         raise ValueError("an objective needs at least one parameter")
     return tuple(name in targets for name in names)
-
-
-def prior_sd_of(spread: SpreadLike) -> float:
-    """Standard deviation of a relative parameter, uniform within the spread."""
-    # Without a spread, the prior standard deviation is one percent.
-    return max(Spread.of(spread).relative, 0.01) / 3**0.5

@@ -18,7 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
 
-from ..description import Spread, SpreadLike
+from ..description import Spread, SpreadLike, prior_sd_of
+from ..estimation.prior import PriorPlants
 from ..plant import AbstractARXPlant, AbstractPlant, Params, draw_params
 from ..plant.fields import floats
 from ..plant.uncertainty import Uncertainty
@@ -32,10 +33,10 @@ from ..policy import (
     with_measurement,
 )
 from ..safety import critical_levels, penalty, safe_input, watched_levels
-from ..simulation import measure, step
+from ..simulation import disturbed, measure, step
 from .errors import EstimationError
 from .information_gain import InformationGain
-from .objective import AbstractObjective, StepData, prior_sd_of, target_mask
+from .objective import AbstractObjective, StepData, target_mask
 
 
 def _spread(given: SpreadLike) -> Spread:
@@ -102,6 +103,7 @@ class Env(eqx.Module):
         uncertainty: box of the plants on which a policy is also made safe, without reward.
         coast: samples after the experiment, under the input that ends it, in which the plant must
             be safe too. Training by gradient penalises them; a step of the process has none.
+        prior: of the parameters, in place of the spread.
     """
 
     plant: AbstractPlant
@@ -112,6 +114,7 @@ class Env(eqx.Module):
     constants: tuple[PyTree, PyTree] | None = None
     uncertainty: Uncertainty | None = None
     coast: int = eqx.field(static=True, default=0)
+    prior: PriorPlants | None = None
 
     @classmethod
     def of(
@@ -125,6 +128,7 @@ class Env(eqx.Module):
         constants: tuple[PyTree, PyTree] | None = None,
         uncertainty: Uncertainty | None = None,
         coast: int = 0,
+        prior: PriorPlants | None = None,
     ) -> Env:
         """The paper's process for a plant, except for the given choices."""
         return cls(
@@ -136,6 +140,7 @@ class Env(eqx.Module):
             constants,
             uncertainty,
             coast,
+            prior,
         )
 
     def reset(self, key: PRNGKeyArray) -> tuple[EnvState, Float[Array, " observation"]]:
@@ -143,7 +148,10 @@ class Env(eqx.Module):
         params_key, key = jax.random.split(key)
         constants = self._draw_constants(params_key)
         plant = self.plant.changed(**constants._asdict())
-        params = draw_params(plant, params_key, self.spread)
+        if self.prior is None:
+            params = draw_params(plant, params_key, self.spread)
+        else:
+            params = self.prior.draw(params_key)
         output = plant.output(plant.initial_state, params)
         measured = measure(plant, output, jax.random.fold_in(key, 0))
         window = with_measurement(jnp, self.layout, empty_window(jnp, self.layout), measured)
@@ -172,7 +180,9 @@ class Env(eqx.Module):
         plant, k = self.plant.changed(**state.constants._asdict()), state.k + 1
         action = jnp.where(jnp.isfinite(action), jnp.clip(action, -1, 1), 0.0)
         input = scaled_action(jnp, self.layout, action.astype(float))
+        noise_key = jax.random.fold_in(jax.random.fold_in(state.key, k), 1)
         after = step(plant, state.plant_state, input, state.params)
+        after = disturbed(plant, after, noise_key)
         is_finite = jnp.all(jnp.isfinite(after)) & self._is_visible(after, state.params)
         is_finite = is_finite & state.is_finite
         after = jnp.where(is_finite, after, state.plant_state)

@@ -190,6 +190,11 @@ def identify(
         raise ValueError("validate_columns need a held-out record (--validate)")
     plant = plant_from(plant_named_by(given[0]) if plant is None else plant)
     estimator, begin = _chosen(estimator, plant, start, hold)
+    if plant.definition.is_disturbed and not isinstance(estimator, PEM):
+        raise ValueError(
+            f"plant {plant.definition.name!r} has process noise, which {estimator.name} takes for "
+            "noise of its sensors: use the estimator pem"
+        )
     estimator = _with_likelihood(estimator, likelihood)
     if prior is not None:
         if not isinstance(estimator, NLS):

@@ -25,20 +25,19 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import ndtr
 from jaxtyping import Array, Float, Key, PRNGKeyArray
 
 from ..description import LARGEST_SEED, Spread, SpreadLike, names_of, require_whole
 from ..excitation import AbstractExcitation
 from ..excitation.catalogue import ExcitationLike
 from ..information import require_noise
-from ..plant import AbstractPlant, Params
 from ..plant.catalogue import PlantLike
 from ..progress import SHOWN, Progress
 from ..report.tables import html_table, text_table
-from ..simulation import Experiment, response, run_episode
+from ..safety import safe_input
+from ..simulation import Experiment, predicted, require_likelihood, run_episode
 from .evidence import Fit, nearest
-from .prior import Prior
+from .prior import PriorPlants
 from .prior_knowledge import PriorLike, with_prior
 
 _STEPS, _STARTS = 30, 8  # of the search for the most probable parameters
@@ -49,35 +48,6 @@ _NEAR_CAP = 1.0  # nats below the largest value of a lower bound, at which it sa
 _FEW = 10.0  # effective samples
 
 
-class PriorPlants(eqx.Module):
-    """Parameters as functions of independent standard normal coordinates z.
-
-    Attributes:
-        plant: has the parameters.
-        normal: distribution of some parameters, or of their logarithms; None for none.
-        spread: of the others, which are uniform in their box.
-    """
-
-    plant: AbstractPlant
-    normal: Prior | None
-    spread: Spread = eqx.field(static=True)
-
-    def params(self, z: Float[Array, " param"]) -> Params:
-        """The parameters at some coordinates, in their units."""
-        d, values = self.plant.definition, {}
-        names = () if self.normal is None else self.normal.names
-        if self.normal is not None:
-            index = np.array([names_of(d.parameters).index(name) for name in names])
-            drawn = self.normal.mean + jnp.linalg.solve(self.normal.root, z[index])
-            parts = zip(names, self.normal.logarithmic, drawn, strict=True)
-            values = {n: jnp.exp(v) if is_log else v for n, is_log, v in parts}
-        for i, parameter in enumerate(d.parameters):
-            if parameter.name not in values:
-                unit, nominal = 2 * ndtr(z[i]) - 1, self.plant.nominal[i]
-                values[parameter.name] = self.spread.value(parameter, nominal, unit)
-        return self.plant.Params(**values)
-
-
 class Gains(eqx.Module):
     """The gain of each of some records.
 
@@ -86,12 +56,16 @@ class Gains(eqx.Module):
             prior; an estimate, no bound.
         lower, upper: differences whose means bound the expected gain.
         effective: number of effective samples of the evidence.
+        changes: sum of the squared changes of the input, the first from rest [input unit²].
+        controls: functions of the true parameters whose mean is zero.
     """
 
     laplace: Float[Array, "*record"]
     lower: Float[Array, "*record"]
     upper: Float[Array, "*record"]
     effective: Float[Array, "*record"]
+    changes: Float[Array, "*record"]
+    controls: Float[Array, "*record control"]
 
 
 @eqx.filter_jit
@@ -113,7 +87,7 @@ def gains(
         num_samples: of the evidence of each record.
         from_prior: whether these are drawn from the prior, not near the posterior.
     """
-    plant, sd = prior.plant, prior.plant.sensor.sd
+    plant = prior.plant
     count = len(plant.nominal)
     unknown = Fit(jnp.zeros(count), jnp.eye(count), jnp.zeros(()), jnp.zeros(()))
 
@@ -123,7 +97,7 @@ def gains(
         run = run_episode(plant, prior.params(true), excitation, num_steps, run_key)
 
         def residual(z: Array) -> Array:
-            outputs = response(plant, prior.params(z), run.inputs)
+            outputs, sd = predicted(plant, prior.params(z), run.inputs, run.measured)
             return ((run.measured - outputs) / sd[None]).ravel()
 
         def log_likelihood(z: Array) -> Array:
@@ -175,22 +149,41 @@ def gains(
         with_own = jnp.logaddexp(total, log_weight(true))
         lower = own - (with_own - math.log(number + 1))
         upper = own - (total - math.log(number))
-        return Gains(laplace, lower, upper, jnp.exp(2 * total - squares))
+        rest = jnp.asarray(safe_input(plant.definition))
+        steps = jnp.diff(jnp.concatenate([rest[None], run.inputs]), axis=0)
+        controls = jnp.concatenate([true, true**2 - 1])
+        effective = jnp.exp(2 * total - squares)
+        return Gains(laplace, lower, upper, effective, jnp.sum(steps**2), controls)
 
     return jax.lax.map(of, keys, batch_size=_CHUNK)
 
 
 @dataclass(frozen=True)
 class Mean:
-    """A mean and its standard error [nats]."""
+    """A mean and its standard error."""
 
     value: float
     std_error: float
 
     @classmethod
-    def of(cls, values: Float[np.ndarray, " record"]) -> Mean:
-        """Of some independent values."""
-        return cls(float(np.mean(values)), float(np.std(values, ddof=1) / math.sqrt(len(values))))
+    def of(
+        cls, values: Float[np.ndarray, " record"], controls: Float[np.ndarray, "record control"]
+    ) -> Mean:
+        """Of some independent values.
+
+        Args:
+            controls: of mean zero; what of the values is linear in them is no error (control
+                variates; R. Rubinstein, D. Kroese, Simulation and the Monte Carlo Method, 2017,
+                section 5.2). Few values go without.
+        """
+        count, width = controls.shape
+        X = np.ones((count, 1))
+        if count > 10 * width:
+            X = np.column_stack([X, controls])
+        found, *_ = np.linalg.lstsq(X, values)
+        rest = values - X @ found
+        variance = rest @ rest / max(count - X.shape[1], 1)
+        return cls(float(found[0]), math.sqrt(variance * np.linalg.inv(X.T @ X)[0, 0]))
 
     def __str__(self) -> str:
         return f"{self.value:.3f} ± {self.std_error:.3f}"
@@ -205,7 +198,9 @@ class InformationGain:
         num_steps: of the experiment.
         prior: of the parameters, in words.
         lower, upper: bounds on the expected gain, each with its standard error [nats].
-        laplace: the same by normal approximations of the posteriors: an estimate, no bound.
+        laplace: the same by normal approximations of the posteriors: an estimate, no bound; exact
+            where the records are linear in the parameters and their prior is normal.
+        changes: mean sum of the squared changes of the input, the first from rest [input unit²].
         num_plants, num_samples: plants with a record each, and samples of each evidence.
         from_prior: whether the samples were drawn from the prior.
         few: records whose evidence has fewer than 10 effective samples.
@@ -219,6 +214,7 @@ class InformationGain:
     lower: Mean
     upper: Mean
     laplace: Mean
+    changes: Mean
     num_plants: int
     num_samples: int
     from_prior: bool
@@ -233,6 +229,7 @@ class InformationGain:
         about = f"{self.num_samples} samples, {kind}"
         given = {f"lower bound, {about}": self.lower, f"upper bound, {about}": self.upper,
                  "by normal approximations": self.laplace}  # fmt: skip
+        given["squared changes of the input, summed"] = self.changes
         return [[n, f"{m.value:.3f}", f"{m.std_error:.3f}"] for n, m in given.items()]
 
     @property
@@ -257,6 +254,7 @@ class InformationGain:
         return {
             **{name: getattr(self, name) for name in ("plant", "excitation", "num_steps", "prior")},
             **{name: {"nats": m.value, "std_error": m.std_error} for name, m in means.items()},
+            "input_changes": {"value": self.changes.value, "std_error": self.changes.std_error},
             **{name: getattr(self, name) for name in ("num_plants", "num_samples", "from_prior")},
             "few_effective_samples": self.few,
             "warnings": list(self.warnings),
@@ -300,9 +298,12 @@ def information_gain(
         seed: of plants, noise and samples.
         progress: called with a text, how much is done, and the total.
 
+    A plant with process noise is judged where its state is observed: its records then have the
+    likelihood of their transitions.
+
     Raises:
-        ValueError: as `simulate`, for a sensor without noise, and for a uniform prior: give its
-            range as the spread.
+        ValueError: as `simulate`, for a sensor without noise, for process noise of a state that is
+            not observed, and for a uniform prior: give its range as the spread.
         TypeError: for an argument of another type.
     """
     require_whole("plants", plants, 2, 1_000_000)
@@ -312,7 +313,8 @@ def information_gain(
         plant, excitation, options=options, steps=steps, noise=noise, resolution=resolution,
         seed=seed,
     )  # fmt: skip
-    require_noise(e.plant)
+    if not require_likelihood(e.plant):
+        require_noise(e.plant)
     reach, normal, words = Spread.of(spread), None, str(Spread.of(spread))
     if prior is not None:
         bounded, normal, _ = with_prior(e.plant, prior, e.plant.nominal, {}, {})
@@ -331,7 +333,9 @@ def information_gain(
     progress("done", plants, plants)
     found = jax.tree.map(lambda *rows: np.concatenate([np.asarray(r) for r in rows]), *parts)
     number = -(-samples // min(samples, _BLOCK)) * min(samples, _BLOCK)
-    lower, upper, laplace = (Mean.of(v) for v in (found.lower, found.upper, found.laplace))
+    lower, upper, laplace, changes = (
+        Mean.of(v, found.controls) for v in (found.lower, found.upper, found.laplace, found.changes)
+    )
     few = int(np.sum(found.effective < _FEW))
     warnings = list(e.warnings)
     if from_prior and lower.value > math.log(number + 1) - _NEAR_CAP:
@@ -351,6 +355,7 @@ def information_gain(
         lower=lower,
         upper=upper,
         laplace=laplace,
+        changes=changes,
         num_plants=plants,
         num_samples=number,
         from_prior=from_prior,

@@ -16,9 +16,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jax.scipy.special import ndtr
+from jaxtyping import Array, Float, PRNGKeyArray
 
-from ..description import RARE, Parameter
+from ..description import RARE, Parameter, Spread, names_of, prior_sd_of
+from ..information import relative_size
 from ..plant import AbstractPlant, Params
 from .diagnosis import chi2_tail
 
@@ -168,6 +170,54 @@ class Prior(eqx.Module):
                     f"the estimate of {name} is that of its prior; the data hardly change it"
                 )
         return tuple(told)
+
+
+class PriorPlants(eqx.Module):
+    """Parameters as functions of independent standard normal coordinates z.
+
+    Attributes:
+        plant: has the parameters.
+        normal: distribution of some parameters, or of their logarithms; None for none.
+        spread: of the others, which are uniform in their box.
+    """
+
+    plant: AbstractPlant
+    normal: Prior | None
+    spread: Spread = eqx.field(static=True)
+
+    def draw(self, key: PRNGKeyArray) -> Params:
+        """The parameters of a plant drawn from the prior."""
+        return self.params(jax.random.normal(key, (len(self.plant.nominal),), float))
+
+    def changes(self, params: Params) -> Float[Array, "param param"]:
+        """Changes of the parameters, by row, by a standard deviation of each coordinate.
+
+        That of a uniform distribution is a third of its width over the root of three, everywhere.
+        """
+        names = names_of(self.plant.definition.parameters)
+        spread = jnp.eye(len(names)) * prior_sd_of(self.spread)
+        changes = spread * relative_size(self.plant, params)[:, None]
+        if (normal := self.normal) is not None:
+            index = np.array([names.index(name) for name in normal.names])
+            size = jnp.where(np.array(normal.logarithmic), jnp.stack(params)[index], 1.0)
+            inverse = jnp.linalg.inv(normal.root) * size[:, None]
+            changes = changes.at[np.ix_(index, index)].set(inverse)
+        return changes
+
+    def params(self, z: Float[Array, " param"]) -> Params:
+        """The parameters at some coordinates, in their units."""
+        d, values = self.plant.definition, {}
+        names = () if self.normal is None else self.normal.names
+        if self.normal is not None:
+            index = np.array([names_of(d.parameters).index(name) for name in names])
+            drawn = self.normal.mean + jnp.linalg.solve(self.normal.root, z[index])
+            parts = zip(names, self.normal.logarithmic, drawn, strict=True)
+            values = {n: jnp.exp(v) if is_log else v for n, is_log, v in parts}
+        for i, parameter in enumerate(d.parameters):
+            if parameter.name not in values:
+                unit, nominal = 2 * ndtr(z[i]) - 1, self.plant.nominal[i]
+                values[parameter.name] = self.spread.value(parameter, nominal, unit)
+        return self.plant.Params(**values)
 
 
 def bounded(

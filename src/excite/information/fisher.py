@@ -38,6 +38,12 @@ Information = Float[Array, "param param"]
 
 def require_noise(plant: AbstractPlant) -> None:
     """Raises ValueError for a sensor without noise, which has no Cramér-Rao bound."""
+    if plant.definition.is_disturbed:
+        raise ValueError(
+            f"plant {plant.definition.name!r} has process noise, so that its information differs "
+            "from record to record: see what is expected of it with excite gain "
+            "(ex.information_gain)"
+        )
     if not np.all(np.asarray(plant.sensor.sd) > 0):
         raise ValueError("a sensor without noise has no Cramér-Rao bound; give it a noise_sd")
 

@@ -115,7 +115,7 @@ class AbstractPlant(_Module):
         sensor: noise and resolution of the outputs.
         initial_state: state at which an experiment starts.
         dt: sampling time [s].
-        substeps: Runge-Kutta steps in one `dt`.
+        substeps: of the integration, in one `dt`.
     """
 
     definition: ClassVar[PlantDescription]
@@ -241,6 +241,12 @@ class AbstractPlant(_Module):
             band=(min(d.band[0], 0.25 / dt), min(d.band[1], 0.5 / dt)),
             substeps=self.substeps,
         )
+
+    @property
+    def process_noise_sd(self) -> Float[Array, " state"]:
+        """Standard deviation of what disturbances add to the state in one `dt`."""
+        declared = jnp.asarray([s.noise_sd for s in self.definition.states])
+        return declared * jnp.sqrt(self.dt / self.definition.dt)
 
     @property
     def input_limits(self) -> tuple[Float[Array, " input"], Float[Array, " input"]]:

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 from jaxtyping import PyTree
 from pydantic import Field
 
-from ..description import SpreadLike, names_of, unknown
+from ..description import SpreadLike, names_of, prior_sd_of, unknown
 from ..environment import (
     MAX_SENSITIVITY,
     AbstractObjective,
@@ -20,7 +20,6 @@ from ..environment import (
     InformationGain,
     OutputError,
     WeightedSum,
-    prior_sd_of,
     target_mask,
 )
 from ..estimation import ARX, NLS
@@ -297,7 +296,8 @@ class Agent:
             "training": {
                 name: value
                 for name, value in dataclasses.asdict(self.training).items()
-                if is_uncertain or name not in AGAINST_UNCERTAINTY
+                if (is_uncertain or name not in AGAINST_UNCERTAINTY)
+                and (name, value) != ("starts", 1)
             },
             **({"uncertainty": dict(self.ranges(ranges))} if is_uncertain else {}),
         }

@@ -32,16 +32,17 @@ from ..description import (
     SpreadLike,
     names_of,
     path_from,
+    prior_sd_of,
     require_whole,
     wrong_type,
 )
-from ..environment import prior_sd_of, run_episodes
+from ..environment import run_episodes
 from ..estimation import Status
 from ..estimation.diagnosis import chi2_tail
 from ..estimation.identify import RecordLike, identify
 from ..estimation.result import Identification
 from ..excitation import PolicyExcitation, Replay
-from ..information import running_information
+from ..information import require_noise, running_information
 from ..plant import AbstractPlant, Params
 from ..plant.catalogue import PlantLike, plant_from
 from ..policy import Policy, mismatch, read_policy
@@ -224,6 +225,7 @@ class Campaign:
             TypeError: for an argument of another type.
         """
         self.declared = self.plant = plant_from(plant)
+        require_noise(self.plant)
         description = self.plant.description
         self.targets = targets_from(self.plant, target)
         require_whole("rounds", rounds, 1, 1000)

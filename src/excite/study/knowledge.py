@@ -10,8 +10,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ..description import Spread, SpreadLike, names_of, wrong_type
-from ..environment import prior_sd_of
+from ..description import Spread, SpreadLike, names_of, prior_sd_of, wrong_type
 from ..estimation.identify import RecordLike, identify, plant_named_by, require_shipped
 from ..estimation.prior import Prior
 from ..estimation.prior_knowledge import PriorLike, prior_of_run, run_with_estimate, with_prior

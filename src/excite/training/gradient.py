@@ -350,7 +350,7 @@ def started(
     pairs = jax.vmap(jax.random.split)(jnp.stack([jax.random.key(seed) for seed in seeds]))
 
     def start(key: PRNGKeyArray) -> Optimisation:
-        network = Network(_first_weights(env, settings, key), env.layout)
+        network = Network(_first_policy(env, settings, key), env.layout)
         return Optimisation.start(network, settings, env)
 
     def keys(i: int) -> Key[Array, "seed plant"]:
@@ -430,6 +430,59 @@ def _first_weights(env: Env, settings: GradientSettings, key: PRNGKeyArray) -> W
         (gain * glorot(own, (after, before), jnp.float32), jnp.zeros(after, jnp.float32))
         for own, gain, before, after in zip(keys, gains, widths[:-1], widths[1:], strict=True)
     )
+
+
+def _first_policy(env: Env, settings: GradientSettings, key: PRNGKeyArray) -> Weights:
+    """The best of several first policies, on the same plants; of one, that.
+
+    A gradient does not leave a policy that plays the limit of its input all the time, and far from
+    a good one it does not find it: feedbacks that excite are found by chance.
+    """
+    if settings.starts == 1:
+        return _first_weights(env, settings, key)
+    keys = jax.random.split(key, settings.starts)
+    tried = jax.vmap(lambda own: _linear_start(env, settings, own))(keys)
+    plants = jax.random.split(jax.random.fold_in(key, 1), _PLANTS_OF_A_START)
+
+    def worth(weights: Weights) -> Float[Array, ""]:
+        found = env.objective.of_batch(
+            experiments(env, Network(weights, env.layout), plants, settings.margin).outcome
+        )
+        return jnp.where(jnp.isfinite(found), found, -jnp.inf)
+
+    best = jnp.argmax(jax.lax.map(worth, tried, batch_size=8))
+    return jax.tree.map(lambda x: x[best], tried)
+
+
+_PLANTS_OF_A_START = 32
+_GAINS = 0.3, 30.0  # of linear feedbacks, in scales of outputs and inputs
+_SMALL = 0.05  # at which the hyperbolic tangent is linear
+
+
+def _linear_start(env: Env, settings: GradientSettings, key: PRNGKeyArray) -> Weights:
+    """First weights to which a random linear feedback is added, by one neuron for each input.
+
+    Its hyperbolic tangent bounds it, so that it has a gradient wherever the input is.
+    """
+    weights_key, gain_key, direction_key = jax.random.split(key, 3)
+    weights = list(_first_weights(env, settings, weights_key))
+    layout, width = env.layout, len(env.layout.output_scale)
+    count = len(layout.input_half)
+    outputs = (layout.window - 1) * width + np.arange(width)
+    inputs = layout.window * width + (layout.window - 1) * count + np.arange(count)
+    newest, own = np.concatenate([outputs, inputs]), np.arange(count)
+    low, high = np.log(_GAINS)
+    gain = jnp.exp(jax.random.uniform(gain_key, (count, 1), jnp.float32, low, high))
+    direction = jax.random.normal(direction_key, (count, len(newest)), jnp.float32)
+    rows = _SMALL * gain * direction / math.sqrt(len(newest))
+    last = len(weights) - 2
+    for i, (matrix, bias) in enumerate(weights[:-1]):
+        carried = jnp.zeros((count, matrix.shape[1]), jnp.float32)
+        carried = carried.at[:, newest].set(rows) if i == 0 else carried.at[own, own].set(1.0)
+        weights[i] = matrix.at[own].set(carried / _SMALL if i == last else carried), bias
+    matrix, bias = weights[-1]
+    weights[-1] = matrix.at[:, own].set(jnp.eye(count, dtype=jnp.float32)), bias
+    return tuple(weights)
 
 
 def _require_finite(now: Optimisation, settings: GradientSettings, num_updates: int) -> None:

@@ -56,6 +56,8 @@ class GradientSettings(_Checked):
         max_grad_norm: a longer gradient is scaled down to this norm.
         hidden: widths of the hidden layers, tanh.
         last_gain: scale of the last layer's initial weights; with large ones training diverges.
+        starts: first policies that are compared, of which the best is trained: with more than one
+            they begin as random linear feedbacks of the newest measurement and the last input.
         margin: the penalty begins at this fraction of a critical level.
         penalty_weight: of the penalty, at the beginning and at least.
         near: fraction of a critical level that counts as too near to it.
@@ -80,6 +82,7 @@ class GradientSettings(_Checked):
     max_grad_norm: Positive = 1.0
     hidden: Widths = (64, 64)
     last_gain: Positive = 0.02
+    starts: Count = 1
     margin: Fraction = 0.95
     penalty_weight: Positive = 30.0
     near: Fraction = 0.97

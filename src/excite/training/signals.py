@@ -20,8 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, PRNGKeyArray
 
-from ..description import SpreadLike
-from ..environment import Env, EnvState, InformationGain, prior_sd_of
+from ..description import SpreadLike, prior_sd_of
+from ..environment import Env, EnvState, InformationGain
 from ..environment.falsification import Cases, OnPlant
 from ..excitation import Multisine, Replay
 from ..plant import AbstractPlant
