@@ -35,11 +35,10 @@ def line_of(row):
     about = ""
     if row["method"] == "gradient":
         about = f", price {row['price']:g}, seed {row['seed']}"
-    found = row["lower"]
-    return (
-        f"| {row['task']} | {row['method']}{about} | {found['nats']:.2f} ± {found['std_error']:.2f} "
-        f"| {row['input_changes']['value']:.1f} | {row['gain_less_changes']:.2f} |"
-    )
+    gain, error = row["lower"]["nats"], row["lower"]["std_error"]
+    changes, less = row["input_changes"]["value"], row["gain_less_changes"]
+    method = f"{row['method']}{about}"
+    return f"| {row['task']} | {method} | {gain:.2f} ± {error:.2f} | {changes:.1f} | {less:.2f} |"
 
 
 def test_every_row_is_on_the_page_and_its_bounds_are_tight():
