@@ -253,7 +253,7 @@ REFUSALS = {
         "--fast is an option of a simulated rig",
     ),
     "own rig without class": ((*SIGNAL, *FAST, "--rig", "own.py:Quick"), "no rig class 'Quick'"),
-    "own rig that is none": ((*SIGNAL, *FAST, "--rig", "own.py:Other"), "no rig class 'Other'"),
+    "own rig that is none": ((*SIGNAL, *FAST, "--rig", "own.py:Other"), "Other in own.py is no"),
     "own rig half made": ((*SIGNAL, *FAST, "--rig", "own.py:Half"), "not a complete rig"),
 }  # fmt: skip
 
