@@ -1,7 +1,6 @@
 """Plants with process noise whose state is observed: simulation, likelihood, gain, training."""
 
 import math
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from excite.description import Input, Output, Parameter, PlantDescription, Sprea
 from excite.environment import Env, InformationGain
 from excite.estimation.prior import Prior, PriorPlants
 from excite.excitation import PRBS, PolicyExcitation
+from excite.files import module_at
 from excite.plant import AbstractPlant, Aero2
 from excite.plant.catalogue import plant_named
 from excite.policy import Layout
@@ -260,11 +260,7 @@ FORCES: Any = {
 
 
 def test_a_published_policy_is_read_and_played(tmp_path):
-    sys.path.insert(0, str(EXAMPLES))
-    try:
-        from smc_policies import RecurrentPolicy  # type: ignore[import-not-found]
-    finally:
-        sys.path.remove(str(EXAMPLES))
+    RecurrentPolicy = module_at(EXAMPLES / "smc_policies.py").RecurrentPolicy
     rng, sizes = np.random.default_rng(0), {"enc1": (2, 8), "enc2": (8, 8), "enc3": (8, 3)}
     sizes |= {"mean1": (3, 8), "mean2": (8, 8), "mean3": (8, 1)}
     weights = {}

@@ -9,7 +9,6 @@ already are not computed again.
 
 import argparse
 import json
-import sys
 import time
 from functools import partial
 from pathlib import Path
@@ -22,6 +21,7 @@ from excite.environment import Env, InformationGain
 from excite.estimation.prior import PriorPlants
 from excite.estimation.prior_knowledge import with_prior
 from excite.excitation import Random
+from excite.files import module_at
 from excite.plant.catalogue import plant_named
 from excite.policy import Layout, Policy
 from excite.training.gradient import train
@@ -29,7 +29,6 @@ from excite.training.settings import GradientSettings
 
 HERE = Path(__file__).parent
 EXAMPLES = HERE.parent.parent / "examples"
-sys.path.insert(0, str(EXAMPLES))
 STEPS = 50
 EVALUATED = {"plants": 2048, "samples": 400, "seed": 1}
 
@@ -120,9 +119,8 @@ def main():
 
         keep(("random", None, None), partial(row, task, "random", Random(hold=1)))
         if asked.published is not None:
-            from smc_policies import RecurrentPolicy
-
-            kept = RecurrentPolicy.read(asked.published / TASKS[task][3])
+            own = module_at(EXAMPLES / "smc_policies.py")
+            kept = own.RecurrentPolicy.read(asked.published / TASKS[task][3])
             keep(("published", None, None), partial(row, task, "published", kept))
         for seed in range(asked.seeds):
             for price in (0.0, *TASKS[task][2]):
