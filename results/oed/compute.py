@@ -3,8 +3,8 @@
     python results/oed/compute.py [--seeds 3] [--published FOLDER] [TASK ...]
 
 Trains one policy for each task, price of the squared input changes and seed, and evaluates it, the
-published policies (archives in FOLDER) and signals on other plants. Rows that are in `table.json`
-already are not computed again.
+published policies (archives in FOLDER) and random inputs on other plants. Rows that are in a task's
+table already are not computed again.
 """
 
 import argparse
@@ -12,8 +12,6 @@ import json
 import time
 from functools import partial
 from pathlib import Path
-
-import jax.numpy as jnp
 
 import excite as ex
 from excite.description import Spread
@@ -63,10 +61,24 @@ SETTINGS = GradientSettings(
 )  # fmt: skip
 
 
+def word_of(task):
+    """The name of a task's plant."""
+    return f"{EXAMPLES / 'smc_pendulums.py'}:{TASKS[task][0]}"
+
+
+def path_of(task, rest):
+    """A file of a task."""
+    return HERE / f"{task.replace(' ', '_')}{rest}"
+
+
+def policy_path(task, price, seed):
+    """The file of a trained policy."""
+    return path_of(task, f"-{price:g}-{seed}.safetensors")
+
+
 def env_of(task, price):
     """The decision process whose total reward is the gain in nats less the price of changes."""
-    name, given, *_ = TASKS[task]
-    plant = plant_named(f"{EXAMPLES / 'smc_pendulums.py'}:{name}")
+    plant, given = plant_named(word_of(task)), TASKS[task][1]
     _, normal, _ = with_prior(plant, given, plant.nominal, {}, {})
     prior, count = PriorPlants(plant, normal, Spread.of(0.0)), len(plant.nominal)
     objective = InformationGain(
@@ -78,9 +90,8 @@ def env_of(task, price):
 
 def row(task, method, excitation, **about):
     """What an excitation is expected to tell, on plants that no training has seen."""
-    name, prior, (price, _), _ = TASKS[task]
-    plant = f"{EXAMPLES / 'smc_pendulums.py'}:{name}"
-    found = ex.information_gain(plant, excitation, steps=STEPS, prior=prior, **EVALUATED)
+    _, prior, (price, _), _ = TASKS[task]
+    found = ex.information_gain(word_of(task), excitation, steps=STEPS, prior=prior, **EVALUATED)
     content = {"task": task, "method": method, **about, **found.to_dict()}
     content["gain_less_changes"] = found.lower.value - price * found.changes.value
     return {k: v for k, v in content.items() if k not in ("plant", "excitation")}
@@ -92,11 +103,10 @@ def trained_row(task, price, seed):
     trained = train(env, SETTINGS, seed)
     seconds = time.process_time() - start
     policy = Policy(
-        env.plant.description, env.layout,
-        tuple((jnp.asarray(W), jnp.asarray(b)) for W, b in trained.weights),
+        env.plant.description, env.layout, trained.weights,
         {"excite": ex.__version__, "task": task, "change_price": price, "seed": seed},
     )  # fmt: skip
-    policy.save(HERE / f"{task.replace(' ', '_')}-{price:g}-{seed}.safetensors", overwrite=True)
+    policy.save(policy_path(task, price, seed), overwrite=True)
     return row(task, "gradient", policy, price=price, seed=seed, train_cpu_seconds=seconds)
 
 
@@ -108,7 +118,7 @@ def main():
     parser.add_argument("tasks", nargs="*", default=list(TASKS))
     asked = parser.parse_args()
     for task in asked.tasks:
-        path = HERE / f"{task.replace(' ', '_')}.json"
+        path = path_of(task, ".json")
         rows = json.loads(path.read_text())["rows"] if path.is_file() else []
         done = {(r["method"], r.get("price"), r.get("seed")) for r in rows}
 

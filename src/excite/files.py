@@ -248,7 +248,7 @@ def locked_folder(folder: Path, what: str) -> Iterator[None]:
 
 
 def is_class_word(name: str) -> bool:
-    """Whether a name is `path/to/file.py:ClassName`."""
+    """Whether a name is `path/to/file.py:ClassName`, or that of a function."""
     return name.rpartition(":")[0].endswith(".py")
 
 

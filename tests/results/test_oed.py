@@ -7,27 +7,14 @@ import pytest
 from experiments import ROOT
 
 import excite as ex
+from excite.files import module_at
 
 FOLDER = ROOT / "results" / "oed"
 PAGE = (ROOT / "docs" / "explanation" / "expected-information.md").read_text()
 ROWS = [
     row for path in sorted(FOLDER.glob("*.json")) for row in json.loads(path.read_text())["rows"]
 ]
-PLANTS = {
-    "linear pendulum": ("LinearPendulum", {"a": "normal:14.7:0.316228", "b": "normal:0:0.1",
-                                           "c": "normal:3:0.316228"}),
-    "nonlinear pendulum": ("NonlinearPendulum", {"m": "lognormal:1:0.1", "l": "lognormal:1:0.1"}),
-    "cart-pole": ("CartPole", dict.fromkeys(("l", "m_p", "m_c"), "lognormal:1:0.1")),
-    "double pendulum": (
-        "DoublePendulum", dict.fromkeys(("m_1", "m_2", "l_1", "l_2"), "lognormal:1:0.1"),
-    ),
-}  # fmt: skip
-
-
-def policy_of(row):
-    """The policy's file of a row."""
-    word = row["task"].replace(" ", "_")
-    return FOLDER / f"{word}-{row['price']:g}-{row['seed']}.safetensors"
+COMPUTED = module_at(FOLDER / "compute.py")
 
 
 def line_of(row):
@@ -47,22 +34,22 @@ def test_every_row_is_on_the_page_and_its_bounds_are_tight():
         assert 0 <= row["upper"]["nats"] - row["lower"]["nats"] < 0.01
         assert row["few_effective_samples"] == 0
     assert PAGE.count("| gradient, ") == sum(row["method"] == "gradient" for row in ROWS)
-    assert {row["task"] for row in ROWS} == PLANTS.keys()
+    assert {row["task"] for row in ROWS} == COMPUTED.TASKS.keys()
 
 
-@pytest.mark.parametrize("task", PLANTS)
+@pytest.mark.parametrize("task", COMPUTED.TASKS)
 def test_a_policy_tells_again_what_its_row_says(task):
     row = next(r for r in ROWS if (r["task"], r["method"]) == (task, "gradient"))
-    name, prior = PLANTS[task]
+    policy = COMPUTED.policy_path(task, row["price"], row["seed"])
+    prior = COMPUTED.TASKS[task][1]
     found = ex.information_gain(
-        f"{ROOT}/examples/smc_pendulums.py:{name}", policy_of(row), prior=prior, plants=192,
-        samples=100, seed=7,
-    )  # fmt: skip
+        COMPUTED.word_of(task), policy, prior=prior, plants=192, samples=100, seed=7
+    )
     error = math.hypot(found.laplace.std_error, row["laplace"]["std_error"])
     assert abs(found.laplace.value - row["laplace"]["nats"]) < 4.5 * error
 
 
-@pytest.mark.parametrize("task", PLANTS)
+@pytest.mark.parametrize("task", COMPUTED.TASKS)
 def test_trained_without_a_price_the_best_policy_tells_more_than_the_published_one(task):
     own = [r for r in ROWS if r["task"] == task]
     (published,) = (r for r in own if r["method"] == "published")

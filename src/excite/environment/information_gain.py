@@ -128,11 +128,8 @@ class InformationGain(AbstractObjective):
         return -jnp.log(jnp.trace(own) if self.criterion == "A" else jnp.linalg.eigvalsh(own)[-1])
 
     def _value(self, information: Float[Array, "param param"]) -> Float[Array, ""]:
-        chosen = np.flatnonzero(self.targets)
         if self.criterion == "D":
             others = np.flatnonzero(~np.array(self.targets))
             nuisance = information[np.ix_(others, others)]
             return jnp.linalg.slogdet(information)[1] - jnp.linalg.slogdet(nuisance)[1]
-        bound = jnp.linalg.inv(information)[np.ix_(chosen, chosen)]
-        size = jnp.trace(bound) if self.criterion == "A" else jnp.linalg.eigvalsh(bound)[-1]
-        return -jnp.log(size)
+        return self._of_covariance(jnp.linalg.inv(information))

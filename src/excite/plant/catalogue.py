@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..description import Listing, as_number, first_line, names_of, told, unknown, wrong_type
-from ..files import class_at, damaged, read_json
+from ..files import class_at, damaged, is_class_word, read_json
 from .aero2 import Aero2, Aero2Detailed, Aero2Lag
 from .cart_pole import CartPole
 from .contract import (
@@ -97,9 +97,9 @@ def plant_named(name: str) -> AbstractPlant:
         return extended(plant_named(f"{path}{colon}{plain}"), extensions)
     if name in PLANTS:
         return PLANTS[name]()
-    if not path.endswith(".py") and Path(path or name).is_file():
-        raise ValueError(f"{path or name} is no file of a plant: the name of one ends in .py")
-    if not colon or not path.endswith(".py"):
+    if not is_class_word(name):
+        if Path(path or name).is_file():
+            raise ValueError(f"{path or name} is no file of a plant: the name of one ends in .py")
         known = [*PLANTS, "path/to/file.py:ClassName", f"path/to/plant{PLANT_ENDING}"]
         raise unknown("plant", name, known)
     plant_class = class_at(Path(path), class_name, AbstractPlant, "plant")

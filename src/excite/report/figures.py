@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import matplotlib.axes
 import matplotlib.figure
@@ -84,9 +85,9 @@ def _draw_intervals(axis: matplotlib.axes.Axes, params: Mapping[str, EstimatedPa
 def knowledge_figure(
     title: str,
     samples: Int[np.ndarray, " sample"],
-    shares: Mapping[str, Float[np.ndarray, " sample"]],
-    ends: Sequence[int],
-    decided: Mapping[str, Sequence[float]],
+    halves: Mapping[str, Float[np.ndarray, " sample"]],
+    rounds: Sequence[Mapping[str, Any]],
+    allowed: Mapping[str, float],
 ) -> matplotlib.figure.Figure:
     """Half of the 95 % intervals over those asked for, after every sample of a campaign.
 
@@ -95,16 +96,20 @@ def knowledge_figure(
     Args:
         title: of the figure.
         samples: counted from the first of the campaign.
-        shares: by parameter; its target is reached at one.
-        ends: of the rounds, in samples.
-        decided: by parameter, the share by which each round was judged.
+        halves: of the intervals by the bound, by quantity.
+        rounds: as JSON-ready data.
+        allowed: half of the interval that each target allows.
     """
     figure, axes = new_figure(1)
     axis = axes[0, 0]
-    for i, (name, share) in enumerate(shares.items()):
-        shown = np.where(np.isfinite(share), share, np.nan)
+    ends = np.cumsum([r["num_samples"] for r in rounds])
+    for i, (name, most) in enumerate(allowed.items()):
+        judged = [r["known"].get(name, {}).get("ci95_half", np.nan) for r in rounds]
+        with np.errstate(divide="ignore", invalid="ignore"):  # nothing is a share of nothing
+            bound, found = np.divide(halves[name], most), np.divide(judged, most)
+        shown = np.where(np.isfinite(bound), bound, np.nan)
         axis.plot(samples, shown, color=colour_of(i), lw=1.4, label=name)
-        axis.plot(ends, decided[name], "o", color=colour_of(i), ms=5)
+        axis.plot(ends, found, "o", color=colour_of(i), ms=5)
     axis.axhline(1, color="black", lw=0.8, ls="--", label="asked for")
     for end in ends[:-1]:
         axis.axvline(end, color=GREY, lw=0.8, ls=":")

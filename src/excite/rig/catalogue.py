@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..description import PlantDescription, SpreadLike, names_of, unknown
-from ..files import class_at
+from ..files import class_at, is_class_word
 from .contract import AbstractRig
 from .fmu import FMURig
 from .quanser import QuanserAero2
@@ -149,14 +149,14 @@ def rig_named(
             does not have.
     """
     is_fmu, is_plant = name.endswith(".fmu"), HAS_JAX and name.endswith(PLANT_ENDING)
-    path, colon, class_name = name.rpartition(":")
+    path, _, class_name = name.rpartition(":")
     if name in RIGS:
         rig = RIGS[name](plant, description, options)
     elif is_plant:
         rig = _of_file(name, plant, options)
     elif is_fmu:
         rig = FMURig(Path(name), description, is_real_time=not options.fast)
-    elif colon and path.endswith(".py"):
+    elif is_class_word(name):
         rig = _users_rig(Path(path), class_name, description)
     else:
         raise unknown("rig", name, [*RIGS, "FILE.fmu", "FILE.json", "path/to/file.py:ClassName"])

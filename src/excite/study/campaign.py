@@ -176,7 +176,7 @@ class Campaign:
         records: of all rounds.
         rounds: what each of them brought.
         result: estimate from all records; None before the first.
-        reason: why the campaign ended; empty while it goes on.
+        reason: why the campaign ended; empty before its end.
         playing: what `ask` returned last, as `Round` names it; empty after the round.
         next: how the coming round was chosen, after the first estimate.
         interrupted: what interrupted `campaign`, such as a signal; empty if nothing did.
@@ -626,19 +626,9 @@ class Campaign:
         from ..report.figures import knowledge_figure
 
         samples, halves = self.knowledge()
-        known = self.known
-        names = list(known)
-        shares = {
-            t.name: t.share(known[t.name].estimate, halves[:, names.index(t.name)])
-            for t in self.targets
-        }
-        ends = np.cumsum([r.num_samples for r in self.rounds]).tolist()
-        allowed = self._allowed()
-        decided = {
-            n: [r.known[n].ci95_half / half if n in r.known else math.nan for r in self.rounds]
-            for n, half in allowed.items()
-        }
-        return knowledge_figure(self.title, samples, shares, ends, decided)
+        bounds = dict(zip(self.known, halves.T, strict=True))
+        rounds = [r.to_dict() for r in self.rounds]
+        return knowledge_figure(self.title, samples, bounds, rounds, self._allowed())
 
 
 @eqx.filter_jit

@@ -23,7 +23,7 @@ from ..description import HALF_95, PlantDescription, names_of, told, unknown
 from ..estimation.result import Identification
 from ..excitation.catalogue import excitation_named
 from ..excitation.contract import AbstractSignal
-from ..files import function_at
+from ..files import function_at, is_class_word
 from ..information import relative_size
 from ..plant import AbstractPlant, Params
 from ..rig.contract import Interval
@@ -114,8 +114,8 @@ def quantity_of(plant: AbstractPlant, given: QuantityLike) -> AbstractQuantity:
     d = plant.description
     if (found := _PREDICTION.fullmatch(given)) is not None:
         return _prediction(plant, given, **found.groupdict())
-    path, colon, word = given.rpartition(":")
-    if colon and path.endswith(".py"):
+    path, _, word = given.rpartition(":")
+    if is_class_word(given):
         return _function(plant, word, function_at(Path(path), word))
     if "@" in given or given.endswith((".py", ".py:")):
         raise ValueError(

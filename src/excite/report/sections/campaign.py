@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -100,15 +99,9 @@ class CampaignRun(Run):
         """The figure of what was known after each sample; nothing without an estimate."""
         if not self.knowledge:
             return ""
-        samples, allowed = self.knowledge["sample"], self.content["allowed"]
-        shares = {n: self.knowledge[n] / half for n, half in allowed.items()}
-        ends = np.cumsum([r["num_samples"] for r in self.content["rounds"]]).tolist()
-        decided = {
-            n: [r["known"].get(n, {}).get("ci95_half", math.nan) / half
-                for r in self.content["rounds"]]
-            for n, half in allowed.items()
-        }  # fmt: skip
-        drawn = knowledge_figure("", samples.astype(int), shares, ends, decided)
+        samples = self.knowledge["sample"].astype(int)
+        rounds, allowed = self.content["rounds"], self.content["allowed"]
+        drawn = knowledge_figure("", samples, self.knowledge, rounds, allowed)
         return figure(
             drawn,
             f"{name}-known",
