@@ -151,7 +151,7 @@ MISTAKES = {
     "ex.Campaign('aero2', {'D_p': True})": "target of D_p must be a number: got bool True",
     "ex.Campaign('aero2', {'D_p': '1%'}, spread='3')": "such as factor:3: got '3'",
     "ex.Campaign('aero2', {'D_p': '1%'}, rounds=2.5)": "rounds must be a whole number from 1",
-    "ex.Campaign('aero2', {'D_p': '1%'}).tell(3)": "record must be a record or a path: got int 3",
+    "ex.Campaign('aero2', {'D_p': '1%'}).tell(3)": "must be a path or a DataFrame: got int 3",
     "ex.campaign('aero2', {'D_p': '1%'}, 3, out='x')": "rig must be a name, a file, path",
     "ex.campaign('aero2', {'D_p': '1%'}, out=3)": "out must be a path: got int 3",
     "ex.campaign('aero2', {'D_p': '1%'}, out='x', pause='5')": "pause must be a number: got str",
@@ -179,14 +179,14 @@ MISTAKES = {
     "ex.simulate('aero2', noise={'pitch': [1]})": "noise of 'pitch' must be a number",
     "ex.simulate('aero2', options=3)": "options must be a dict by name: got int 3",
     "ex.information('aero2', initial_state='no')": "initial state 'no' is not one of",
-    "ex.identify(3)": "records must be a record or the path of an experiment file, or several",
+    "ex.identify(3)": "the path of an experiment file or a DataFrame, or several: got int 3",
     "ex.identify([3])": "records must be a record",
     "ex.identify([])": "no record is given",
     "ex.identify('missing.csv', 'aero2')": "missing.csv: no such file",
     "ex.identify('missing.csv')": "missing.csv: no such file",
     "ex.identify('.')": ".: is a folder; only files can be read, and ROS 2 bags",
     "ex.identify(record, 'emps')": "is of plant 'aero2' and has voltage, pitch; plant 'emps' has",
-    "ex.read_record(3)": "record must be a path: got int 3",
+    "ex.read_record(3)": "record must be a path or a DataFrame: got int 3",
     "ex.read_study({'a': 1})": "study must be a name or a path: got dict {'a': 1}",
     "ex.run_study(3)": "study must be a name or a path: got int 3",
     "ex.run(out=3)": "out must be a path: got int 3",
@@ -318,3 +318,14 @@ def test_a_mistake_is_one_sentence_and_what_can_be_meant_works():
         assert sentence in text, f"{line}: {text}"
         assert "\n" not in text, line
     assert {line: said[line] for line in WORKS} == dict.fromkeys(WORKS, "works")
+
+
+def test_a_data_frame_is_a_record(record, result):
+    frame = record.to_pandas()
+    again = ex.identify(frame, "aero2", initial_state="known")
+    assert again.params == result.params
+    with pytest.raises(ValueError, match="a DataFrame does not tell its plant: name the plant"):
+        ex.identify(frame)
+    known = ex.next_experiment  # takes what identify takes
+    with pytest.raises(ValueError, match="name the plant"):
+        known(frame, target={"D_p": "1%"})

@@ -39,6 +39,55 @@ def is_the_log(record: Record) -> bool:
     return True
 
 
+# DataFrames
+
+
+FRAMES: dict[str, pd.DataFrame] = {
+    "columns": pd.DataFrame({"time": TIME, "u": U, "y": Y}),
+    "index with a name": pd.DataFrame({"u": U, "y": Y}, pd.Index(TIME, name="time")),
+    "index of durations": pd.DataFrame({"u": U, "y": Y}, pd.to_timedelta(TIME, "s")),
+    "index of dates": pd.DataFrame(
+        {"y": Y, "u": U}, pd.Timestamp("2026-03-01", tz="Asia/Tokyo") + pd.to_timedelta(TIME, "s")
+    ),
+    "integers that may be missing": pd.DataFrame({"time": TIME, "u": U, "y": Y}).convert_dtypes(),
+}
+
+
+@pytest.mark.parametrize("kind", FRAMES)
+def test_a_data_frame_is_read_as_a_file(kind: str) -> None:
+    frame = FRAMES[kind]
+    before = frame.copy()
+    record = read_record(frame, plant())
+    np.testing.assert_allclose(record.time - record.time[0], TIME, atol=1e-6)
+    np.testing.assert_array_equal(record.inputs[:, 0], U)
+    np.testing.assert_array_equal(record.outputs[:, 0], Y)
+    pd.testing.assert_frame_equal(frame, before)
+
+
+def test_a_data_frame_takes_the_options_of_files() -> None:
+    frame = pd.DataFrame({"t": [0, 100, 200], "volts": U, "angle": Y})
+    read = read_record(
+        frame, plant(), {"time": "t", "u": "volts", "y": "angle"}, units={"time": "ms"}, rows="0:2"
+    )
+    np.testing.assert_allclose(read.time, [0, 0.1])
+
+
+@pytest.mark.parametrize(
+    ("frame", "message"),
+    [
+        (pd.DataFrame({"time": TIME, "u": U}), r"the DataFrame: no column 'y'"),
+        (pd.DataFrame(np.ones((3, 2)), columns=["u", "u"]), "has the column 'u' twice"),
+        (pd.DataFrame(np.ones((3, 1)), columns=[["a"], ["b"]]), "2 levels of column names"),
+        (pd.DataFrame({"time": TIME, "u": U, "y": ["a", "b", "c"]}), "'y' is 'a', not a number"),
+    ],
+)
+def test_a_data_frame_that_cannot_be_used_is_one_sentence(
+    frame: pd.DataFrame, message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        read_record(frame, plant())
+
+
 # Text
 
 

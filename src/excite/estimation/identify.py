@@ -29,6 +29,7 @@ from ..plant.catalogue import PLANTS, PlantLike, plant_from
 from ..plant.extension import plain_kind
 from ..progress import SHOWN, Progress
 from ..record import (
+    DataFrame,
     Record,
     described_in,
     read_record,
@@ -103,7 +104,7 @@ _FAR_FACTOR = 10.0  # between an estimate and what was expected of it; a larger 
 _BY_CHANCE = 1e-3  # a fit with a larger p-value explains nothing
 
 
-RecordLike: TypeAlias = Record | str | Path
+RecordLike: TypeAlias = Record | str | Path | DataFrame
 """A record, or the path of an experiment file."""
 
 
@@ -141,7 +142,7 @@ def identify(
         0.0125
 
     Args:
-        records: a record or the path of an experiment file, or several.
+        records: a record, the path of an experiment file or a pandas DataFrame, or several.
         plant: a name, `path/to/file.py:ClassName`, a plant or its class; its constants and
             sensor are taken as known, its dt is replaced by that of the records. Default the
             plant that the first record's sidecar names.
@@ -324,7 +325,7 @@ def identify(
 def records_in(records: RecordLike | Sequence[RecordLike], what: str) -> list[RecordLike]:
     """One or several records as a list."""
     listed = [records] if isinstance(records, RecordLike) else records
-    allowed = "a record or the path of an experiment file, or several"
+    allowed = "a record, the path of an experiment file or a DataFrame, or several"
     if not isinstance(listed, Sequence):
         raise wrong_type(what, records, allowed)
     for record in listed:
@@ -335,10 +336,11 @@ def records_in(records: RecordLike | Sequence[RecordLike], what: str) -> list[Re
 
 def plant_named_by(record: RecordLike) -> str:
     """The plant that a record's sidecar names."""
-    is_read = isinstance(record, Record)
-    where = (record.source if is_read else str(record)) or "the record"
-    name = (record.description if is_read else described_in(Path(record))).name
-    return require_shipped(name, where)
+    if isinstance(record, Record):
+        return require_shipped(record.description.name, record.source or "the record")
+    if isinstance(record, DataFrame):
+        raise ValueError("a DataFrame does not tell its plant: name the plant")
+    return require_shipped(described_in(Path(record)).name, str(record))
 
 
 def require_shipped(name: str, where: str) -> str:

@@ -21,3 +21,4 @@ from .record import Record as Record
 from .record import described_in as described_in
 from .record import require_record_path as require_record_path
 from .record import write_record as write_record
+from .table import DataFrame as DataFrame

@@ -14,6 +14,7 @@ import numpy as np
 from .bags import columns_of_bag, is_bag, read_bag
 from .damage import MAX_UNPACKED, damage_reported, require_size
 from .record import TEXT_ENDINGS, read_sidecar, require_matlab, require_readable
+from .table import column_of
 from .text import read_text
 
 _MAT_NUMBERS = re.compile(r"double|single|u?int(8|16|32|64)|logical")
@@ -190,13 +191,4 @@ def _read_parquet(path: Path) -> dict[str, np.ndarray]:
     require_size(path, size)
     if not names:
         raise _no_column(path, "column", [f"{name} ({kind})" for name, kind in kinds.items()])
-    return {str(name): _of_frame(column) for name, column in frame.items()}
-
-
-def _of_frame(column: Any) -> np.ndarray:
-    if column.dtype.kind in "fiub":
-        return column.to_numpy(float)
-    if column.dtype.kind == "M":
-        is_zoned = getattr(column.dtype, "tz", None) is not None
-        return (column.dt.tz_convert(None) if is_zoned else column).to_numpy()
-    return column.to_numpy(object)
+    return {str(name): column_of(column) for name, column in frame.items()}

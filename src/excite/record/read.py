@@ -43,17 +43,19 @@ from .prepare import (
     unit_hint,
 )
 from .record import Record, described_in, read_sidecar
+from .table import DataFrame, columns_of
 from .text import require_one_decimal_sign
 from .units import unit_factor
 
 SIGNAL_ENDINGS = (".csv", ".mat")
+_ALLOWED = "a path or a DataFrame"
 _SAMPLING_TIME = ("Ts", "dt")  # columns that may hold it in their first row
 _THOUSANDS = re.compile(r"[+-]?\d{1,3}([,.' \u2019\u00a0\u202f]\d{3})+([.,]\d+)?")
 _MOST_NAMES, _LONGEST_NAME = 30, 100  # of a file's columns in a message
 
 
 def read_record(
-    path: str | os.PathLike[str],
+    path: str | os.PathLike[str] | DataFrame,
     description: PlantDescription | None = None,
     columns: Mapping[str, str] | None = None,
     scales: Mapping[str, float] | None = None,
@@ -64,7 +66,7 @@ def read_record(
     rows: slice | str | None = None,
     inputs_only: bool = False,
 ) -> Record:
-    """The experiment in a file, checked against a plant.
+    """The experiment in a file or a DataFrame, checked against a plant.
 
         >>> import excite as ex, tempfile
         >>> with tempfile.TemporaryDirectory() as folder:
@@ -74,7 +76,8 @@ def read_record(
 
     Args:
         path: the file; its ending tells its kind: .csv, .txt, .dat, .tsv, .mat, .h5, .hdf5,
-            .parquet, .mcap, .db3; a ROS 2 bag may be a folder.
+            .parquet, .mcap, .db3; a ROS 2 bag may be a folder. Or a pandas DataFrame with the same
+            columns; an index with a name or of times is a column, too.
         description: the plant; default that of the sidecar.
         columns: names in the file where they are not the plant's: {"pitch": "qm"}. Columns of a
             file without names are "1", "2", ...
@@ -93,14 +96,18 @@ def read_record(
             truncated file, a missing column or input, an infinite value, times that do not
             increase, values far outside what the plant can do.
     """
-    path, chosen = path_from("record", path), _slice_of(rows)
-    description = described_in(path) if description is None else description
+    frame, chosen = path if isinstance(path, DataFrame) else None, _slice_of(rows)
+    path = path_from("record", path, _ALLOWED) if frame is None else Path("the DataFrame")
+    if description is None:
+        if frame is not None:
+            raise ValueError("a DataFrame does not tell its plant: name the plant")
+        description = described_in(path)
     if not isinstance(description, PlantDescription):
         raise wrong_type("description", description, "that of a plant (plant.description)")
     given = {"columns": columns, "scales": scales, "units": units, "set_inputs": set_inputs}
     options = _Options(description, **{n: by_name(n, v) for n, v in given.items()}, dt=dt)
     signals = (*description.inputs, *(() if inputs_only else description.outputs))
-    cells, dt = _cells(path, options, names_of(signals))
+    cells, dt = _cells(path, frame, options, names_of(signals))
     num_samples = _num_samples(path, cells)
     cells |= {name: np.full(num_samples, value) for name, value in options.set_inputs.items()}
     where = path if rows is None else Path(f"{path} (rows {_text_of(chosen)} of {num_samples})")
@@ -112,13 +119,14 @@ def read_record(
     if options.dt is None:
         _check_unit_of_time(time, options, where)
     values = [_values(cells[part.name][chosen], part, options, where) for part in signals]
-    num_inputs = len(description.inputs)
+    num_inputs, first = len(description.inputs), chosen.indices(num_samples)[0]
+    metadata = {} if frame is not None else _metadata(path, description, first)
     return Record(
         time=time,
         inputs=np.reshape(values[:num_inputs], (-1, len(time))).T,
         outputs=np.reshape(values[num_inputs:], (-1, len(time))).T,
-        metadata=_metadata(path, description, chosen.indices(num_samples)[0]),
-        source=str(path),
+        metadata=metadata,
+        source=str(path) if frame is None else "",
     )
 
 
@@ -215,7 +223,7 @@ def _text_of(rows: slice) -> str:
 
 
 def _cells(
-    path: Path, options: _Options, signals: Sequence[str]
+    path: Path, frame: DataFrame | None, options: _Options, signals: Sequence[str]
 ) -> tuple[dict[str, np.ndarray], float | None]:
     """The file's columns by the plant's names, with `time`; or without it the sampling time [s]."""
     needed = [name for name in ("time", *signals) if name not in options.set_inputs]
@@ -228,7 +236,7 @@ def _cells(
         raise ValueError(f"{path}: its messages have their times; --dt is for a file without time")
     inputs = names_of(options.description.inputs)
     held = [column for name, column in zip(needed, given, strict=True) if name in inputs]
-    table = columns_in(path, given, held)
+    table = columns_in(path, given, held) if frame is None else columns_of(frame)
     if in_file := [name for name in options.set_inputs if name in table]:
         raise ValueError(
             f"{path}: the file has a column {in_file[0]!r}; --set-input is for inputs that it does "

@@ -31,7 +31,6 @@ from ..description import (
     Spread,
     SpreadLike,
     names_of,
-    path_from,
     prior_sd_of,
     require_whole,
     wrong_type,
@@ -39,7 +38,7 @@ from ..description import (
 from ..environment import run_episodes
 from ..estimation import Status
 from ..estimation.diagnosis import chi2_tail
-from ..estimation.identify import RecordLike, identify
+from ..estimation.identify import RecordLike, identify, record_for
 from ..estimation.result import Identification
 from ..excitation import PolicyExcitation, Replay
 from ..information import require_noise, running_information
@@ -47,7 +46,7 @@ from ..plant import AbstractPlant, Params
 from ..plant.catalogue import PlantLike, plant_from
 from ..policy import Policy, mismatch, read_policy
 from ..policy.file import shipped_policies
-from ..record import Record, read_record
+from ..record import Record
 from ..report.tables import html_table, text_table
 from ..rig.contract import Interval
 from ..rig.loop import COMPLETE
@@ -353,10 +352,7 @@ class Campaign:
         if self.reason:
             raise ValueError(f"the campaign has ended: {self.reason}")
         d = self.plant.description
-        if not isinstance(record, Record):
-            record = read_record(path_from("record", record, "a record or a path"), d)
-        if record.outputs.shape[1] != len(d.outputs) or record.inputs.shape[1] != len(d.inputs):
-            raise ValueError(f"the record has other inputs or outputs than {d.name!r}")
+        record = record_for(d, record)
         if len(record.time) < 2:
             raise ValueError("the record of a round needs at least two samples: got one")
         self.records.append(record)

@@ -18,7 +18,6 @@ from ..estimation.result import Identification
 from ..information import relative_size
 from ..plant import AbstractPlant
 from ..plant.catalogue import PlantLike, plant_from
-from ..record import Record
 from ..report.rows import EstimateSummary
 from ..rig.contract import Interval
 from ..training.redesign import Region
@@ -93,7 +92,7 @@ def known_from(
             a record or a result that is given twice, and an estimate outside the spread.
         TypeError: for something else than records and results.
     """
-    is_one = isinstance(known, str | Path | Record | Identification)
+    is_one = isinstance(known, RecordLike | Identification)
     if not is_one and not isinstance(known, Sequence):
         raise wrong_type("known", known, "a record, a result, a run folder, or several")
     parts: list[Any] = [known] if is_one else list(known)
