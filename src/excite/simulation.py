@@ -25,6 +25,7 @@ from .excitation.catalogue import ExcitationLike, excitation_and_origin, name_of
 from .files import json_ready
 from .plant import AbstractPlant, Params, params_from
 from .plant.catalogue import PlantLike, plant_from, with_sensor
+from .plant.static import AbstractStaticTask
 from .record import Record
 
 _State = TypeVar("_State")
@@ -207,6 +208,9 @@ def predicted(
     Raises:
         ValueError: for process noise and a state that is not observed.
     """
+    if isinstance(plant, AbstractStaticTask):
+        outcomes = jax.vmap(plant.outcome, (0, None))(inputs, params)
+        return jnp.concatenate([jnp.zeros((1, outcomes.shape[1])), outcomes]), plant.sensor.sd
     if not require_likelihood(plant):
         return response(plant, params, inputs), plant.sensor.sd
     steps = acting(plant, params, inputs, None, None)

@@ -11,10 +11,12 @@ from excite.files import module_at
 
 FOLDER = ROOT / "results" / "oed"
 PAGE = (ROOT / "docs" / "explanation" / "expected-information.md").read_text()
-ROWS = [
-    row for path in sorted(FOLDER.glob("*.json")) for row in json.loads(path.read_text())["rows"]
-]
 COMPUTED = module_at(FOLDER / "compute.py")
+ROWS = [
+    row
+    for task in COMPUTED.TASKS
+    for row in json.loads(COMPUTED.path_of(task, ".json").read_text())["rows"]
+]
 
 
 def line_of(row):

@@ -41,6 +41,8 @@ def _options(command: Any) -> Any:
                          help="Scale by which an observed output is divided, in its unit."),
             click.option("--window", type=WholeNumber(1, 10_000),
                          help="Number of samples observed; default 80."),
+            click.option("--memory", type=WholeNumber(0, 10_000),
+                         help="Numbers that the policy carries from step to step; default none."),
             click.option("--clock", type=Number(), multiple=True, metavar="HZ",
                          help="Also observe sine and cosine of this frequency."),
             click.option("--updates", type=WholeNumber(1), metavar="N",

@@ -137,6 +137,8 @@ def gains(
             kind = jax.random.choice(kind_key, 3, (size,), p=jnp.array(shares))
             near = center[None] + jnp.where(kind == 1, _WIDE, 1.0)[:, None] * (z @ root.T)
             weights = jax.vmap(log_weight)(jnp.where((kind == 2)[:, None], z, near))
+            # Each use below would compute them again.
+            weights = jax.lax.optimization_barrier(weights)
             total = jnp.logaddexp(carry[0], jax.nn.logsumexp(weights))
             squares = jnp.logaddexp(carry[1], jax.nn.logsumexp(2 * weights))
             return (total, squares), None

@@ -18,3 +18,5 @@ from .contract import require_double_precision as require_double_precision
 from .dc_motor import DCMotor as DCMotor
 from .emps import EMPS as EMPS
 from .fields import floats as floats
+from .static import AbstractStaticTask as AbstractStaticTask
+from .static import static_description as static_description

@@ -1,7 +1,7 @@
 """`Policy`: a network and the contract under which it may excite a plant.
 
-A policy is a feed-forward network and the layout of what it observes, in one safetensors
-file: the weights as tensors, the contract (plant, layout, provenance) as JSON in the
+A policy is a network, with or without a memory, and the layout of what it observes, in one
+safetensors file: the weights as tensors, the contract (plant, layout, provenance) as JSON in the
 header. It is read and run with NumPy alone. One step of a policy, from window and
 measurement to the input, is `respond`: `xp` is NumPy on a rig, and `jax.numpy` in
 training and simulation. Nothing is unpickled.
@@ -38,7 +38,8 @@ AnyArray: TypeAlias = Any
 """A NumPy or a JAX array."""
 
 Weights: TypeAlias = tuple[tuple[AnyArray, AnyArray], ...]
-"""Matrix [out, in] and bias [out] of every layer."""
+"""Matrix [out, in] and bias [out] of every layer. Of a policy with a memory, the first two are its
+unit: gates from the observation and from the memory."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,7 @@ class Layout:
         input_middle, input_half: middle of each input's limits, and the largest distance
             from it: half their width, or less.
         clocks: frequencies of the clocks, in cycles a step, at most one half.
+        memory: numbers that the policy carries from step to step, by a gated recurrent unit.
     """
 
     window: int
@@ -65,14 +67,23 @@ class Layout:
     input_middle: tuple[float, ...]
     input_half: tuple[float, ...]
     clocks: tuple[float, ...] = ()
+    memory: int = 0
 
     @classmethod
-    def of(cls, description: PlantDescription, window: int = 80, num_steps: int = 500) -> Layout:
+    def of(
+        cls,
+        description: PlantDescription,
+        window: int = 80,
+        num_steps: int = 500,
+        memory: int = 0,
+    ) -> Layout:
         """The layout for a plant, scaled by its outputs' scales and its input limits.
 
         Raises:
-            ValueError: where a length is below one.
+            ValueError: where a length is below one, or the memory's below zero.
         """
+        if memory < 0:
+            raise ValueError(f"memory must not be negative: got {memory}")
         if window < 1 or num_steps < 1:
             raise ValueError(
                 f"window and num_steps must be at least 1: got {window} and {num_steps}"
@@ -83,6 +94,7 @@ class Layout:
             output_scale=tuple(o.scale for o in description.outputs),
             input_middle=tuple((i.lower + i.upper) / 2 for i in description.inputs),
             input_half=tuple((i.upper - i.lower) / 2 for i in description.inputs),
+            memory=memory,
         )
 
     @property
@@ -93,10 +105,11 @@ class Layout:
 
 
 class Window(NamedTuple):
-    """The last measurements and inputs, scaled, oldest first; axis 0 is time."""
+    """The last measurements and inputs, scaled, oldest first, and what the policy remembers."""
 
     outputs: AnyArray
     inputs: AnyArray
+    memory: AnyArray
 
 
 def empty_window(xp: ModuleType, layout: Layout) -> Window:
@@ -104,6 +117,7 @@ def empty_window(xp: ModuleType, layout: Layout) -> Window:
     return Window(
         outputs=xp.zeros((layout.window, len(layout.output_scale))),
         inputs=xp.zeros((layout.window, len(layout.input_half))),
+        memory=xp.zeros(layout.memory, xp.float32),
     )
 
 
@@ -146,6 +160,21 @@ def forward(
     return xp.where(xp.isfinite(action), xp.clip(action, -1.0, 1.0), if_not_finite)
 
 
+def remembered(
+    xp: ModuleType, weights: Weights, memory: AnyArray, observation: AnyArray
+) -> AnyArray:
+    """The memory after one more observation: a gated recurrent unit.
+
+    K. Cho et al., Learning phrase representations using RNN encoder-decoder, EMNLP 2014. The reset
+    gate acts on what the memory's matrix made of the memory.
+    """
+    (into, into_bias), (back, back_bias) = weights
+    new = xp.split(into @ observation + into_bias, 3)
+    old = xp.split(back @ memory + back_bias, 3)
+    reset, keep = (0.5 + 0.5 * xp.tanh((new[i] + old[i]) / 2) for i in (0, 1))
+    return (1 - keep) * xp.tanh(new[2] + reset * old[2]) + keep * memory
+
+
 def act(
     xp: ModuleType,
     layout: Layout,
@@ -153,9 +182,20 @@ def act(
     window: Window,
     k: AnyArray,
     if_not_finite: float = 0.0,
-) -> AnyArray:
-    """Action in [-1, 1] of step k, for a window that ends with the measurement of step k."""
-    return forward(xp, weights, observe(xp, layout, window, k), if_not_finite)
+) -> tuple[Window, AnyArray]:
+    """Action in [-1, 1] of step k, for a window that ends with the measurement of step k.
+
+    Returns:
+        The window, with what the policy remembers of this step, and the action: the network's
+        output, clipped; with a memory its hyperbolic tangent, which has a gradient everywhere.
+    """
+    seen = observe(xp, layout, window, k)
+    if layout.memory:
+        memory = remembered(xp, weights[:2], window.memory, seen)
+        action = xp.tanh(network(xp, weights[2:], xp.concatenate([memory, seen])))
+        window = window._replace(memory=memory)
+        return window, xp.where(xp.isfinite(action), action, if_not_finite)
+    return window, forward(xp, weights, seen, if_not_finite)
 
 
 def scaled_action(xp: ModuleType, layout: Layout, action: AnyArray) -> AnyArray:
@@ -188,7 +228,7 @@ def respond(
         The window, and the input in its unit, in double precision.
     """
     window = with_measurement(xp, layout, window, measured)
-    action = act(xp, layout, weights, window, k, if_not_finite)
+    window, action = act(xp, layout, weights, window, k, if_not_finite)
     return window, scaled_action(xp, layout, action.astype(float))
 
 
@@ -222,14 +262,16 @@ class Policy:
             for matrix, bias in self.weights
         )
         object.__setattr__(self, "weights", layers)
-        _check_layers(layers, self.layout.size, len(self.layout.input_half))
+        _check_layers(layers, self.layout)
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """Action in [-1, 1] for one observation.
 
         Raises:
-            ValueError: for an observation of another size.
+            ValueError: for an observation of another size, and for a policy with a memory, whose
+                action depends on earlier observations, too.
         """
+        self.require_no_memory("one observation")
         if np.shape(observation) != (self.layout.size,):
             raise ValueError(
                 f"an observation of this policy has shape {(self.layout.size,)}; "
@@ -237,10 +279,19 @@ class Policy:
             )
         return forward(np, self.weights, observation)
 
+    def require_no_memory(self, what: str) -> None:
+        """Raises ValueError for a policy with a memory, where something is for one without."""
+        if self.layout.memory:
+            raise ValueError(
+                f"this policy remembers {self.layout.memory} numbers; {what} is for policies "
+                "without a memory"
+            )
+
     def __repr__(self) -> str:
         """Plant, what is observed, how it was trained, and the hash."""
         layout, made = self.layout, self.provenance
-        widths = [layout.size, *(len(bias) for _, bias in self.weights)]
+        layers = self.weights[2:] if layout.memory else self.weights
+        widths = [layout.size, *[layout.memory] * bool(layout.memory), *(len(b) for _, b in layers)]
         words = [f"{word} {made[word]}" for word in ("method", "agent", "study") if word in made]
         claim = textwrap.fill(self.claim, 80, initial_indent="  ", subsequent_indent="    ")
         return (
@@ -304,7 +355,7 @@ class Policy:
         contract = {
             "plant": self.plant.to_dict(),
             "plant_hash": self.plant.hash,
-            "layout": dataclasses.asdict(self.layout),
+            "layout": _layout_data(self.layout),
             "provenance": dict(self.provenance),
         }
         if self.certificate is not None:
@@ -355,11 +406,18 @@ class Policy:
             raise ValueError(f"{where}: {error}") from None
 
 
+def _layout_data(layout: Layout) -> dict[str, Any]:
+    """The layout as JSON-ready data; without a memory as before there were any, so is the hash."""
+    content = dataclasses.asdict(layout)
+    return content if layout.memory else {k: v for k, v in content.items() if k != "memory"}
+
+
 def _check_layout(layout: Layout, plant: PlantDescription) -> None:
     numbers = (*layout.output_scale, *layout.input_middle, *layout.input_half)
-    if not all(type(n) is int and n < _MAX_COUNT for n in (layout.window, layout.num_steps)):
-        raise ValueError("window and num_steps of a layout are whole numbers")
-    usual = Layout.of(plant, layout.window, layout.num_steps)
+    whole = layout.window, layout.num_steps, layout.memory
+    if not all(type(n) is int and n < _MAX_COUNT for n in whole):
+        raise ValueError("window, num_steps and memory of a layout are whole numbers")
+    usual = Layout.of(plant, *whole)
     free = {n: getattr(layout, n) for n in ("output_scale", "input_half", "clocks")}
     if layout != dataclasses.replace(usual, **free) or not all(math.isfinite(n) for n in numbers):
         raise ValueError("the observation layout does not belong to the policy's plant")
@@ -407,12 +465,21 @@ def _check_certificate(certificate: Any) -> None:
         raise ValueError("its certificate is malformed")
 
 
-def _check_layers(weights: Weights, num_inputs: int, num_outputs: int) -> None:
+def _check_layers(weights: Weights, layout: Layout) -> None:
     """Raises ValueError where the layers do not fit each other, the layout or the plant."""
-    if not weights:
+    width, first = layout.size, 0
+    if layout.memory:
+        gates = 3 * layout.memory
+        shapes = [(gates, width), (gates,), (gates, layout.memory), (gates,)]
+        if [part.shape for layer in weights[:2] for part in layer] != shapes:
+            raise ValueError(f"the unit of a memory of {layout.memory} numbers has other weights")
+        width, first = width + layout.memory, 2
+    if len(weights) <= first:
         raise ValueError("a policy needs at least one layer")
-    width = num_inputs
-    for i, (matrix, bias) in enumerate(weights):
+    for matrix, bias in weights[:first]:
+        if not (np.all(np.isfinite(matrix)) and np.all(np.isfinite(bias))):
+            raise ValueError("the unit of the memory has weights that are not finite")
+    for i, (matrix, bias) in enumerate(weights[first:]):
         if matrix.ndim != 2 or matrix.shape[1] != width or bias.shape != matrix.shape[:1]:
             raise ValueError(
                 f"layer {i} has weights {matrix.shape} and biases {bias.shape}; "
@@ -421,8 +488,8 @@ def _check_layers(weights: Weights, num_inputs: int, num_outputs: int) -> None:
         if not (np.all(np.isfinite(matrix)) and np.all(np.isfinite(bias))):
             raise ValueError(f"layer {i} has weights that are not finite")
         width = matrix.shape[0]
-    if width != num_outputs:
-        raise ValueError(f"the last layer gives {width} numbers for {num_outputs} inputs")
+    if width != (num_inputs := len(layout.input_half)):
+        raise ValueError(f"the last layer gives {width} numbers for {num_inputs} inputs")
 
 
 def mismatch(policy: Policy, plant: PlantDescription) -> str | None:

@@ -34,10 +34,11 @@ def to_onnx(policy: Policy) -> bytes:
     `format`, `contract` (plant, layout, provenance as JSON), `policy_hash`.
 
     Raises:
-        ValueError: one sentence where onnx is not installed.
+        ValueError: one sentence where onnx is not installed, and for a policy with a memory.
     """
     if onnx is None:
         raise ValueError("exporting needs onnx: pip install 'excite[onnx]'")
+    policy.require_no_memory("an ONNX file")
     nodes, constants = _network(policy)
     graph = helper.make_graph(
         nodes,

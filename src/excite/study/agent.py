@@ -71,6 +71,7 @@ class DecisionSettings(RewardSettings):
     Attributes:
         terms: several rewards instead of one, which are added.
         window: number of samples observed.
+        memory: numbers that the policy carries from step to step (by gradient), beside the window.
         clocks: frequencies [Hz] whose sine and cosine are observed too.
         output_scale: y_max by output, in its unit, where it differs from the output's scale.
         input_amplitude: by input, in its unit, how far from the middle of its limits the
@@ -83,6 +84,7 @@ class DecisionSettings(RewardSettings):
 
     terms: Annotated[list[RewardSettings], Field(min_length=1)] = []
     window: Annotated[Count, Field(le=10_000)] = 80
+    memory: Annotated[int, Field(ge=0, le=10_000, strict=True)] = 0
     clocks: list[Positive] = []
     output_scale: dict[str, Positive] = {}
     input_amplitude: dict[str, Positive] = {}
@@ -151,6 +153,10 @@ class Agent:
         if len(set(targets)) < len(targets):
             raise ValueError(f"targets must differ from each other, got {', '.join(targets)}")
         chosen = checked(METHODS[own.method], {**training, **own.training}, "training")
+        if process.memory and own.method == "ppo":
+            raise ValueError("ppo trains policies without a memory: take the method gradient")
+        if process.memory and getattr(chosen, "starts", 1) > 1:
+            raise ValueError("several starts are for policies without a memory: leave one out")
         return cls(own.targets, own.method, process, chosen, estimators)
 
     def env(
@@ -201,7 +207,7 @@ class Agent:
 
     def _layout(self, plant: AbstractPlant, num_steps: int) -> Layout:
         decision, outputs = self.decision, plant.definition.outputs
-        usual = Layout.of(plant.description, decision.window, num_steps)
+        usual = Layout.of(plant.description, decision.window, num_steps, decision.memory)
         halves = dict(zip(names_of(plant.definition.inputs), usual.input_half, strict=True))
         for name in decision.output_scale:
             if name not in names_of(outputs):
@@ -288,7 +294,7 @@ class Agent:
         # Settings that were added later enter only where they are used, so that the
         # fingerprints of earlier trainings stay valid.
         later = {"clocks", "criterion", "max_sensitivity", "input_amplitude", "spread", "dense"}
-        later |= {"constants", "terms", "uncertainty"}
+        later |= {"constants", "terms", "uncertainty", "memory"}
         return {
             "method": self.method,
             "targets": [name for name, chosen in zip(names, mask, strict=True) if chosen],
@@ -297,7 +303,7 @@ class Agent:
                 name: value
                 for name, value in dataclasses.asdict(self.training).items()
                 if (is_uncertain or name not in AGAINST_UNCERTAINTY)
-                and (name, value) != ("starts", 1)
+                and (name, value) not in (("starts", 1), ("through_measurements", True))
             },
             **({"uncertainty": dict(self.ranges(ranges))} if is_uncertain else {}),
         }

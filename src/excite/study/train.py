@@ -29,6 +29,7 @@ def train(
     target: str | Sequence[str] = (),
     goal: Mapping[str, float] | None = None,
     window: int | None = None,
+    memory: int | None = None,
     clock: float | Sequence[float] = (),
     training: Mapping[str, object] | None = None,
     updates: int | None = None,
@@ -65,6 +66,8 @@ def train(
         target: parameters in the objective, default the plant's targets.
         goal: relative error that is scaled to one, by parameter.
         window: number of samples observed, default 80.
+        memory: numbers that the policy carries from step to step, by a gated recurrent unit;
+            default none. With a memory, a window of one sample is enough. By gradient only.
         clock: frequencies [Hz] whose sine and cosine are observed too.
         training: hyper-parameters of the method (`excite.training.settings`).
         updates: gradient updates, default 1000; the hyper-parameter `num_updates`.
@@ -104,6 +107,7 @@ def train(
         **decision_of(rewards.values()),
         "output_scale": by_name("output_scale", output_scale, "a dict by output"),
         "window": window,
+        "memory": memory,
         "clocks": _several("clock", clock, Real, "a frequency in Hz, or several"),
         "uncertainty": by_name("uncertainty", uncertainty, "a dict of ranges by name"),
     }

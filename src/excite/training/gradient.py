@@ -43,10 +43,15 @@ class Network(eqx.Module):
 
     weights: Weights
     layout: Layout = eqx.field(static=True)
+    through_measurements: bool = eqx.field(static=True, default=True)
 
-    def __call__(self, state: EnvState) -> Float[Array, " input"]:
-        """The policy's action in this state."""
-        return act(jnp, self.layout, self.weights, state.window, state.k)
+    def __call__(self, state: EnvState) -> tuple[EnvState, Float[Array, " input"]]:
+        """The policy's action in this state, and the state with what it remembers."""
+        window = state.window
+        if not self.through_measurements:
+            window = window._replace(outputs=jax.lax.stop_gradient(window.outputs))
+        window, action = act(jnp, self.layout, self.weights, window, state.k)
+        return dataclasses.replace(state, window=window), action
 
     def excitation(self, layout: Layout) -> PolicyExcitation:
         """The same policy, to be played on any plant."""
@@ -74,7 +79,7 @@ class Scores(eqx.Module):
 @eqx.filter_jit
 def experiments(
     env: Env,
-    act: Callable[[EnvState], Float[Array, " input"]],
+    act: Callable[[EnvState], tuple[EnvState, Float[Array, " input"]]],
     keys: Key[Array, " plant"],
     margin: Float[Array, ""] | float,
 ) -> Scores:
@@ -92,7 +97,7 @@ def experiments(
 
     @jax.checkpoint
     def advance(state: EnvState, _: None) -> tuple[EnvState, tuple]:
-        state, output, gain = env.advance(state, act(state))
+        state, output, gain = env.advance(*act(state))
         return state, (gain, *beyond(output))
 
     def experiment(key: PRNGKeyArray) -> Scores:
@@ -350,7 +355,8 @@ def started(
     pairs = jax.vmap(jax.random.split)(jnp.stack([jax.random.key(seed) for seed in seeds]))
 
     def start(key: PRNGKeyArray) -> Optimisation:
-        network = Network(_first_policy(env, settings, key), env.layout)
+        weights = _first_policy(env, settings, key)
+        network = Network(weights, env.layout, settings.through_measurements)
         return Optimisation.start(network, settings, env)
 
     def keys(i: int) -> Key[Array, "seed plant"]:
@@ -422,14 +428,30 @@ def optimiser(settings: GradientSettings) -> optax.GradientTransformation:
 
 def _first_weights(env: Env, settings: GradientSettings, key: PRNGKeyArray) -> Weights:
     """Glorot's weights (X. Glorot, Y. Bengio, 2010), those of the last layer made small."""
-    widths = [env.layout.size, *settings.hidden, len(env.layout.input_half)]
+    layout, memory = env.layout, env.layout.memory
+    widths = [memory + layout.size, *settings.hidden, len(layout.input_half)]
     gains = [1.0] * len(settings.hidden) + [settings.last_gain]
     keys = jax.random.split(key, len(gains))
-    glorot = jax.nn.initializers.glorot_uniform()
-    return tuple(
-        (gain * glorot(own, (after, before), jnp.float32), jnp.zeros(after, jnp.float32))
+    layers = tuple(
+        _layer(own, before, after, gain)
         for own, gain, before, after in zip(keys, gains, widths[:-1], widths[1:], strict=True)
     )
+    if not memory:
+        return layers
+    into_key, back_key = jax.random.split(jax.random.fold_in(key, 1))
+    into = _layer(into_key, layout.size, 3 * memory)
+    back = jax.nn.initializers.orthogonal(column_axis=0)(
+        back_key, (3 * memory, memory), jnp.float32
+    )
+    keeps = jnp.repeat(jnp.array([0.0, 1.0, 0.0], jnp.float32), memory)
+    return into, (back, keeps), *layers
+
+
+def _layer(
+    key: PRNGKeyArray, before: int, after: int, gain: float = 1.0
+) -> tuple[Float[Array, "after before"], Float[Array, " after"]]:
+    glorot = jax.nn.initializers.glorot_uniform()
+    return gain * glorot(key, (after, before), jnp.float32), jnp.zeros(after, jnp.float32)
 
 
 def _first_policy(env: Env, settings: GradientSettings, key: PRNGKeyArray) -> Weights:
@@ -440,6 +462,8 @@ def _first_policy(env: Env, settings: GradientSettings, key: PRNGKeyArray) -> We
     """
     if settings.starts == 1:
         return _first_weights(env, settings, key)
+    if env.layout.memory:
+        raise ValueError("several starts are for policies without a memory: leave one of them out")
     keys = jax.random.split(key, settings.starts)
     tried = jax.vmap(lambda own: _linear_start(env, settings, own))(keys)
     plants = jax.random.split(jax.random.fold_in(key, 1), _PLANTS_OF_A_START)

@@ -22,6 +22,9 @@ Positive: TypeAlias = Annotated[
 NotNegative: TypeAlias = Annotated[float, Rule("must not be negative", lambda x: 0 <= x < math.inf)]
 Fraction: TypeAlias = Annotated[float, Rule("must lie in [0, 1)", lambda x: 0 <= x < 1)]
 Share: TypeAlias = Annotated[float, Rule("must be above 0 and at most 1", lambda x: 0 < x <= 1)]
+Flag: TypeAlias = Annotated[
+    bool, Rule("must be true or false", lambda value: isinstance(value, bool))
+]
 Widths: TypeAlias = Annotated[
     tuple[int, ...],
     Rule("needs widths of at least 1", lambda widths: min(widths, default=0) >= 1),
@@ -58,6 +61,9 @@ class GradientSettings(_Checked):
         last_gain: scale of the last layer's initial weights; with large ones training diverges.
         starts: first policies that are compared, of which the best is trained: with more than one
             they begin as random linear feedbacks of the newest measurement and the last input.
+        through_measurements: whether the gradient also goes through what the policy has measured:
+            through what an input does to later ones. Over many sharp outcomes this part is large
+            and says little; without it, training is steady.
         margin: the penalty begins at this fraction of a critical level.
         penalty_weight: of the penalty, at the beginning and at least.
         near: fraction of a critical level that counts as too near to it.
@@ -83,6 +89,7 @@ class GradientSettings(_Checked):
     hidden: Widths = (64, 64)
     last_gain: Positive = 0.02
     starts: Count = 1
+    through_measurements: Flag = True
     margin: Fraction = 0.95
     penalty_weight: Positive = 30.0
     near: Fraction = 0.97

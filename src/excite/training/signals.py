@@ -80,9 +80,9 @@ class OpenLoop(eqx.Module):
 
     latent: Float[Array, "*search time input"]
 
-    def __call__(self, state: EnvState) -> Float[Array, " input"]:
+    def __call__(self, state: EnvState) -> tuple[EnvState, Float[Array, " input"]]:
         """The action of this step."""
-        return jnp.tanh(self.latent[state.k])
+        return state, jnp.tanh(self.latent[state.k])
 
     def excitation(self, layout: Layout) -> Replay:
         """The same signal in input units, to be played on any plant."""
@@ -94,8 +94,8 @@ class _Played(eqx.Module):
 
     actions: Float[Array, "*search time input"]
 
-    def __call__(self, state: EnvState) -> Float[Array, " input"]:
-        return self.actions[state.k]
+    def __call__(self, state: EnvState) -> tuple[EnvState, Float[Array, " input"]]:
+        return state, self.actions[state.k]
 
     def excitation(self, layout: Layout) -> Replay:
         """The same signal in input units, to be played on any plant."""

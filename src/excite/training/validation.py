@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,8 +11,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray
 
 from ..description import names_of
-from ..environment import Env
-from ..policy import Weights, forward
+from ..environment import Env, EnvState
+from ..policy import Weights, act
 
 VALIDATION_SEED = 0x7A11DA7E
 """Seed of the validation episodes: the same for all trainings, not used elsewhere."""
@@ -37,16 +39,13 @@ def validate(env: Env, weights: Weights, keys: Key[Array, " episode"]) -> Valida
     """One episode of the deterministic policy for every key."""
 
     def episode(key: PRNGKeyArray) -> Validation:
-        state, observation = env.reset(key)
+        start, _ = env.reset(key)
 
-        def advance(carry: tuple, _: None) -> tuple[tuple, tuple]:
-            state, observation = carry
-            action = forward(jnp, weights, observation)
-            state, t = env.step(state, action)
-            kept = t.reward, t.relative_errors, t.is_violation, jnp.mean(action**2)
-            return (state, t.observation), kept
+        def advance(state: EnvState, _: None) -> tuple[EnvState, tuple]:
+            window, action = act(jnp, env.layout, weights, state.window, state.k)
+            state, t = env.step(dataclasses.replace(state, window=window), action)
+            return state, (t.reward, t.relative_errors, t.is_violation, jnp.mean(action**2))
 
-        start = state, observation
         _, kept = jax.lax.scan(advance, start, None, length=env.layout.num_steps)
         rewards, errors, violations, squares = kept
         rms = jnp.sqrt(jnp.mean(squares))

@@ -1,0 +1,89 @@
+"""Tasks without memory: simulation, likelihood, expected gain."""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import excite as ex
+from excite.excitation import Random, Replay
+from excite.plant import AbstractStaticTask, static_description
+from excite.plant.catalogue import plant_named
+from excite.simulation import predicted, response, run_episode
+
+EXAMPLE = Path(__file__).parent.parent / "examples" / "location_finding.py"
+SD = 0.5
+
+
+class Slope(AbstractStaticTask):
+    """The outcome is a multiple of the design."""
+
+    definition = static_description(
+        "slope",
+        designs=(ex.Input("place", "m", -1.0, 1.0),),
+        outcomes=(ex.Output("height", "m", scale=1.0, noise_sd=SD),),
+        parameters=(ex.Parameter("slope", "", 0.0, scale=1.0, positive=False),),
+    )
+
+    def outcome(self, design, params):
+        return design * params.slope
+
+
+def intensity(places: np.ndarray, designs: np.ndarray) -> np.ndarray:
+    """The logarithm of two sources' intensity, without excite."""
+    squares = ((designs[:, None] - places.reshape(2, 2)[None]) ** 2).sum(axis=2)
+    return np.log(0.1 + (1 / (1e-4 + squares)).sum(axis=1))
+
+
+def test_the_outcome_is_that_of_the_last_design_alone():
+    sources, places = plant_named(f"{EXAMPLE}:TwoSources"), np.array([0.5, -1.0, 1.5, 0.3])
+    designs = np.random.default_rng(0).uniform(-4, 4, (30, 2))
+    params = sources.Params(*places)
+    outputs = response(sources, params, jnp.asarray(designs))
+    np.testing.assert_allclose(outputs[1:, 0], intensity(places, designs), rtol=1e-12)
+    assert float(outputs[0, 0]) == 0  # nothing is measured before the first design
+    run = run_episode(sources, params, Replay(jnp.asarray(designs)), 30, jax.random.key(1))
+    noise = np.asarray(run.measured - outputs)
+    assert 0.3 < noise.std() < 0.7
+
+
+def test_what_the_likelihood_expects_is_the_response():
+    sources = plant_named(f"{EXAMPLE}:TwoSources")
+    designs = jnp.asarray(np.random.default_rng(1).uniform(-4, 4, (30, 2)))
+    params = sources.Params(*jnp.array([0.5, -1.0, 1.5, 0.3]))
+    expected, sd = predicted(sources, params, designs, jnp.zeros((31, 1)))
+    np.testing.assert_allclose(expected, response(sources, params, designs), rtol=1e-12)
+    np.testing.assert_array_equal(sd, [0.5])
+
+
+def test_of_a_linear_task_all_figures_are_the_exact_gain():
+    """Half the mean of log(1 + sum of squared designs over the variance), which bounds hold."""
+    found = ex.information_gain(
+        Slope, Random(hold=1), steps=8, prior={"slope": "normal:0:1"}, plants=256, samples=200
+    )
+    squares = (np.random.default_rng(0).uniform(-1, 1, (100_000, 8)) ** 2).sum(axis=1)
+    exact = 0.5 * np.log1p(squares / SD**2).mean()
+    for mean in (found.lower, found.upper, found.laplace):
+        assert abs(mean.value - exact) < 4 * mean.std_error + 0.01
+
+
+@pytest.mark.science
+def test_random_designs_tell_of_two_sources_what_an_independent_computation_says():
+    found = ex.information_gain(
+        f"{EXAMPLE}:TwoSources", Random(hold=1), steps=30, from_prior=True, plants=128,
+        samples=20_000, prior=dict.fromkeys(("x_1", "y_1", "x_2", "y_2"), "normal:0:1"),
+    )  # fmt: skip
+    rng, gains = np.random.default_rng(0), []
+    others = rng.normal(size=(20_000, 4))
+    for _ in range(256):
+        places, designs = rng.normal(size=4), rng.uniform(-4, 4, (30, 2))
+        outcomes = intensity(places, designs) + SD * rng.normal(size=30)
+        logs = [-((outcomes - intensity(p, designs)) ** 2).sum() / (2 * SD**2)
+                for p in (places, *others[:2000])]  # fmt: skip
+        gains.append(logs[0] - np.logaddexp.reduce(logs) + np.log(len(logs)))
+    error = np.std(gains) / 16
+    # More samples only raise the lower bound, here by less than a third of a nat.
+    difference = found.lower.value - np.mean(gains)
+    assert -3 * np.hypot(error, found.lower.std_error) < difference < 0.35 + 3 * error
