@@ -143,6 +143,7 @@ def test_the_command_writes_a_shipped_policy_or_a_file(
             "policy": str(word),
             "plant": "dc_motor",
             "observation": policy.layout.size,
+            "memory": 0,
             "action": 1,
             "bytes": path.stat().st_size,
             "hash": policy.hash,

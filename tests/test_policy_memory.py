@@ -1,19 +1,31 @@
 """Policies that carry a memory from step to step."""
 
 import dataclasses
+import sys
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import onnxruntime
 import pytest
 import torch
 
 import excite as ex
+from excite.cli import main
 from excite.environment import Env, InformationGain
 from excite.excitation import PolicyExcitation
 from excite.plant import Aero2
-from excite.policy import Layout, Policy, empty_window, respond, with_input
+from excite.policy import (
+    Layout,
+    Policy,
+    act,
+    empty_window,
+    observe,
+    respond,
+    with_input,
+    with_measurement,
+)
 from excite.policy.contract import remembered
 from excite.rig.player import PolicyPlayer
 from excite.simulation import run_episode
@@ -136,13 +148,32 @@ def test_a_unit_whose_weights_are_not_finite_and_a_negative_memory_are_refused()
         Layout.of(Aero2.definition, memory=-1)
 
 
-def test_what_needs_a_policy_without_a_memory_says_so():
-    pytest.importorskip("onnx")
-    from excite.policy.onnx import to_onnx
+def test_one_observation_is_not_enough_for_an_action():
+    with pytest.raises(ValueError, match="this policy remembers 5 numbers; one observation is for"):
+        policy()(np.zeros(LAYOUT.size, np.float32))
 
-    for use in (lambda: policy()(np.zeros(LAYOUT.size, np.float32)), lambda: to_onnx(policy())):
-        with pytest.raises(ValueError, match="this policy remembers 5 numbers"):
-            use()
+
+def test_other_runtimes_play_it_with_its_memory(tmp_path, monkeypatch, capsys):
+    policy().save(tmp_path / "p.safetensors")
+    words = "export", str(tmp_path / "p.safetensors"), "--onnx", str(tmp_path / "p.onnx")
+    monkeypatch.setattr(sys, "argv", ["excite", *words])
+    with pytest.raises(SystemExit, match="0"):
+        main()
+    shown = "] and memory [batch, 5] to action [batch, 1] and memory [batch, 5], "
+    assert shown in capsys.readouterr().out
+    path: Any = tmp_path / "p.onnx"
+    session: Any = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    rng, window = np.random.default_rng(4), empty_window(np, LAYOUT)
+    seen, memory = np.zeros((2, LAYOUT.size), np.float32), np.zeros((2, MEMORY))
+    for k in range(STEPS):
+        window = with_measurement(np, LAYOUT, window, rng.normal(size=1))
+        seen = np.repeat(observe(np, LAYOUT, window, k)[None], 2, axis=0)
+        action, memory = session.run(None, {"observation": seen, "memory": np.float32(memory)})
+        window, ours = act(np, LAYOUT, policy().weights, window, k)
+        np.testing.assert_allclose(action, [ours, ours], atol=1e-5)
+        np.testing.assert_allclose(memory, [window.memory] * 2, atol=1e-5)
+    spoilt = session.run(["action"], {"observation": seen * np.nan, "memory": np.float32(memory)})
+    np.testing.assert_array_equal(spoilt[0], 0)
 
 
 def test_it_is_trained_by_one_argument():

@@ -26,6 +26,7 @@ def export(policy: str, onnx: Path, overwrite: bool, as_json: bool) -> None:
         "policy": policy,
         "plant": read.plant.name,
         "observation": read.layout.size,
+        "memory": read.layout.memory,
         "action": len(read.layout.input_half),
         "bytes": onnx.stat().st_size,
         "hash": read.hash,
@@ -34,7 +35,8 @@ def export(policy: str, onnx: Path, overwrite: bool, as_json: bool) -> None:
     if as_json:
         show_json(result)
     else:
+        memory = f" and memory [batch, {read.layout.memory}]" * bool(read.layout.memory)
         click.echo(
-            f"{onnx}: observation [batch, {result['observation']}] to action "
-            f"[batch, {result['action']}], {result['bytes']} bytes"
+            f"{onnx}: observation [batch, {result['observation']}]{memory} to action "
+            f"[batch, {result['action']}]{memory}, {result['bytes']} bytes"
         )

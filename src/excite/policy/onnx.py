@@ -30,21 +30,25 @@ _OPSET = 13  # of 2020, supported by all runtimes in use
 def to_onnx(policy: Policy) -> bytes:
     """Content of an ONNX file: `observation` [batch, size] to `action` [batch, input].
 
-    Both are single precision; a single observation is a batch of one. Metadata:
-    `format`, `contract` (plant, layout, provenance as JSON), `policy_hash`.
+    Both are single precision; a single observation is a batch of one. A policy with a memory also
+    takes `memory` [batch, size], zero before the first observation, and gives `next_memory`.
+    Metadata: `format`, `contract` (plant, layout, provenance as JSON), `policy_hash`.
 
     Raises:
-        ValueError: one sentence where onnx is not installed, and for a policy with a memory.
+        ValueError: one sentence where onnx is not installed.
     """
     if onnx is None:
         raise ValueError("exporting needs onnx: pip install 'excite[onnx]'")
-    policy.require_no_memory("an ONNX file")
     nodes, constants = _network(policy)
+    memory = policy.layout.memory
     graph = helper.make_graph(
         nodes,
         f"policy for {policy.plant.name}",
-        [_batch("observation", policy.layout.size)],
-        [_batch("action", len(policy.layout.input_half))],
+        [_batch("observation", policy.layout.size), *[_batch("memory", memory)] * bool(memory)],
+        [
+            _batch("action", len(policy.layout.input_half)),
+            *[_batch("next_memory", memory)] * bool(memory),
+        ],
         [numpy_helper.from_array(array, name) for name, array in constants.items()],
     )
     opsets = [helper.make_opsetid("", _OPSET)]
@@ -84,14 +88,13 @@ def _batch(name: str, size: int) -> ValueInfoProto:
 
 
 def _network(policy: Policy) -> tuple[list[NodeProto], dict[str, np.ndarray]]:
-    """Nodes and constants of `policy.forward`."""
-    constants = {
-        "lowest": np.array(-1, np.float32),
-        "highest": np.array(1, np.float32),
-        "zero": np.array(0, np.float32),
-    }
-    nodes, into = [], "observation"
-    for i, (matrix, bias) in enumerate(policy.weights):
+    """Nodes and constants of `policy.act`, from an observation on."""
+    constants = {"zero": np.array(0, np.float32)}
+    nodes, into, layers = [], "observation", policy.weights
+    if policy.layout.memory:
+        nodes, unit = _unit(policy)
+        constants, into, layers = constants | unit, "seen", layers[2:]
+    for i, (matrix, bias) in enumerate(layers):
         if i:
             nodes.append(helper.make_node("Tanh", [into], [f"{i}.tanh"]))
             into = f"{i}.tanh"
@@ -99,11 +102,42 @@ def _network(policy: Policy) -> tuple[list[NodeProto], dict[str, np.ndarray]]:
         words = [into, f"{i}.weight", f"{i}.bias"]
         into = f"{i}.sum"
         nodes.append(helper.make_node("Gemm", words, [into], transB=1))
+    if policy.layout.memory:
+        bounded = helper.make_node("Tanh", [into], ["bounded"])
+    else:
+        constants |= {"lowest": np.array(-1, np.float32), "highest": np.array(1, np.float32)}
+        bounded = helper.make_node("Clip", [into, "lowest", "highest"], ["bounded"])
     nodes += [
-        helper.make_node("Clip", [into, "lowest", "highest"], ["clipped"]),
+        bounded,
         helper.make_node("IsNaN", [into], ["is_nan"]),
         helper.make_node("IsInf", [into], ["is_infinite"]),
         helper.make_node("Or", ["is_nan", "is_infinite"], ["is_not_finite"]),
-        helper.make_node("Where", ["is_not_finite", "zero", "clipped"], ["action"]),
+        helper.make_node("Where", ["is_not_finite", "zero", "bounded"], ["action"]),
+    ]
+    return nodes, constants
+
+
+def _unit(policy: Policy) -> tuple[list[NodeProto], dict[str, np.ndarray]]:
+    """Nodes and constants of `policy.remembered`; ONNX has the gates keep, reset, candidate."""
+    memory = policy.layout.memory
+
+    def ordered(array: np.ndarray) -> np.ndarray:
+        reset, keep, candidate = np.split(array, 3)
+        return np.concatenate([keep, reset, candidate])[None]
+
+    (into, into_bias), (back, back_bias) = policy.weights[:2]
+    constants = {
+        "first": np.array([0], np.int64),
+        "unit.W": ordered(into),
+        "unit.R": ordered(back),
+        "unit.B": np.concatenate([ordered(into_bias), ordered(back_bias)], axis=1),
+    }
+    words = ["sequence", "unit.W", "unit.R", "unit.B", "", "before"]
+    nodes = [
+        helper.make_node("Unsqueeze", ["observation", "first"], ["sequence"]),
+        helper.make_node("Unsqueeze", ["memory", "first"], ["before"]),
+        helper.make_node("GRU", words, ["", "after"], hidden_size=memory, linear_before_reset=1),
+        helper.make_node("Squeeze", ["after", "first"], ["next_memory"]),
+        helper.make_node("Concat", ["next_memory", "observation"], ["seen"], axis=1),
     ]
     return nodes, constants
