@@ -151,7 +151,7 @@ MISTAKES = {
     "ex.Campaign('aero2', {'D_p': True})": "target of D_p must be a number: got bool True",
     "ex.Campaign('aero2', {'D_p': '1%'}, spread='3')": "such as factor:3: got '3'",
     "ex.Campaign('aero2', {'D_p': '1%'}, rounds=2.5)": "rounds must be a whole number from 1",
-    "ex.Campaign('aero2', {'D_p': '1%'}).tell(3)": "must be a path or a DataFrame: got int 3",
+    "ex.Campaign('aero2', {'D_p': '1%'}).tell(3)": "a record, a path or a DataFrame: got int 3",
     "ex.campaign('aero2', {'D_p': '1%'}, 3, out='x')": "rig must be a name, a file, path",
     "ex.campaign('aero2', {'D_p': '1%'}, out=3)": "out must be a path: got int 3",
     "ex.campaign('aero2', {'D_p': '1%'}, out='x', pause='5')": "pause must be a number: got str",
@@ -326,6 +326,11 @@ def test_a_data_frame_is_a_record(record, result):
     assert again.params == result.params
     with pytest.raises(ValueError, match="a DataFrame does not tell its plant: name the plant"):
         ex.identify(frame)
-    known = ex.next_experiment  # takes what identify takes
     with pytest.raises(ValueError, match="name the plant"):
-        known(frame, target={"D_p": "1%"})
+        ex.next_experiment(frame, target={"D_p": "1%"})
+    with pytest.raises(ValueError, match="a record or a result is given twice: give"):
+        ex.next_experiment([frame, frame], "aero2", target={"D_p": "1%"})
+    with pytest.raises(TypeError, match="or several: got the class DataFrame"):
+        ex.identify(type(frame), "aero2")  # pyright: ignore[reportArgumentType]
+    told = ex.Campaign("aero2", {"D_p": "50%"}).tell(frame)
+    assert told.num_samples == len(frame) - 1

@@ -64,6 +64,16 @@ def test_a_data_frame_is_read_as_a_file(kind: str) -> None:
     pd.testing.assert_frame_equal(frame, before)
 
 
+def test_durations_are_seconds_and_have_no_other_unit() -> None:
+    with pytest.raises(ValueError, match="'time' holds durations, which are read as seconds"):
+        read_record(FRAMES["index of durations"], plant(), units={"time": "ms"})
+
+
+def test_a_value_that_is_missing_in_a_data_frame_was_not_measured() -> None:
+    frame = pd.DataFrame({"time": TIME, "u": U, "y": pd.array([1, pd.NA, 3], dtype=object)})
+    np.testing.assert_array_equal(read_record(frame, plant()).outputs[:, 0], [1, np.nan, 3])
+
+
 def test_a_data_frame_takes_the_options_of_files() -> None:
     frame = pd.DataFrame({"t": [0, 100, 200], "volts": U, "angle": Y})
     read = read_record(
@@ -79,6 +89,8 @@ def test_a_data_frame_takes_the_options_of_files() -> None:
         (pd.DataFrame(np.ones((3, 2)), columns=["u", "u"]), "has the column 'u' twice"),
         (pd.DataFrame(np.ones((3, 1)), columns=[["a"], ["b"]]), "2 levels of column names"),
         (pd.DataFrame({"time": TIME, "u": U, "y": ["a", "b", "c"]}), "'y' is 'a', not a number"),
+        (FRAMES["columns"].set_index(["time", "u"]), "2 levels of row names; one is allowed"),
+        (FRAMES["columns"].assign(y=pd.to_timedelta(Y, "s")), "sample 1 of 'y' is .* not a number"),
     ],
 )
 def test_a_data_frame_that_cannot_be_used_is_one_sentence(

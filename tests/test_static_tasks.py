@@ -1,5 +1,6 @@
 """Tasks without memory: simulation, likelihood, expected gain."""
 
+import dataclasses
 from pathlib import Path
 
 import jax
@@ -56,6 +57,48 @@ def test_what_the_likelihood_expects_is_the_response():
     expected, sd = predicted(sources, params, designs, jnp.zeros((31, 1)))
     np.testing.assert_allclose(expected, response(sources, params, designs), rtol=1e-12)
     np.testing.assert_array_equal(sd, [0.5])
+
+
+class Singular(AbstractStaticTask):
+    """The outcome of a design at zero is infinite."""
+
+    definition = dataclasses.replace(
+        Slope.definition, name="singular", inputs=(ex.Input("place", "m", 0.5, 2.0),)
+    )
+
+    def outcome(self, design, params):
+        return jnp.log(design) * params.slope
+
+
+def test_how_long_a_design_takes_changes_nothing():
+    designs, params = jnp.array([[1.0], [-1.0], [0.5]]), Slope().Params(jnp.asarray(2.0))
+    expected = [0.0, 2.0, -2.0, 1.0]
+    for task in (Slope(), Slope(dt=2.0), Slope().integrated_in(4)):
+        np.testing.assert_allclose(response(task, params, designs)[:, 0], expected)
+    times = response(Slope(), params, designs, dt=jnp.array([0.1, 3.0, 1.0]))
+    np.testing.assert_allclose(times[:, 0], expected)
+
+
+@pytest.mark.parametrize("dt", [1.0, 2.0])
+def test_identify_is_linear_regression(dt):
+    rng = np.random.default_rng(0)
+    designs, time = rng.uniform(-1, 1, 41), dt * np.arange(41)
+    outcomes = np.append(0.0, 0.8 * designs[:-1]) + SD * rng.normal(size=41)
+    record = ex.Record(time, designs[:, None], outcomes[:, None])
+    found = ex.identify(record, Slope, initial_state="known")
+    used = designs[:-1]
+    assert found.params.slope == pytest.approx(used @ outcomes[1:] / (used @ used), rel=1e-6)
+    assert not any("coarse" in sentence for sentence in found.verdict)
+
+
+def test_an_outcome_that_is_infinite_at_zero_has_a_gradient():
+    designs = jnp.array([[0.5], [2.0]])
+
+    def total(slope):
+        return jnp.sum(response(Singular(), Singular().Params(slope), designs))
+
+    assert float(jax.grad(total)(1.5)) == pytest.approx(0.0, abs=1e-12)
+    assert float(total(1.5)) == pytest.approx(0.0, abs=1e-12)
 
 
 def test_of_a_linear_task_all_figures_are_the_exact_gain():

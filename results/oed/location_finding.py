@@ -73,6 +73,8 @@ def main():
     parser.add_argument("--samples", type=int, default=1_000_000)
     asked = parser.parse_args()
     rows = json.loads(TABLE.read_text())["rows"] if TABLE.is_file() else []
+    if any((r["num_plants"], r["num_samples"]) != (asked.plants, asked.samples) for r in rows):
+        parser.error(f"{TABLE.name} has rows of another number of plants or samples: remove it")
     done = {(r["method"], r.get("seed")) for r in rows}
     makers = {("random", None): partial(row, "random", Random(hold=1), asked)}
     makers |= {("gradient", s): partial(trained_row, asked, s) for s in asked.seed}

@@ -61,6 +61,8 @@ def step(
         dt: time between the samples [s]; default the plant's.
         next_input: at the next sample, if the input is linear between them; default it is held.
     """
+    if isinstance(plant, AbstractStaticTask):
+        return plant.after(input)
     n = plant.substeps
     h = (plant.dt if dt is None else dt) / n
 

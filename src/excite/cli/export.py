@@ -35,8 +35,9 @@ def export(policy: str, onnx: Path, overwrite: bool, as_json: bool) -> None:
     if as_json:
         show_json(result)
     else:
-        memory = f" and memory [batch, {read.layout.memory}]" * bool(read.layout.memory)
+        size = f"memory [batch, {read.layout.memory}]"
+        before, after = (f" and {word}{size}" * bool(read.layout.memory) for word in ("", "next_"))
         click.echo(
-            f"{onnx}: observation [batch, {result['observation']}]{memory} to action "
-            f"[batch, {result['action']}]{memory}, {result['bytes']} bytes"
+            f"{onnx}: observation [batch, {result['observation']}]{before} to action "
+            f"[batch, {result['action']}]{after}, {result['bytes']} bytes"
         )

@@ -68,6 +68,8 @@ def _process(
     penalty_weight = choices.get("penalty_weight", 1.0)
     if not 0 <= penalty_weight < math.inf:
         raise ValueError(f"penalty_weight must lie in [0, inf): got {penalty_weight}")
+    if getattr(choices.get("layout"), "memory", 0):
+        raise ValueError("an environment's observation has no memory: leave that of the layout out")
     with jax.enable_x64(True):
         env = Env.of(plant_class() if plant is None else plant, **choices)
         return jax.tree.map(lambda leaf: jnp.asarray(leaf, float), env)

@@ -105,7 +105,7 @@ _BY_CHANCE = 1e-3  # a fit with a larger p-value explains nothing
 
 
 RecordLike: TypeAlias = Record | str | Path | DataFrame
-"""A record, or the path of an experiment file."""
+"""A record, the path of an experiment file, or a pandas DataFrame."""
 
 
 def identify(
@@ -329,7 +329,7 @@ def records_in(records: RecordLike | Sequence[RecordLike], what: str) -> list[Re
     if not isinstance(listed, Sequence):
         raise wrong_type(what, records, allowed)
     for record in listed:
-        if not isinstance(record, RecordLike):
+        if isinstance(record, type) or not isinstance(record, RecordLike):
             raise wrong_type(what, record, allowed)
     return list(listed)
 
@@ -362,7 +362,14 @@ def _require_files(records: Sequence[RecordLike], **options: object) -> None:
 
 
 def record_for(description: PlantDescription, given: RecordLike, **options: Any) -> Record:
-    """A record or that of a file; ValueError where it does not have the plant's columns."""
+    """A record, read where it is a file or a DataFrame.
+
+    Raises:
+        ValueError: where it does not have the plant's columns.
+        TypeError: for anything else.
+    """
+    if isinstance(given, type) or not isinstance(given, RecordLike):
+        raise wrong_type("record", given, "a record, a path or a DataFrame")
     if not isinstance(given, Record):
         return read_record(given, description, **options)
     found = given.inputs.shape[1], given.outputs.shape[1]

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from ..description import Input, Output, Parameter, PlantDescription, State
 from .contract import AbstractPlant, Params
 
-_MADE = "num_designs"
+_MADE = "is_made"
 
 
 def static_description(
@@ -25,7 +25,7 @@ def static_description(
     outcomes: tuple[Output, ...],
     parameters: tuple[Parameter, ...],
 ) -> PlantDescription:
-    """The description of a static task: one step, of one second, is one design.
+    """The description of a static task: one step is one design, and lasts one second.
 
     Args:
         name: of the task.
@@ -70,15 +70,21 @@ class AbstractStaticTask(AbstractPlant):
     def outcome(self, design: Float[Array, " input"], params: Params) -> Float[Array, " output"]:
         """Mean of what is measured of a design; the sensor's noise is added to it."""
 
+    def after(self, design: Float[Array, " input"]) -> Float[Array, " state"]:
+        """The state after a design, whatever time it took: the design, and that one was made."""
+        return jnp.append(design, 1.0)
+
     def derivative(
         self, state: Float[Array, " state"], input: Float[Array, " input"], params: Params
     ) -> Float[Array, " state"]:
-        """In one step of Euler's method the state becomes the design."""
+        """Toward the design, in one step of Euler's method; a simulation takes `after`."""
         del params
-        made = jnp.ones(1)
-        return (jnp.concatenate([input, made]) - state) / self.dt
+        return (self.after(input) - state) / self.dt
 
     def output(self, state: Float[Array, " state"], params: Params) -> Float[Array, " output"]:
-        """The outcome of the last design."""
-        *design, made = state
-        return jnp.where(made > 0.5, self.outcome(jnp.stack(design), params), 0.0)
+        """The outcome of the last design, zero before the first."""
+        *last, made = state
+        lower, upper = self.input_limits
+        # An outcome that is not finite at zero would spoil the gradient of the others.
+        design = jnp.where(made > 0.5, jnp.stack(last), (lower + upper) / 2)
+        return jnp.where(made > 0.5, self.outcome(design, params), 0.0)

@@ -109,7 +109,7 @@ class Window(NamedTuple):
 
     outputs: AnyArray
     inputs: AnyArray
-    memory: AnyArray
+    memory: AnyArray = None
 
 
 def empty_window(xp: ModuleType, layout: Layout) -> Window:
@@ -117,7 +117,7 @@ def empty_window(xp: ModuleType, layout: Layout) -> Window:
     return Window(
         outputs=xp.zeros((layout.window, len(layout.output_scale))),
         inputs=xp.zeros((layout.window, len(layout.input_half))),
-        memory=xp.zeros(layout.memory, xp.float32),
+        memory=xp.zeros(layout.memory, xp.float32) if layout.memory else None,
     )
 
 
@@ -188,13 +188,15 @@ def act(
     Returns:
         The window, with what the policy remembers of this step, and the action: the network's
         output, clipped; with a memory its hyperbolic tangent, which has a gradient everywhere.
+        An observation that is not finite is not remembered.
     """
     seen = observe(xp, layout, window, k)
     if layout.memory:
         memory = remembered(xp, weights[:2], window.memory, seen)
-        action = xp.tanh(network(xp, weights[2:], xp.concatenate([memory, seen])))
-        window = window._replace(memory=memory)
-        return window, xp.where(xp.isfinite(action), action, if_not_finite)
+        action = network(xp, weights[2:], xp.concatenate([memory, seen]))
+        memory = xp.where(xp.all(xp.isfinite(seen)), memory, window.memory)
+        action = xp.where(xp.isfinite(action), xp.tanh(action), if_not_finite)
+        return window._replace(memory=memory), action
     return window, forward(xp, weights, seen, if_not_finite)
 
 
@@ -271,21 +273,17 @@ class Policy:
             ValueError: for an observation of another size, and for a policy with a memory, whose
                 action depends on earlier observations, too.
         """
-        self.require_no_memory("one observation")
+        if self.layout.memory:
+            raise ValueError(
+                f"this policy has a memory of {self.layout.memory} numbers: its action depends on "
+                "earlier observations, too (excite.policy.respond)"
+            )
         if np.shape(observation) != (self.layout.size,):
             raise ValueError(
                 f"an observation of this policy has shape {(self.layout.size,)}; "
                 f"got {np.shape(observation)}"
             )
         return forward(np, self.weights, observation)
-
-    def require_no_memory(self, what: str) -> None:
-        """Raises ValueError for a policy with a memory, where something is for one without."""
-        if self.layout.memory:
-            raise ValueError(
-                f"this policy remembers {self.layout.memory} numbers; {what} is for policies "
-                "without a memory"
-            )
 
     def __repr__(self) -> str:
         """Plant, what is observed, how it was trained, and the hash."""

@@ -128,6 +128,7 @@ def _unit(policy: Policy) -> tuple[list[NodeProto], dict[str, np.ndarray]]:
     (into, into_bias), (back, back_bias) = policy.weights[:2]
     constants = {
         "first": np.array([0], np.int64),
+        "last": np.array([1], np.int64),
         "unit.W": ordered(into),
         "unit.R": ordered(back),
         "unit.B": np.concatenate([ordered(into_bias), ordered(back_bias)], axis=1),
@@ -137,7 +138,12 @@ def _unit(policy: Policy) -> tuple[list[NodeProto], dict[str, np.ndarray]]:
         helper.make_node("Unsqueeze", ["observation", "first"], ["sequence"]),
         helper.make_node("Unsqueeze", ["memory", "first"], ["before"]),
         helper.make_node("GRU", words, ["", "after"], hidden_size=memory, linear_before_reset=1),
-        helper.make_node("Squeeze", ["after", "first"], ["next_memory"]),
-        helper.make_node("Concat", ["next_memory", "observation"], ["seen"], axis=1),
+        helper.make_node("Squeeze", ["after", "first"], ["new"]),
+        helper.make_node("Concat", ["new", "observation"], ["seen"], axis=1),
+        # Zero times what is not finite is NaN: such an observation is not remembered.
+        helper.make_node("Mul", ["observation", "zero"], ["nothing"]),
+        helper.make_node("ReduceSum", ["nothing", "last"], ["sum"]),
+        helper.make_node("IsNaN", ["sum"], ["is_unseen"]),
+        helper.make_node("Where", ["is_unseen", "memory", "new"], ["next_memory"]),
     ]
     return nodes, constants

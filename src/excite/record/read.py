@@ -327,17 +327,18 @@ def _number(cell: Any) -> float | None:
 
 def _seconds(cells: np.ndarray, options: _Options, where: Path) -> np.ndarray:
     """Time in seconds, from numbers or dates."""
-    has_dates = cells.dtype.kind == "M"
+    has_dates, has_durations = cells.dtype.kind == "M", cells.dtype.kind == "m"
     if cells.dtype.kind == "O" and cells.size:
         has_dates = _is_there(cells[0]) and _number(cells[0]) is None
-    if not has_dates:
+    if not has_dates and not has_durations:
         return _numbers(cells, "time", where) * options.factor("time")
-    seconds = seconds_of(cells)
+    seconds = cells / np.timedelta64(1, "s") if has_durations else seconds_of(cells)
     if (bad := np.flatnonzero(np.isnan(seconds))).size:
         raise _bad_cell(cells, int(bad[0]), "time", "neither a number nor a date", where)
     if options.factor("time") != 1:
         raise ValueError(
-            f"{where}: 'time' holds dates, which are read as seconds; leave its unit and scale out"
+            f"{where}: 'time' holds {'durations' if has_durations else 'dates'}, which are read as "
+            "seconds; leave its unit and scale out"
         )
     return seconds
 
@@ -370,11 +371,12 @@ def _values(cells: np.ndarray, part: Input | Output, options: _Options, where: P
 
 def _numbers(cells: np.ndarray, name: str, where: Path) -> np.ndarray:
     """The numbers of a column; ValueError names the first cell that is none."""
-    if cells.dtype.kind != "M":
-        try:
-            return cells.astype(float)
-        except (TypeError, ValueError):
-            pass
+    if cells.dtype.kind in "Mm":
+        raise _bad_cell(cells, 0, name, "not a number", where)
+    try:
+        return cells.astype(float)
+    except (TypeError, ValueError):
+        pass
     bad = next(k for k, cell in enumerate(cells) if _number(cell) is None)
     raise _bad_cell(cells, bad, name, "not a number", where)
 

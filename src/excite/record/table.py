@@ -37,17 +37,23 @@ def data_frame(columns: Mapping[str, object], index: object = None) -> pandas.Da
 
 
 def columns_of(frame: DataFrame) -> dict[str, np.ndarray]:
-    """Columns of a DataFrame by name: numbers, dates, or texts and other things as they are.
+    """Columns of a DataFrame by name: numbers, dates, durations, or other things as they are.
 
-    An index that has a name, or holds times, is a column, too; without a name it is `time`.
+    An index that has a name, or holds dates or durations, is a column, too; without a name it is
+    `time`.
 
     Raises:
         ValueError: for a name that is there twice, or several levels of names.
     """
+    if frame.index.nlevels > 1:
+        raise ValueError(
+            f"the DataFrame has {frame.index.nlevels} levels of row names; one is allowed "
+            "(reset_index makes columns of them)"
+        )
     if frame.index.name is not None or frame.index.dtype.kind in "Mm":
         name = "time" if frame.index.name is None else frame.index.name
         if name not in frame.columns:
-            frame = frame.reset_index(names=name)
+            frame = frame.reset_index(names=[name])
     if frame.columns.nlevels > 1:
         raise ValueError(
             f"the DataFrame has {frame.columns.nlevels} levels of column names; one is allowed"
@@ -59,13 +65,13 @@ def columns_of(frame: DataFrame) -> dict[str, np.ndarray]:
 
 
 def column_of(column: Any) -> np.ndarray:
-    """A column of a DataFrame: numbers, seconds, dates without a zone, or objects."""
+    """A column of a DataFrame: numbers, dates without a zone, durations, or objects."""
     kind = column.dtype.kind
     if kind in "fiub":
         return column.to_numpy(float, na_value=np.nan)
     if kind == "m":
-        return column.dt.total_seconds().to_numpy(float)
+        return column.to_numpy()
     if kind == "M":
         is_zoned = getattr(column.dtype, "tz", None) is not None
         return (column.dt.tz_convert(None) if is_zoned else column).to_numpy()
-    return column.to_numpy(object)
+    return column.astype(object).where(column.notna(), None).to_numpy(object)

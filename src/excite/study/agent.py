@@ -28,7 +28,7 @@ from ..plant import AbstractARXPlant, AbstractPlant
 from ..plant.uncertainty import Range, Uncertainty
 from ..policy import Layout
 from ..safety import watched_levels
-from ..training.settings import AGAINST_UNCERTAINTY, GradientSettings, PPOSettings
+from ..training.settings import AGAINST_UNCERTAINTY, ONE_START, GradientSettings, PPOSettings
 from .settings import Count, EstimatorSettings, Positive, Settings, SpreadSetting, checked
 
 METHODS = {"ppo": PPOSettings, "gradient": GradientSettings}
@@ -155,8 +155,8 @@ class Agent:
         chosen = checked(METHODS[own.method], {**training, **own.training}, "training")
         if process.memory and own.method == "ppo":
             raise ValueError("ppo trains policies without a memory: take the method gradient")
-        if process.memory and getattr(chosen, "starts", 1) > 1:
-            raise ValueError("several starts are for policies without a memory: leave one out")
+        if process.memory and isinstance(chosen, GradientSettings) and chosen.starts > 1:
+            raise ValueError(ONE_START)
         return cls(own.targets, own.method, process, chosen, estimators)
 
     def env(

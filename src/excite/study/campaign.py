@@ -340,7 +340,7 @@ class Campaign:
         """Takes the record of a round, identifies, and decides whether another one follows.
 
         Args:
-            record: of the round, from rest, or its file.
+            record: of the round, from rest, its file or its DataFrame.
             ended: why the round ended.
             unsafe: whether it ended because a level was near, or no declared plant explains it.
             goes_on: whether the next record exists already, so that reached targets end nothing.

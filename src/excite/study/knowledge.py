@@ -24,7 +24,7 @@ from ..training.redesign import Region
 from .quantities import AbstractQuantity, half_intervals, known_of, parameters_of, slopes
 
 KnownLike = RecordLike | Identification | Sequence[RecordLike | Identification]
-"""Records or their files, results of `identify` or their run folders, or several of these."""
+"""Records, their files or DataFrames, results of `identify`, their run folders, or several."""
 
 
 _LARGE = 2.0  # root mean square of a residual over the declared noise
@@ -101,7 +101,8 @@ def known_from(
     named = [str(Path(p).resolve()) if isinstance(p, str | Path) else str(id(p)) for p in parts]
     for part, name in zip(parts, named, strict=True):
         if named.count(name) > 1:
-            raise ValueError(f"{part} is given twice: give each record and each result once")
+            what = part if isinstance(part, str | Path) else "a record or a result"
+            raise ValueError(f"{what} is given twice: give each record and each result once")
     results = [part for part in parts if _is_result(part)]
     records = [part for part in parts if not _is_result(part)]
     if results and prior is not None:

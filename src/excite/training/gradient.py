@@ -31,7 +31,7 @@ from ..plant.uncertainty import Uncertainty
 from ..policy import Layout, Weights, act
 from ..safety import watched_levels
 from .checkpoint import Checkpoint, OnBoundary, Trained
-from .settings import GradientSettings
+from .settings import ONE_START, GradientSettings
 from .validation import VALIDATION_SEED, look, validation_keys
 
 _LOOK = dataclasses.replace(Effort.of(1500), searched_noises=8)
@@ -463,7 +463,7 @@ def _first_policy(env: Env, settings: GradientSettings, key: PRNGKeyArray) -> We
     if settings.starts == 1:
         return _first_weights(env, settings, key)
     if env.layout.memory:
-        raise ValueError("several starts are for policies without a memory: leave one of them out")
+        raise ValueError(ONE_START)
     keys = jax.random.split(key, settings.starts)
     tried = jax.vmap(lambda own: _linear_start(env, settings, own))(keys)
     plants = jax.random.split(jax.random.fold_in(key, 1), _PLANTS_OF_A_START)

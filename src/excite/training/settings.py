@@ -110,6 +110,9 @@ class GradientSettings(_Checked):
         return update >= self.adversaries_from * self.num_updates
 
 
+ONE_START = "several starts are for policies without a memory: leave one of the two out"
+
+
 AGAINST_UNCERTAINTY = (
     "num_adversaries", "adversary_steps", "adversary_margin", "adversary_noise",
     "adversaries_from", "allowed_nearness",
