@@ -1,6 +1,6 @@
 """A policy that finds two sources, by gradient, and what it is expected to tell.
 
-    python results/oed/location_finding.py [--seed N ...] [--plants 256] [--samples 1000000]
+    python results/oed/location_finding.py [--seed N ...] [--plants 256] [--samples 100000]
 
 Trains one policy for each seed, default 1, and evaluates it and random designs with samples from
 the prior. Rows that are in the table already are not computed again.
@@ -70,7 +70,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, nargs="+", default=[1])
     parser.add_argument("--plants", type=int, default=256)
-    parser.add_argument("--samples", type=int, default=1_000_000)
+    parser.add_argument("--samples", type=int, default=100_000)
     asked = parser.parse_args()
     rows = json.loads(TABLE.read_text())["rows"] if TABLE.is_file() else []
     if any((r["num_plants"], r["num_samples"]) != (asked.plants, asked.samples) for r in rows):

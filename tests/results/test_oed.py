@@ -39,6 +39,25 @@ def test_every_row_is_on_the_page_and_its_bounds_are_tight():
     assert {row["task"] for row in ROWS} == COMPUTED.TASKS.keys()
 
 
+def test_the_policy_that_finds_sources_tells_again_what_its_row_says():
+    own = module_at(FOLDER / "location_finding.py")
+    rows = json.loads(own.TABLE.read_text())["rows"]
+    for row in rows:
+        is_trained = row["method"] == "gradient"
+        name = f"trained by gradient, seed {row['seed']}" if is_trained else row["method"]
+        means = [row[kind] for kind in ("lower", "upper", "laplace")]
+        cells = " | ".join(f"{m['nats']:.2f} ± {m['std_error']:.2f}" for m in means)
+        assert f"| {name} | {cells} |" in PAGE
+        assert (row["num_plants"], row["num_samples"]) == (256, 100_000)
+    row = rows[-1]
+    policy = FOLDER / f"location_finding-{row['seed']}.safetensors"
+    found = ex.information_gain(
+        own.WORD, policy, prior=own.PRIOR, plants=192, samples=10, from_prior=True, seed=7
+    )
+    error = math.hypot(found.laplace.std_error, row["laplace"]["std_error"])
+    assert abs(found.laplace.value - row["laplace"]["nats"]) < 4.5 * error
+
+
 @pytest.mark.parametrize("task", COMPUTED.TASKS)
 def test_a_policy_tells_again_what_its_row_says(task):
     row = next(r for r in ROWS if (r["task"], r["method"]) == (task, "gradient"))
