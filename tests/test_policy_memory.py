@@ -251,15 +251,12 @@ def test_without_the_part_through_measurements_the_gradient_is_that_of_fixed_one
 def test_a_memory_finds_a_source_that_a_window_of_one_sample_does_not():
     from test_static_tasks import EXAMPLE
 
-    from excite.description import Spread
-    from excite.estimation.prior import PriorPlants
-    from excite.estimation.prior_knowledge import with_prior
+    from excite.estimation.prior_knowledge import plants_of
     from excite.plant.catalogue import plant_named
 
     plant = plant_named(f"{EXAMPLE}:TwoSources")
     given: dict[str, str] = dict.fromkeys(("x_1", "y_1", "x_2", "y_2"), "normal:0:1")
-    _, normal, _ = with_prior(plant, given, plant.nominal, {}, {})
-    prior = PriorPlants(plant, normal, Spread.of(0.0))
+    prior = plants_of(plant, given)
     objective = InformationGain((True,) * 4, 1.0, 0.5, dense=False, prior=prior)
     settings = GradientSettings(
         num_updates=400, learning_rate=3e-3, hidden=(64,), last_gain=0.3, watch_every=200,

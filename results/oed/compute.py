@@ -14,10 +14,8 @@ from functools import partial
 from pathlib import Path
 
 import excite as ex
-from excite.description import Spread
 from excite.environment import Env, InformationGain
-from excite.estimation.prior import PriorPlants
-from excite.estimation.prior_knowledge import with_prior
+from excite.estimation.prior_knowledge import plants_of
 from excite.excitation import Random
 from excite.files import module_at
 from excite.plant.catalogue import plant_named
@@ -79,8 +77,7 @@ def policy_path(task, price, seed):
 def env_of(task, price):
     """The decision process whose total reward is the gain in nats less the price of changes."""
     plant, given = plant_named(word_of(task)), TASKS[task][1]
-    _, normal, _ = with_prior(plant, given, plant.nominal, {}, {})
-    prior, count = PriorPlants(plant, normal, Spread.of(0.0)), len(plant.nominal)
+    prior, count = plants_of(plant, given), len(plant.nominal)
     objective = InformationGain(
         (True,) * count, 1.0, 0.5, dense=False, prior=prior, change_price=price
     )

@@ -13,10 +13,8 @@ from functools import partial
 from pathlib import Path
 
 import excite as ex
-from excite.description import Spread
 from excite.environment import Env, InformationGain
-from excite.estimation.prior import PriorPlants
-from excite.estimation.prior_knowledge import with_prior
+from excite.estimation.prior_knowledge import plants_of
 from excite.excitation import Random
 from excite.plant.catalogue import plant_named
 from excite.policy import Layout, Policy
@@ -37,8 +35,7 @@ SETTINGS = GradientSettings(
 def env():
     """The decision process whose total reward is the gain in nats, by normal approximations."""
     plant = plant_named(WORD)
-    _, normal, _ = with_prior(plant, PRIOR, plant.nominal, {}, {})
-    prior = PriorPlants(plant, normal, Spread.of(0.0))
+    prior = plants_of(plant, PRIOR)
     objective = InformationGain((True,) * 4, 1.0, 0.5, dense=False, prior=prior)
     layout = Layout.of(plant.description, window=1, num_steps=STEPS, memory=64)
     return Env.of(plant, objective=objective, layout=layout, prior=prior)

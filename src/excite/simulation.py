@@ -210,9 +210,6 @@ def predicted(
     Raises:
         ValueError: for process noise and a state that is not observed.
     """
-    if isinstance(plant, AbstractStaticTask):
-        outcomes = jax.vmap(plant.outcome, (0, None))(inputs, params)
-        return jnp.concatenate([jnp.zeros((1, outcomes.shape[1])), outcomes]), plant.sensor.sd
     if not require_likelihood(plant):
         return response(plant, params, inputs), plant.sensor.sd
     steps = acting(plant, params, inputs, None, None)

@@ -329,18 +329,22 @@ def records_in(records: RecordLike | Sequence[RecordLike], what: str) -> list[Re
     if not isinstance(listed, Sequence):
         raise wrong_type(what, records, allowed)
     for record in listed:
-        if isinstance(record, type) or not isinstance(record, RecordLike):
-            raise wrong_type(what, record, allowed)
+        _require_record(record, what, allowed)
     return list(listed)
+
+
+def _require_record(given: object, what: str, allowed: str) -> None:
+    """Raises TypeError for anything but a `RecordLike`; the class DataFrame looks like one."""
+    if isinstance(given, type) or not isinstance(given, RecordLike):
+        raise wrong_type(what, given, allowed)
 
 
 def plant_named_by(record: RecordLike) -> str:
     """The plant that a record's sidecar names."""
     if isinstance(record, Record):
         return require_shipped(record.description.name, record.source or "the record")
-    if isinstance(record, DataFrame):
-        raise ValueError("a DataFrame does not tell its plant: name the plant")
-    return require_shipped(described_in(Path(record)).name, str(record))
+    path = record if isinstance(record, DataFrame) else Path(record)
+    return require_shipped(described_in(path).name, str(path))
 
 
 def require_shipped(name: str, where: str) -> str:
@@ -368,8 +372,7 @@ def record_for(description: PlantDescription, given: RecordLike, **options: Any)
         ValueError: where it does not have the plant's columns.
         TypeError: for anything else.
     """
-    if isinstance(given, type) or not isinstance(given, RecordLike):
-        raise wrong_type("record", given, "a record, a path or a DataFrame")
+    _require_record(given, "record", "a record, a path or a DataFrame")
     if not isinstance(given, Record):
         return read_record(given, description, **options)
     found = given.inputs.shape[1], given.outputs.shape[1]

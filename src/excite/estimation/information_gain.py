@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, PRNGKeyArray
 
-from ..description import LARGEST_SEED, Spread, SpreadLike, names_of, require_whole
+from ..description import LARGEST_SEED, SpreadLike, names_of, require_whole
 from ..excitation import AbstractExcitation
 from ..excitation.catalogue import ExcitationLike
 from ..information import require_noise
@@ -38,7 +38,7 @@ from ..safety import safe_input
 from ..simulation import Experiment, predicted, require_likelihood, run_episode
 from .evidence import Fit, nearest
 from .prior import PriorPlants
-from .prior_knowledge import PriorLike, with_prior
+from .prior_knowledge import PriorLike, plants_of
 
 _STEPS, _STARTS = 30, 8  # of the search for the most probable parameters
 _WIDE, _SHARES = 2.0, (0.5, 0.375, 0.125)  # of the proposal: normal, a wider one, the prior
@@ -137,8 +137,6 @@ def gains(
             kind = jax.random.choice(kind_key, 3, (size,), p=jnp.array(shares))
             near = center[None] + jnp.where(kind == 1, _WIDE, 1.0)[:, None] * (z @ root.T)
             weights = jax.vmap(log_weight)(jnp.where((kind == 2)[:, None], z, near))
-            # Each use below would compute them again.
-            weights = jax.lax.optimization_barrier(weights)
             total = jnp.logaddexp(carry[0], jax.nn.logsumexp(weights))
             squares = jnp.logaddexp(carry[1], jax.nn.logsumexp(2 * weights))
             return (total, squares), None
@@ -317,15 +315,13 @@ def information_gain(
     )  # fmt: skip
     if not require_likelihood(e.plant):
         require_noise(e.plant)
-    reach, normal, words = Spread.of(spread), None, str(Spread.of(spread))
+    population = plants_of(e.plant, prior, spread)
+    reach, normal = population.spread, population.normal
+    words = str(reach)
     if prior is not None:
-        bounded, normal, _ = with_prior(e.plant, prior, e.plant.nominal, {}, {})
-        if bounded is not e.plant:
-            raise ValueError("a uniform prior is given as the spread")
         names = () if normal is None else normal.names
         rest = [n for n in names_of(e.plant.definition.parameters) if n not in names]
         words = f"normal in {', '.join(names)}" + f", others {reach}" * bool(rest)
-    population = PriorPlants(e.plant, normal, reach)
     keys = jax.random.split(jax.random.key(seed), plants)
     parts = []
     for first in range(0, plants, 4 * _CHUNK):

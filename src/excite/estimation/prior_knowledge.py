@@ -9,11 +9,11 @@ from typing import TypeAlias
 
 import numpy as np
 
-from ..description import names_of, unknown, wrong_type
+from ..description import Spread, SpreadLike, names_of, unknown, wrong_type
 from ..files import read_json
 from ..plant import AbstractPlant, Params, floats
 from ..report.rows import EstimateSummary
-from .prior import Prior, bounded
+from .prior import Prior, PriorPlants, bounded
 from .result import Identification
 
 _FORMS = "normal:MEAN:SD, lognormal:MEDIAN:SD or uniform:LOWEST:HIGHEST"
@@ -22,6 +22,30 @@ _ADVICE = "give a run folder of `excite identify`, or a file with `mean` and `co
 
 PriorLike: TypeAlias = Mapping[str, str] | str | Path | Identification | Prior
 """Distributions by parameter ("normal:0.022:5%"), an earlier run, or a joint distribution."""
+
+
+def plants_of(
+    plant: AbstractPlant,
+    prior: PriorLike | Sequence[PriorLike] | None,
+    spread: SpreadLike = 0.0,
+) -> PriorPlants:
+    """The plants of a prior, from which some can be drawn.
+
+    Args:
+        plant: has the parameters.
+        prior: normal and lognormal distributions, see `identify`.
+        spread: of parameters without one.
+
+    Raises:
+        ValueError: as `with_prior`, and for a uniform prior.
+        TypeError: for something else than a prior.
+    """
+    reach, normal = Spread.of(spread), None
+    if prior is not None:
+        narrowed, normal, _ = with_prior(plant, prior, plant.nominal, {}, {})
+        if narrowed is not plant:
+            raise ValueError("a uniform prior is given as the spread")
+    return PriorPlants(plant, normal, reach)
 
 
 def with_prior(

@@ -99,9 +99,7 @@ def read_record(
     frame, chosen = path if isinstance(path, DataFrame) else None, _slice_of(rows)
     path = path_from("record", path, _ALLOWED) if frame is None else Path("the DataFrame")
     if description is None:
-        if frame is not None:
-            raise ValueError("a DataFrame does not tell its plant: name the plant")
-        description = described_in(path)
+        description = described_in(path if frame is None else frame)
     if not isinstance(description, PlantDescription):
         raise wrong_type("description", description, "that of a plant (plant.description)")
     given = {"columns": columns, "scales": scales, "units": units, "set_inputs": set_inputs}

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from ..description import PlantDescription, display_unit, path_from, wrong_type
 from ..files import csv_text, require_new_file, require_unlocked, write_bytes, write_json
-from .table import data_frame
+from .table import DataFrame, data_frame
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -270,8 +270,10 @@ def read_sidecar(path: Path) -> Mapping[str, Any]:
     return content
 
 
-def described_in(path: Path) -> PlantDescription:
-    """The plant that a record's sidecar names; ValueError without one."""
+def described_in(path: Path | DataFrame) -> PlantDescription:
+    """The plant that a record's sidecar names; ValueError without one, as of a DataFrame."""
+    if not isinstance(path, Path):
+        raise ValueError("a DataFrame does not tell its plant: name the plant")
     require_readable(path)
     content = read_sidecar(path).get("plant")
     if not content:
