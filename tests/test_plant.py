@@ -11,6 +11,7 @@ from catalogue import PLANTS, TwoMasses
 from excite.description import names_of
 from excite.excitation import Random
 from excite.plant import Aero2, CartPole, DCMotor, Sensor, draw_params, params_from
+from excite.plant.catalogue import plant_named
 from excite.simulation import response, run_episode, step
 
 plants = pytest.mark.parametrize("plant", PLANTS.values(), ids=PLANTS)
@@ -349,3 +350,20 @@ def test_aero2_recovers_its_parameters_from_the_linearised_equation():
     B = jax.jacfwd(plant.derivative, argnums=1)(*at_rest)
     back = plant.from_transfer_function(-A[1, 0], -A[1, 1], B[1, 0])
     np.testing.assert_allclose(back, params, rtol=1e-12)
+
+
+def test_a_plant_file_is_run_again_only_when_it_has_changed(tmp_path):
+    path, other = tmp_path / "own.py", tmp_path / "more" / "own.py"
+    other.parent.mkdir()
+    text = "from excite.plant import DCMotor\n\n\nclass Own(DCMotor):\n    pass\n"
+    for file in (path, other):
+        file.write_text(text)
+    first, second = (type(plant_named(f"{path}:Own")) for _ in range(2))
+    assert first is second  # what was compiled for it serves again
+    assert type(plant_named(f"{other}:Own")) is not first
+    path.write_text(text.replace("pass", "speed = 1"))
+    assert type(plant_named(f"{path}:Own")).speed == 1
+    path.write_text("raise SystemExit")
+    for _ in range(2):  # what cannot be imported is not kept
+        with pytest.raises(ValueError, match="cannot be imported"):
+            plant_named(f"{path}:Own")

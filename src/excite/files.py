@@ -315,9 +315,14 @@ def function_at(path: Path, word: str) -> Callable[..., Any]:
 def module_at(path: Path) -> Any:
     """The module in a user's file, whose code is run; ValueError where it cannot be imported.
 
-    No compiled code is written beside the file.
+    It is run again when the file has changed: programs that were compiled for its classes serve as
+    long as these are the same. No compiled code is written beside the file.
     """
-    name = f"excite_file_{path.stem}"
+    name, place = f"excite_file_{path.stem}", path.resolve()
+    source = place.read_bytes() if place.is_file() else b""
+    known = sys.modules.get(name)
+    if known is not None and getattr(known, _SOURCE, None) == (place, source):
+        return known
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
         raise ValueError(f"{path} cannot be imported")
@@ -332,7 +337,11 @@ def module_at(path: Path) -> Any:
         raise ValueError(f"{path} cannot be imported: {told(error)}") from error
     finally:
         sys.dont_write_bytecode = writes_nothing
+    setattr(module, _SOURCE, (place, source))
     return module
+
+
+_SOURCE = "_excite_source"
 
 
 _NUM_HEADER_BYTES = 8  # a safetensors file begins with the length of its JSON header
