@@ -1,5 +1,6 @@
 """Plants with process noise whose state is observed: simulation, likelihood, gain, training."""
 
+import dataclasses
 import math
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,8 @@ import pytest
 
 import excite as ex
 from excite.description import Input, Output, Parameter, PlantDescription, Spread, State
-from excite.environment import Env, InformationGain
+from excite.environment import Env, InformationGain, run_episodes
+from excite.estimation import NLS
 from excite.estimation.prior import Prior, PriorPlants
 from excite.excitation import PRBS, PolicyExcitation
 from excite.files import module_at
@@ -172,6 +174,69 @@ def test_the_best_of_many_linear_feedbacks_is_trained_to_more_than_it_began_with
     ).laplace.value  # fmt: skip
 
 
+def regression(record, sd=1.0):
+    """Estimate and information (a, c) by linear least squares of all steps, without excite."""
+    x, u = record.outputs, record.inputs[:-1]
+    B = DT * np.column_stack([-x[:-1, 0], u[:, 0]])
+    y = x[1:, 1] - (1 - DT) * x[:-1, 1]
+    M = B.T @ B / sd**2
+    return np.linalg.solve(M, B.T @ y / sd**2), M, y - B @ np.linalg.solve(M, B.T @ y / sd**2)
+
+
+def test_where_the_state_is_observed_nls_is_the_regression_of_its_steps():
+    records = [ex.simulate(Pushed, "prbs", steps=n, seed=n) for n in (40, 70)]
+    for record in records:
+        found = ex.identify(record, Pushed)
+        expected, M, rest = regression(record)
+        np.testing.assert_allclose(list(found.params.values()), expected, rtol=1e-6)
+        # Of both outputs, by whose declared noise they are weighed; two unknowns are shared.
+        variance = rest @ rest / (len(rest) - 1)
+        np.testing.assert_allclose(found.covariance, variance * np.linalg.inv(M), rtol=1e-4)
+        computed = found.fitted[0].computed["predicted"][1:, 1]
+        np.testing.assert_allclose(computed, record.outputs[1:, 1] - rest, atol=1e-5)
+    both = ex.identify(records, Pushed, estimator=NLS(noise="known"))
+    parts = [regression(record, SD[1]) for record in records]
+    M = sum(part[1] for part in parts)
+    expected = np.linalg.solve(M, sum(part[1] @ part[0] for part in parts))
+    np.testing.assert_allclose(list(both.params.values()), expected, rtol=1e-6)
+    np.testing.assert_allclose(both.covariance, np.linalg.inv(M), rtol=1e-6)
+
+
+def test_with_a_prior_it_is_the_most_probable_estimate():
+    record = ex.simulate(Pushed, "prbs", steps=40, seed=3)
+    found = ex.identify(record, Pushed, estimator=NLS(noise="known"), prior=PRIOR)
+    expected, M, _ = regression(record, SD[1])
+    W, mean = np.diag([1 / 0.4, 1 / 0.3]) ** 2, np.array([2.0, 1.0])
+    posterior = np.linalg.solve(M + W, M @ expected + W @ mean)
+    np.testing.assert_allclose(list(found.params.values()), posterior, rtol=1e-6)
+    np.testing.assert_allclose(found.covariance, np.linalg.inv(M + W), rtol=1e-6)
+
+
+def test_a_sample_that_is_missing_costs_the_two_steps_beside_it():
+    record = ex.simulate(Pushed, "prbs", steps=60, seed=4)
+    outputs = record.outputs.copy()
+    outputs[20, 1] = np.nan
+    found = ex.identify(dataclasses.replace(record, outputs=outputs), Pushed)
+    x, u, kept = record.outputs, record.inputs[:-1], np.setdiff1d(np.arange(60), [19, 20])
+    B = DT * np.column_stack([-x[:-1, 0], u[:, 0]])[kept]
+    y = (x[1:, 1] - (1 - DT) * x[:-1, 1])[kept]
+    expected = np.linalg.lstsq(B, y)[0]
+    np.testing.assert_allclose(list(found.params.values()), expected, rtol=1e-6)
+
+
+def test_the_bound_of_an_episode_is_that_of_its_steps():
+    plant, keys = Pushed(), jax.random.split(jax.random.key(2), 3)
+    found = run_episodes(plant, PRBS(), 30, 0.3, keys)
+    for i in range(3):
+        states, inputs = (
+            np.asarray(rows[i]) for rows in (found.trajectory.measured, found.trajectory.inputs)
+        )
+        B = DT * np.column_stack([-states[:-1, 0], inputs[:, 0]])
+        scale = np.diag([p.scale for p in plant.definition.parameters])
+        expected = scale @ (B.T @ B / SD[1] ** 2) @ scale
+        np.testing.assert_allclose(found.information[i], expected, rtol=1e-9)
+
+
 class Hidden(Pushed):
     """The same, with one output alone and noise of its sensor."""
 
@@ -188,12 +253,26 @@ class Hidden(Pushed):
         return state[:1]
 
 
+def uneven(record):
+    """The same at times that jitter."""
+    jitter = np.random.default_rng(0).uniform(-0.3, 0.3, len(record.time))
+    return dataclasses.replace(record, time=record.time + DT * jitter)
+
+
 @pytest.mark.parametrize(
     ("call", "words"),
     [
         (lambda: ex.information_gain(Hidden, "prbs"), "has process noise, and its state is not"),
         (lambda: ex.information(Pushed, "prbs"), "its information differs from record to record"),
-        (lambda: ex.identify(ex.simulate(Pushed, "prbs"), Pushed), "use the estimator pem"),
+        (lambda: ex.identify(ex.simulate(Hidden, "prbs"), Hidden), "use the estimator pem"),
+        (
+            lambda: ex.identify(ex.simulate(Pushed, "prbs"), Pushed, estimator="decrement"),
+            "use the estimator pem",
+        ),
+        (
+            lambda: ex.identify(uneven(ex.simulate(Pushed, "prbs")), Pushed),
+            "has process noise, and uneven times: use the estimator pem",
+        ),
         (lambda: ex.Campaign(Pushed, {"a": "1%"}), "its information differs from record to record"),
         (lambda: State("x", "m", noise_sd=-1.0), "noise_sd of state 'x' must not be negative"),
         (

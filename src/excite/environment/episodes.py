@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PRNGKeyArray
 
 from ..description import SpreadLike
+from ..estimation.prior import PriorPlants
 from ..excitation import AbstractExcitation, Coast
 from ..information import cramer_rao_bound, experiment_information, relative_size
 from ..plant import AbstractPlant, Params, draw_params
@@ -49,6 +50,7 @@ def run_episodes(
     keys: Key[Array, " episode"],
     uncertainty: Uncertainty | None = None,
     coast: int = 0,
+    prior: PriorPlants | None = None,
 ) -> Episodes:
     """One episode per key. Plant and noise of a key are the same for any excitation.
 
@@ -61,15 +63,18 @@ def run_episodes(
         uncertainty: in place of the spread, the box from which plants are drawn.
         coast: samples after the episode, under the input that ends it, whose outputs count as
             those of the episode; nothing is measured there.
+        prior: in place of the spread, the distribution of the parameters.
     """
     whole, length = Coast.after(excitation, num_steps, coast)
 
     def episode(key: PRNGKeyArray) -> Episodes:
         params_key, episode_key = jax.random.split(key)
-        if uncertainty is None:
-            true, own = plant, draw_params(plant, params_key, spread)
-        else:
+        if uncertainty is not None:
             true, own = uncertainty.at(uncertainty.draw(params_key))
+        elif prior is not None:
+            true, own = plant, prior.draw(params_key)
+        else:
+            true, own = plant, draw_params(plant, params_key, spread)
         run = run_episode(true, own, whole, length, episode_key)
         known = plant.Params(*(getattr(own, name) for name in plant.nominal._fields))
         return scored(plant, known, run, coast)
@@ -87,7 +92,7 @@ def scored(plant: AbstractPlant, params: Params, run: Trajectory, coast: int = 0
     rows = run.time, run.measured, run.outputs
     time, measured, outputs = (x[: end + 1] for x in rows)
     trajectory = Trajectory(time, run.inputs[:end], measured, outputs)
-    information = experiment_information(plant, params, trajectory.inputs)
+    information = experiment_information(plant, params, trajectory.inputs, measured=measured)
     relative = relative_size(plant, params) / jnp.abs(jnp.stack(params))
     return Episodes(
         params=params,

@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..description import PlantDescription, names_of
 from ..information import relative_size
-from ..plant import AbstractPlant, Params
+from ..plant import AbstractPlant, Params, Sensor
 from ..simulation import response
 
 AnyArray: TypeAlias = Array | np.ndarray
@@ -116,6 +116,51 @@ def stack_experiments(
     }
     arrays = jax.device_put(arrays) if xp is np else arrays
     return Experiments(**arrays, initial_state_known=initial_state_known)
+
+
+def transitions(
+    plant: AbstractPlant, experiments: Experiments
+) -> tuple[AbstractPlant, Experiments]:
+    """Every step of a plant whose state is observed, as an experiment of its own.
+
+    It begins with the state that is measured, and ends with a measurement whose noise is that of
+    the process: the likelihood of the experiments is that of their transitions.
+
+    Raises:
+        ValueError: for an input delay, with which the state is not all that the plant remembers,
+            and for steps of different length, which have different noise.
+    """
+    e = experiments
+    if e.dt is not None or plant.delay(plant.nominal) is not None:
+        what = "uneven times" if e.dt is not None else "an input delay"
+        raise ValueError(
+            f"plant {plant.definition.name!r} has process noise, and {what}: use the estimator pem"
+        )
+
+    def steps(rows: Array) -> Array:
+        return rows.reshape(-1, 1, rows.shape[2])
+
+    measured = jnp.concatenate([steps(e.measured[:, :-1]), steps(e.measured[:, 1:])], axis=1)
+    after = e.valid[:, 1:] & e.valid[:, :-1].all(axis=2, keepdims=True)
+    valid = jnp.concatenate([jnp.zeros_like(steps(after)), steps(after)], axis=1)
+    own = plant.changed(sensor=Sensor(plant.process_noise_sd, jnp.zeros(after.shape[2])))
+    return own, Experiments(
+        inputs=steps(e.inputs),
+        measured=measured,
+        valid=valid,
+        initial_state=measured[:, 0],
+        initial_state_known=True,
+        next_inputs=None if e.next_inputs is None else steps(e.next_inputs),
+    )
+
+
+def of_transitions(
+    experiments: Experiments, values: Float[Array, "step 2 output"]
+) -> Float[Array, "experiment sample output"]:
+    """Values of the ends of all `transitions`, by experiment; NaN at its first sample."""
+    shape = experiments.measured.shape
+    ends = values[:, 1].reshape(shape[0], -1, shape[2])
+    return jnp.concatenate([jnp.full_like(ends[:, :1], jnp.nan), ends], axis=1)
 
 
 class Prediction(eqx.Module):

@@ -42,8 +42,10 @@ from .contract import (
     Basis,
     Estimate,
     Experiments,
+    Prediction,
     Status,
     simulate_experiments,
+    transitions,
 )
 from .diagnosis import (
     chance_of_fit,
@@ -93,7 +95,7 @@ from .prior_knowledge import PriorLike, with_prior
 from .profile import profile_intervals
 from .remedies import Question, Suspect, outliers, suspects, suspects_in
 from .result import Fitted, Identification, Noise
-from .validation import fitted_all, state_from, validated, way_to_state
+from .validation import fitted_all, predicted_in_steps, state_from, validated, way_to_state
 
 InitialState = Literal["auto", "free", "known"]
 Intervals = Literal["linear", "profile"]
@@ -191,7 +193,8 @@ def identify(
         raise ValueError("validate_columns need a held-out record (--validate)")
     plant = plant_from(plant_named_by(given[0]) if plant is None else plant)
     estimator, begin = _chosen(estimator, plant, start, hold)
-    if plant.definition.is_disturbed and not isinstance(estimator, PEM):
+    by_steps = plant.definition.observes_state and isinstance(estimator, NLS)
+    if plant.definition.is_disturbed and not (by_steps or isinstance(estimator, PEM)):
         raise ValueError(
             f"plant {plant.definition.name!r} has process noise, which {estimator.name} takes for "
             "noise of its sensors: use the estimator pem"
@@ -233,16 +236,23 @@ def identify(
         require_complete(estimator, [*records, *validation], linear)
     plant = sampled_as([*records, *validation], plant)
     known = known and all(len(parts_of(record)) == 1 for record in records)
-    experiments = experiments_of(plant, records, known, linear)
+    whole = experiments_of(plant, records, known, linear)
+    seen, experiments = transitions(plant, whole) if by_steps else (plant, whole)
     progress("first search", 0.0, 1.0)
-    find = partial(_suspects, plant, records, experiments, estimator, begin, linear, progress)
+    find = partial(_suspects, seen, records, experiments, estimator, begin, linear, progress)
     too = PRIOR_TOO * bool(num_priors)
     try:
-        fit = fit_of(plant, experiments, estimator, begin, progress)
+        fit = fit_of(seen, experiments, estimator, begin, progress)
     except NothingLeftError as refusal:
         raise _with_causes(str(refusal) + too, find(refusal.fit, False)[0]) from None
-    residual = _residuals(plant, records, experiments, estimator, fit)
-    fitted = fitted_all(plant, records, experiments, fit.estimate, residual)
+    params, prediction = fit.estimate.params, fit.estimate.prediction
+    if by_steps:
+        own = seen, whole, experiments, params, np.asarray(fit.estimate.residual)
+        error, prediction = predicted_in_steps(*own)
+        residual = by_record(records, error)
+    else:
+        residual = _residuals(plant, records, experiments, estimator, fit)
+    fitted = fitted_all(plant, records, whole, params, residual, prediction)
     is_normal = isinstance(estimator, NLS) and estimator.likelihood == "normal"
     is_judged = is_normal and not fit.has_ended_in(Status.NOT_FINITE)
     is_fit = not is_judged or _explains(records, residual, int(fit.free.sum()) - num_priors)
@@ -259,22 +269,23 @@ def identify(
     }
     wrong = [n for n, p in structure.items() if p < RARE / len(structure)] * fit.is_successful
     covariance, degrees, factor, verdict = _confidence(
-        plant, experiments, estimator, fit, whiteness, uncertain_sd, bool(wrong)
+        seen, experiments, estimator, fit, whiteness, uncertain_sd, bool(wrong), by_steps
     )
     others = (
         *(s for record in [*records, *validation] for s in _other_plant(record, plant)),
         *given_twice(records, validation),
     )
     wrong = _wrong_structure(wrong, factor, estimator)
-    large = _above_declared(plant, fit) if fit.is_successful else ()
-    astray = _simulates_poorly(fitted) if fit.is_successful and isinstance(estimator, PEM) else ()
+    large = _above_declared(seen, fit) if fit.is_successful else ()
+    is_predicted = fit.is_successful and prediction is not None
+    astray = _simulates_poorly(fitted) if is_predicted else ()
     remedies = *_remedies(found), *where
     verdict = (*others, *wrong, *large, *astray, *remedies, *_agreement(fit), *verdict)
     names = names_of(plant.definition.parameters)
     values = np.array([float(value) for value in fit.estimate.params])
     sd = np.where(fit.free, np.sqrt(np.maximum(np.diag(covariance), 0.0)), np.nan)
     half = np.where(fit.free, half_95(covariance, degrees), np.nan)
-    if isinstance(estimator, NLS) and fit.is_successful:
+    if isinstance(estimator, NLS) and fit.is_successful and not by_steps:
         coarse = too_coarse(plant, experiments, fit.estimate, fit.free, sd)
         verdict = (*coarse, *verdict)
     ends = np.stack([values - half, values + half], axis=1)
@@ -285,7 +296,7 @@ def identify(
     if intervals == "profile" and isinstance(estimator, NLS) and fit.is_successful:
         estimate = jax.device_put(fit.estimate)
         ends, profiles = profile_intervals(
-            plant,
+            seen,
             experiments,
             estimator,
             estimate,
@@ -315,10 +326,10 @@ def identify(
             for record, share in zip(validation, shares, strict=True)
         ),
         initial_state_known=known,
-        noise=_noise(plant.definition, fit.estimate),
+        noise=_noise(plant.definition, prediction),
         starts=tuple(float(end.cost) for end in (fit.estimate, *fit.others)) if fit.others else (),
         profiles=profiles,
-        basis=Basis(plant, experiments, estimator, fit.estimate, fit.free, uncertain_sd),
+        basis=Basis(seen, experiments, estimator, fit.estimate, fit.free, uncertain_sd),
     )
 
 
@@ -506,11 +517,12 @@ def _confidence(
     whiteness: Mapping[str, float],
     uncertain: np.ndarray,
     is_wrong: bool,
+    by_steps: bool,
 ) -> tuple[np.ndarray, np.ndarray, float, tuple[str, ...]]:
     """Covariance of the estimates, its degrees of freedom, and the sentences of the verdict.
 
     A wrong structure widens what the data tell, and not what a prior tells: by the factor that
-    stands before the sentences.
+    stands before the sentences. Intervals from one-step predictions assume white noise.
     """
     names = names_of(plant.definition.parameters)
     covariance, its = np.asarray(fit.estimate.covariance), fit.estimate.degrees
@@ -523,10 +535,11 @@ def _confidence(
     not_white = f"the residual of {' and '.join(coloured)} is not white: the intervals"
     parameters = zip(plant.definition.parameters, fit.estimate.params, strict=True)
     size = np.array([float(value) if p.positive else p.scale for p, value in parameters])
-    if not isinstance(estimator, NLS):
-        if coloured:
-            remarks.append(f"{not_white} assume white noise, and are too narrow")
-    elif coloured or uncertain.any() or is_wrong:
+    if coloured and (by_steps or not isinstance(estimator, NLS)):
+        remarks.append(f"{not_white} assume white noise, and are too narrow")
+    if by_steps:
+        coloured, is_wrong = [], False
+    if isinstance(estimator, NLS) and (coloured or uncertain.any() or is_wrong):
         estimate, free = jax.device_put((fit.estimate, fit.free))
         S, residual = map(np.asarray, estimator.sensitivity(plant, experiments, estimate, free))
         prior = np.asarray(estimator.prior_information(plant, estimate, S.shape[-1], free))
@@ -584,9 +597,8 @@ def _sd_in_words(plant: AbstractPlant, uncertain: np.ndarray) -> str:
     return ", ".join(f"{c.name} ({f'{sd:.3g} {c.unit}'.strip()})" for c, sd in pairs if sd)
 
 
-def _noise(description: PlantDescription, estimate: Estimate) -> Noise | None:
-    """Estimated noise by name, of estimators that have one."""
-    p = estimate.prediction
+def _noise(description: PlantDescription, p: Prediction | None) -> Noise | None:
+    """Estimated noise by name, of estimators that have a one-step prediction."""
     if p is None:
         return None
     of_states = zip(names_of(description.states), map(float, p.process_noise), strict=True)
@@ -705,6 +717,8 @@ def _suspects(
     """What the plant may leave out, where more than noise is left, and in which rows."""
     if not isinstance(estimator, NLS) or fit.has_ended_in(Status.NOT_FINITE):
         return (), ()
+    if plant.definition.is_disturbed:
+        return (), ()  # disturbances explain what a suspect would
     if estimator.likelihood != "normal" or estimator.prior is not None:
         return (), ()  # outliers would hide them, a prior explain what they explain
     residual, valid = np.asarray(fit.estimate.residual), np.asarray(experiments.valid)
@@ -776,7 +790,7 @@ def _explains(records: Sequence[Record], residual: Sequence[np.ndarray], unknown
     What has no more values than unknowns cannot be tested.
     """
     chances = [
-        chance_of_fit(finite(record.outputs[:, i]), finite(r[:, i]), unknowns)
+        chance_of_fit(record.outputs[np.isfinite(r[:, i]), i], finite(r[:, i]), unknowns)
         for record, r in zip(records, residual, strict=True)
         for i in range(r.shape[1])
         if np.isfinite(r[:, i]).sum() > unknowns > 0

@@ -30,12 +30,12 @@ from jaxtyping import Array, Float, Key, PRNGKeyArray
 from ..description import LARGEST_SEED, SpreadLike, names_of, require_whole
 from ..excitation import AbstractExcitation
 from ..excitation.catalogue import ExcitationLike
-from ..information import require_noise
+from ..information import require_bound
 from ..plant.catalogue import PlantLike
 from ..progress import SHOWN, Progress
 from ..report.tables import html_table, text_table
 from ..safety import safe_input
-from ..simulation import Experiment, predicted, require_likelihood, run_episode
+from ..simulation import Experiment, predicted, run_episode
 from .evidence import Fit, nearest
 from .prior import PriorPlants
 from .prior_knowledge import PriorLike, plants_of
@@ -313,8 +313,7 @@ def information_gain(
         plant, excitation, options=options, steps=steps, noise=noise, resolution=resolution,
         seed=seed,
     )  # fmt: skip
-    if not require_likelihood(e.plant):
-        require_noise(e.plant)
+    require_bound(e.plant)
     population = plants_of(e.plant, prior, spread)
     reach, normal = population.spread, population.normal
     words = str(reach)

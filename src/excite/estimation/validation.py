@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -19,12 +20,15 @@ from .contract import (
     Estimate,
     Experiments,
     Prediction,
+    of_transitions,
     residual_of,
     simulate_experiments,
+    transitions,
 )
 from .diagnosis import fit_percent
 from .fit import with_initial_state
 from .from_records import by_record, experiments_of, parts_of, starts_at
+from .nls import NLS, Problem
 from .pem import PEM
 from .result import Fitted, Predicted
 
@@ -35,15 +39,43 @@ def fitted_all(
     plant: AbstractPlant,
     records: Sequence[Record],
     experiments: Experiments,
-    estimate: Estimate,
+    params: Params,
     residual: list[np.ndarray],
+    prediction: Prediction | None,
 ) -> tuple[Fitted, ...]:
     """The records with what the plant makes of them."""
-    predicted = _predicted(plant, records, estimate.prediction)
-    if estimate.prediction is not None:
-        residual = by_record(records, _simulation_error(plant, experiments, estimate.params))
+    predicted = _predicted(plant, records, prediction)
+    if prediction is not None:
+        residual = by_record(records, _simulation_error(plant, experiments, params))
     parts = zip(records, residual, predicted, strict=True)
     return tuple(_fitted(plant.definition, *part) for part in parts)
+
+
+def predicted_in_steps(
+    plant: AbstractPlant,
+    whole: Experiments,
+    steps: Experiments,
+    params: Params,
+    residual: Float[np.ndarray, "step 2 output"],
+) -> tuple[Float[np.ndarray, "experiment sample output"], Prediction]:
+    """The residual of whole experiments, and their one-step prediction.
+
+    Args:
+        plant: whose sensor has the noise of the process.
+        whole: the experiments.
+        steps: their `transitions`.
+        residual: of these.
+    """
+    own, found = jax.device_put((params, residual))
+    sd = Problem(plant, steps, own, None).noise_sd(found)
+    error = of_transitions(whole, jnp.where(steps.valid, found, jnp.nan))
+    prediction = Prediction(
+        outputs=whole.measured - jnp.nan_to_num(error),  # without a step before: as measured
+        sd=jnp.broadcast_to(sd, error.shape),
+        process_noise=sd / jnp.sqrt(plant.dt),
+        noise_sd=jnp.zeros_like(sd),
+    )
+    return jax.device_get((error, prediction))
 
 
 def _fitted(
@@ -171,6 +203,11 @@ def validated(
     if isinstance(estimator, PEM) and estimate.prediction is not None:
         found = jax.device_put((estimate.params, estimate.prediction))
         prediction = jax.device_get(estimator.predict(plant, experiments, *found))
+    elif isinstance(estimator, NLS) and plant.definition.observes_state:
+        seen, steps = transitions(plant, experiments)
+        own = jax.device_put(estimate.params)
+        error = residual_of(steps, simulate_experiments(seen, own, steps, steps.initial_state))
+        prediction = predicted_in_steps(seen, experiments, steps, own, np.asarray(error))[1]
     residual, fits = _begun(plant, record, experiments, estimator, estimate, share)
     if fits is None:
         raise ValueError(

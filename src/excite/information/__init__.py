@@ -17,6 +17,7 @@ from .fisher import fisher_information as fisher_information
 from .fisher import information as information
 from .fisher import marginal_information as marginal_information
 from .fisher import relative_size as relative_size
+from .fisher import require_bound as require_bound
 from .fisher import require_noise as require_noise
 from .fisher import running_information as running_information
 from .fisher import sensitivity as sensitivity

@@ -26,7 +26,7 @@ from ..plant.catalogue import PlantLike
 from ..record import Record
 from ..record.table import data_frame
 from ..report.results import information_html, information_text, wrapped
-from ..simulation import Experiment, response, run_episode
+from ..simulation import Experiment, predicted, require_likelihood, response, run_episode
 from .identifiability import Structure, practically, structure
 
 if TYPE_CHECKING:
@@ -46,6 +46,12 @@ def require_noise(plant: AbstractPlant) -> None:
         )
     if not np.all(np.asarray(plant.sensor.sd) > 0):
         raise ValueError("a sensor without noise has no Cramér-Rao bound; give it a noise_sd")
+
+
+def require_bound(plant: AbstractPlant) -> None:
+    """Raises ValueError where the records of a plant have no likelihood, or no Cramér-Rao bound."""
+    if not require_likelihood(plant):
+        require_noise(plant)
 
 
 def sensitivity(
@@ -92,6 +98,7 @@ def experiment_information(
     params: Params,
     inputs: Float[Array, "time input"],
     *,
+    measured: Float[Array, "time+1 output"] | None = None,
     initial_state_known: bool = True,
 ) -> Information:
     """Relative Fisher information of an experiment with these inputs and this plant's sensor.
@@ -99,6 +106,7 @@ def experiment_information(
     In logarithms of positive parameters, and of free ones over their scale.
 
     Args:
+        measured: of a plant whose state is observed, which begins every step there.
         initial_state_known: False where the initial state must be estimated too; the
             experiment starts at the plant's initial state in either case.
     """
@@ -106,15 +114,18 @@ def experiment_information(
     theta = jnp.stack([jnp.asarray(p, float) for p in params])
     size, num_params = relative_size(plant, params), len(theta)
     num_states = 0 if initial_state_known else len(plant.initial_state)
+    is_observed = measured is not None and plant.definition.observes_state
 
     def outputs(change: Array) -> Array:
-        values = theta + size * change[:num_params]
+        own = plant.Params(*(theta + size * change[:num_params]))
+        if measured is not None and is_observed:
+            return predicted(plant, own, inputs, measured)[0]
         moved = change[num_params:] if num_states else 0.0
-        return response(plant, plant.Params(*values), inputs, plant.initial_state + moved)
+        return response(plant, own, inputs, plant.initial_state + moved)
 
     S = sensitivity(outputs, jnp.zeros(num_params + num_states))
-    if initial_state_known:
-        return fisher_information(S, plant.sensor.sd)
+    if is_observed or initial_state_known:
+        return fisher_information(S, plant.process_noise_sd if is_observed else plant.sensor.sd)
     return marginal_information(S, plant.sensor.sd, num_params)
 
 
