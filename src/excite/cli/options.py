@@ -190,6 +190,13 @@ def uncertainty_option(help: str) -> Callable[[Callback], Callback]:
     )  # fmt: skip
 
 
+prior_option = click.option(
+    "--prior", type=NAMES, multiple=True, metavar="NAME=DISTRIBUTION,...",
+    help="Plants are drawn from these distributions of parameters (normal:MEAN:SD, "
+    "lognormal:MEDIAN:SD), others within the spread; the table has the expected gain.",
+)  # fmt: skip
+
+
 def json_option(command: Callback) -> Callback:
     """`--json`: one JSON object on stdout and nothing else."""
     return click.option(

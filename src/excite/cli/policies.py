@@ -18,6 +18,7 @@ from .options import (
     computing,
     json_option,
     merged,
+    prior_option,
     progress_bar,
     show_json,
     show_table,
@@ -96,6 +97,7 @@ def _worst(certificate: Mapping[str, Any] | None) -> str:
     show_default=True,
     help="Spread of the plants (0.3, factor:3).",
 )
+@prior_option
 @uncertainty_option("What else may differ, as in 'excite falsify'.")
 @coast_option
 @click.option("--noise", type=NUMBERS, multiple=True, help="Noise sd of an output, in its unit.")
@@ -110,7 +112,8 @@ def evaluate(policy: str, as_json: bool, **options: Any) -> None:
     from ..study.evaluate import evaluate as evaluated
 
     on_rig, filtered, noise = (options.pop(n) for n in ("on_rig", "filtered", "noise"))
-    options["uncertainty"] = merged(options["uncertainty"])
+    for name in ("uncertainty", "prior"):
+        options[name] = merged(options[name])
     with warnings_shown(), progress_bar(f"evaluating {policy}") as progress:
         found = evaluated(
             policy, rig=on_rig, filter=filtered, noise=merged(noise), progress=progress, **options

@@ -18,6 +18,7 @@ from .options import (
     computing,
     json_option,
     merged,
+    prior_option,
     uncertainty_option,
 )
 from .study import running, show_comparison
@@ -45,6 +46,9 @@ def _options(command: Any) -> Any:
                          help="Numbers that the policy carries from step to step; default none."),
             click.option("--clock", type=Number(), multiple=True, metavar="HZ",
                          help="Also observe sine and cosine of this frequency."),
+            click.option("--change-price", type=Number(min=0), default=0.0, metavar="PRICE",
+                         help="Subtracted from the information for each squared change of an "
+                         "input [1 / input unit²]; default none."),
             click.option("--updates", type=WholeNumber(1), metavar="N",
                          help="Gradient updates; default 1000."),
             click.option("--set", "training", type=VALUES, multiple=True,
@@ -55,6 +59,7 @@ def _options(command: Any) -> Any:
                          show_default=True,
                          help="Plants are drawn from nominal values ± this fraction, or within a "
                          "factor (factor:3)."),
+            prior_option,
             uncertainty_option("What else may differ: the policy is made safe there too."),
             coast_option,
             click.option("--steps", type=WholeNumber(2, 1_000_000), default=500,
@@ -84,7 +89,7 @@ def train(plant: str, out: Path, as_json: bool, **options: Any) -> None:
     from ..study.table import finished_table
     from ..study.train import train as trained
 
-    for name in ("goal", "training", "noise", "output_scale"):
+    for name in ("goal", "training", "noise", "output_scale", "prior"):
         options[name] = merged(options[name])
     options["uncertainty"] = merged(options["uncertainty"])
     options["objective"] = options["objective"] or "D"

@@ -115,6 +115,27 @@ class BoundByLength(Saved):
     cramer_rao_percent: dict[str, tuple[Number, ...]]
 
 
+class Nats(Saved):
+    """A mean in nats, with its standard error."""
+
+    mean: Number
+    std_error: Number
+
+
+class ExpectedGain(Saved):
+    """Expected information gain: bounds, of how many plants and samples, and what to know of them.
+
+    Of an agent they are means over its viable seeds.
+    """
+
+    lower: Nats
+    upper: Nats
+    plants: Count
+    samples: Count
+    from_prior: Annotated[bool, Strict()]
+    warnings: tuple[str, ...] = ()
+
+
 class Row(Saved):
     """One method and one estimator over all episodes, or an agent over all its seeds."""
 
@@ -137,6 +158,7 @@ class Row(Saved):
     coverage95_percent: dict[str, Number]
     beyond_6_std_errors: Count
     bound_by_length: BoundByLength | None = None
+    expected_gain: ExpectedGain | None = None
     viable_seeds: Count | None = None
     seeds: Count | None = None
     train_seconds: float | None = None
@@ -245,6 +267,8 @@ class StudyFacts(Saved):
     num_steps: int
     seed: int
     spread: float | str
+    prior: dict[str, str] = {}
+    gain: Options | None = None
     uncertainty: Options = {}
     coast: int = 0
     sensor: dict[str, Options] = {}

@@ -18,7 +18,16 @@ from ..description import Spread, unknown
 from ..files import csv_text, damaged, read_json
 from ..record.table import data_frame
 from .numbers import mean_sd, number
-from .rows import Difference, Gap, PublishedRow, RigCounts, Row, Saved, StudyFacts
+from .rows import (
+    Difference,
+    ExpectedGain,
+    Gap,
+    PublishedRow,
+    RigCounts,
+    Row,
+    Saved,
+    StudyFacts,
+)
 from .tables import Table, html_table, markdown_table, text_table
 
 if TYPE_CHECKING:
@@ -73,7 +82,7 @@ class StudyTable(Saved):
         """The table with its footnotes, no line wider than `width` where possible."""
         header, cells = self.cells()
         table = text_table(self.study.heading, header, cells, width, NUM_LABELS)
-        notes = "\n".join(textwrap.fill(note, width) for note in footnotes(self.study))
+        notes = "\n".join(textwrap.fill(note, width) for note in footnotes(self.study, self.rows))
         return f"{table}\n\n{notes}"
 
     def _repr_html_(self) -> str:
@@ -129,7 +138,7 @@ class StudyTable(Saved):
     def markdown(self) -> str:
         """The table as Markdown, with its footnotes and differences."""
         lines = [f"# {self.study.heading}", "", *markdown_table(*self.cells())]
-        lines += [line for note in footnotes(self.study) for line in ("", note)]
+        lines += [line for note in footnotes(self.study, self.rows) for line in ("", note)]
         if self.differences:
             title = f"## Differences, {self.differences[0].estimator}"
             lines += ["", title, "", DIFFERENCES, ""]
@@ -139,7 +148,7 @@ class StudyTable(Saved):
     def latex(self) -> str:
         """The table as LaTeX (booktabs), its footnotes as comments."""
         header, cells = self.cells()
-        lines = [f"% {note}" for note in footnotes(self.study)]
+        lines = [f"% {note}" for note in footnotes(self.study, self.rows)]
         lines += [r"\begin{tabular}{ll" + "r" * (len(header) - NUM_LABELS) + "}", r"\toprule"]
         lines += [_latex_row(header), r"\midrule", *map(_latex_row, cells)]
         return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"]) + "\n"
@@ -163,6 +172,8 @@ class StudyTable(Saved):
                 columns[key] = [_known(getattr(row.on_rig, key, None)) for row in rows]
         columns["log_det_information"] = [row.log_det_information for row in rows]
         columns["log_det_information_sd"] = [row.log_det_information_sd for row in rows]
+        if any(row.expected_gain is not None for row in rows):
+            columns |= _columns_of_gain(rows)
         if any(row.d_efficiency is not None for row in rows):
             columns["d_efficiency"] = [_known(row.d_efficiency) for row in rows]
         largest = rows[0].max_abs_output
@@ -198,6 +209,18 @@ def _columns_by_seed(rows: Sequence[Row]) -> dict[str, list[float]]:
     return {**columns, "evaluations_by_seed": evaluations}
 
 
+def _columns_of_gain(rows: Sequence[Row]) -> dict[str, list[float]]:
+    """Bounds on the expected gain and their standard errors [nats]."""
+    columns: dict[str, list[float]] = {}
+    for bound in ("lower", "upper"):
+        found = [getattr(row.expected_gain, bound, None) for row in rows]
+        columns[f"gain_{bound}_nats"] = [math.nan if b is None else b.mean for b in found]
+        columns[f"gain_{bound}_nats_error"] = [
+            math.nan if b is None else b.std_error for b in found
+        ]
+    return columns
+
+
 def _min_median_max(values: Sequence[int]) -> tuple[float, float, float]:
     return min(values), statistics.median(values), max(values)
 
@@ -225,6 +248,7 @@ def _header(rows: Sequence[Row]) -> list[str]:
         header += [f"{name} error %", "bound %"]
     header += [f"max {largest.output} {largest.unit}", "violations (95 %)", "failed"]
     header += [*_rig_cells(rows[0].on_rig, rows[0].evaluations), "log det"]
+    header += ["gain nats"] * any(row.expected_gain is not None for row in rows)
     header += ["D-efficiency"] * any(row.d_efficiency is not None for row in rows)
     return header + ["viable seeds", "training"] * _is_trained(rows)
 
@@ -244,9 +268,20 @@ def _cells(rows: Sequence[Row], row: Row) -> list[str]:
         *_rig_cells(row.on_rig, row.evaluations).values(),
         number(row.log_det_information, 4),
     ]
+    if any(other.expected_gain is not None for other in rows):
+        cells.append(gain_cell(row.expected_gain))
     if any(other.d_efficiency is not None for other in rows):
         cells.append(number(row.d_efficiency, 2))
     return cells + _training_cells(row) * _is_trained(rows)
+
+
+def gain_cell(gain: ExpectedGain | None) -> str:
+    """The expected gain with its standard error; both bounds where they differ by more than it."""
+    if gain is None:
+        return "–"
+    bounds = [f"{bound.mean:.2f} ± {bound.std_error:.2f}" for bound in (gain.lower, gain.upper)]
+    is_tight = gain.upper.mean - gain.lower.mean < gain.lower.std_error
+    return bounds[0] if is_tight else " to ".join(bounds)
 
 
 def violations_cell(row: Row) -> str:
@@ -295,8 +330,8 @@ def _published_cells(rows: Sequence[Row], row: Row, published: PublishedRow) -> 
     return cells
 
 
-def footnotes(study: StudyFacts) -> list[str]:
-    """The footnotes of the table."""
+def footnotes(study: StudyFacts, rows: Sequence[Row] = ()) -> list[str]:
+    """The footnotes of the table; the rows are those whose warnings are told."""
     notes = [study.note] * bool(study.note) + [
         "Errors are relative errors in percent, mean ± standard deviation over the estimates "
         "that did not fail. The bound is the mean Cramér-Rao bound of the same data, a standard "
@@ -318,6 +353,22 @@ def footnotes(study: StudyFacts) -> list[str]:
             f"as if its parameters were known ({study.clairvoyant.starts} starts, "
             f"{study.clairvoyant.updates:,} updates); it is no upper limit."
         )
+    if study.gain is not None:
+        samples = f"{study.gain['samples']:,} samples"
+        kind = f"{samples} of the prior: figures of other numbers cannot be compared"
+        kind = kind if study.gain["from_prior"] else f"{samples} near the posterior"
+        notes.append(
+            "gain is the expected information gain: mean and standard error over "
+            f"{study.gain['plants']:,} plants, its evidence from {kind}. Two figures are a lower "
+            "and an upper bound."
+        )
+        told = {
+            f"{row.method}: {warning}."
+            for row in rows
+            if row.expected_gain is not None
+            for warning in row.expected_gain.warnings
+        }
+        notes += sorted(told)
     if study.uncertainty:
         signals = "; the clairvoyant signals are for plants of the spread alone"
         notes.append(
@@ -344,6 +395,9 @@ def violations_note(study: StudyFacts) -> str:
     spread = Spread.of(study.spread)
     within = f"a factor of {spread.reach:g}" if spread.is_factor else f"± {100 * spread.reach:g} %"
     declared = f"parameters within {within}"
+    if study.prior:
+        given = ", ".join(f"{name} {distribution}" for name, distribution in study.prior.items())
+        declared = f"{given}, any others within {within}"
     if study.uncertainty:
         ranges = ", ".join(f"{name} {_range(value)}" for name, value in study.uncertainty.items())
         declared += f", in addition {ranges}"

@@ -24,12 +24,21 @@ from ..environment import (
 )
 from ..estimation import ARX, NLS
 from ..estimation.catalogue import estimator_named
+from ..estimation.prior import PriorPlants
 from ..plant import AbstractARXPlant, AbstractPlant
 from ..plant.uncertainty import Range, Uncertainty
 from ..policy import Layout
 from ..safety import watched_levels
 from ..training.settings import AGAINST_UNCERTAINTY, ONE_START, GradientSettings, PPOSettings
-from .settings import Count, EstimatorSettings, Positive, Settings, SpreadSetting, checked
+from .settings import (
+    Count,
+    EstimatorSettings,
+    Magnitude,
+    Positive,
+    Settings,
+    SpreadSetting,
+    checked,
+)
 
 METHODS = {"ppo": PPOSettings, "gradient": GradientSettings}
 """Trainers, and their hyper-parameters."""
@@ -47,6 +56,8 @@ class RewardSettings(Settings):
         goals: by parameter, the relative error that is scaled to one, default one.
         estimator: in the reward, by its name in the study or a shipped name; an ARX estimator,
             or `nls` to first order in the noise, for any plant.
+        change_price: of the squared change of an input [1 / input unit²], subtracted from
+            information at every step.
         start_covariance: replaces that of the estimator; with a smaller one its bias, which
             is a smooth function of the inputs, is larger than the effect of sensor noise.
     """
@@ -56,6 +67,7 @@ class RewardSettings(Settings):
     weight: Positive = 1.0
     criterion: Literal["D", "A", "E"] = "D"
     max_sensitivity: Positive = MAX_SENSITIVITY
+    change_price: Magnitude = 0.0
     goals: dict[str, Positive] = {}
     estimator: str = "arx-rls"
     start_covariance: Positive | None = None
@@ -166,6 +178,7 @@ class Agent:
         num_steps: int,
         ranges: Mapping[str, Range] = MappingProxyType({}),
         coast: int = 0,
+        prior: PriorPlants | None = None,
     ) -> Env:
         """The decision process of this agent.
 
@@ -175,6 +188,7 @@ class Agent:
             num_steps: of an experiment.
             ranges: declared uncertainty of the study.
             coast: of the study.
+            prior: of the study, in place of the spread; information is then rewarded in nats.
 
         Raises:
             ValueError: for a target, output or input that does not exist, an amplitude
@@ -188,17 +202,20 @@ class Agent:
             raise ValueError(
                 f"plant {plant.definition.name!r} has no critical level: leave uncertainty out"
             )
+        if prior is not None and decision.spread is not None:
+            raise ValueError("an agent of a study with a prior has that prior: leave spread out")
         if coast and self.method == "ppo":
             raise ValueError("ppo does not train on the coast: take the method gradient")
         return Env.of(
             plant,
-            objective=self._objective(plant, own),
+            objective=self._objective(plant, own, prior),
             layout=self._layout(plant, num_steps),
             spread=own,
             penalty_weight=1 / num_steps if decision.normalise_penalty else 1.0,
             constants=_ends(plant, decision.constants),
             uncertainty=Uncertainty.of(plant, own, ranges) if ranges else None,
             coast=coast,
+            prior=prior,
         )
 
     def ranges(self, of_study: Mapping[str, Range]) -> Mapping[str, Range]:
@@ -226,12 +243,18 @@ class Agent:
             clocks=_cycles(decision.clocks, float(plant.dt)),
         )
 
-    def _objective(self, plant: AbstractPlant, spread: SpreadLike) -> AbstractObjective:
-        terms = [self._term(reward, plant, spread) for reward in self.decision.terms]
-        return WeightedSum(terms) if terms else self._term(self.decision, plant, spread)
+    def _objective(
+        self, plant: AbstractPlant, spread: SpreadLike, prior: PriorPlants | None
+    ) -> AbstractObjective:
+        terms = [self._term(reward, plant, spread, prior) for reward in self.decision.terms]
+        return WeightedSum(terms) if terms else self._term(self.decision, plant, spread, prior)
 
     def _term(
-        self, chosen: RewardSettings, plant: AbstractPlant, spread: SpreadLike
+        self,
+        chosen: RewardSettings,
+        plant: AbstractPlant,
+        spread: SpreadLike,
+        prior: PriorPlants | None,
     ) -> AbstractObjective:
         has_mapping = isinstance(plant, AbstractARXPlant)
         form = chosen.reward or ("relative" if has_mapping else "information")
@@ -242,11 +265,13 @@ class Agent:
             return InformationGain(
                 targets,
                 prior_sd_of(spread),
-                chosen.weight,
+                chosen.weight if prior is None else chosen.weight / 2,  # log det to nats
                 criterion=chosen.criterion,
                 max_sensitivity=chosen.max_sensitivity,
                 # A gradient needs no reward before the last step.
                 dense=self.method == "ppo" if chosen.dense is None else chosen.dense,
+                prior=prior,
+                change_price=chosen.change_price,
             )
         own = _estimator(chosen, self.estimators)
         estimator = estimator_named(own.kind, own.options)
@@ -294,7 +319,7 @@ class Agent:
         # Settings that were added later enter only where they are used, so that the
         # fingerprints of earlier trainings stay valid.
         later = {"clocks", "criterion", "max_sensitivity", "input_amplitude", "spread", "dense"}
-        later |= {"constants", "terms", "uncertainty", "memory"}
+        later |= {"constants", "terms", "uncertainty", "memory", "change_price"}
         return {
             "method": self.method,
             "targets": [name for name, chosen in zip(names, mask, strict=True) if chosen],
@@ -333,7 +358,7 @@ def _require_one_reward(process: DecisionSettings) -> None:
 
 
 _USED = {
-    "information": {"dense", "criterion", "max_sensitivity"},
+    "information": {"dense", "criterion", "max_sensitivity", "change_price"},
     "errors of nls": {"goals", "estimator", "max_sensitivity"},
     "errors of an ARX estimator": {"goals", "estimator", "start_covariance"},
 }

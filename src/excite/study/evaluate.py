@@ -15,7 +15,7 @@ from ..policy import POLICY_ENDING, Policy, mismatch, read_policy
 from ..progress import SHOWN, Progress
 from ..report.study_table import StudyTable
 from .methods import compared
-from .spec import plant_tables, study_from
+from .spec import of_prior, plant_tables, study_from
 
 
 def evaluate(
@@ -25,6 +25,7 @@ def evaluate(
     episodes: int = 1000,
     seed: int = 0,
     spread: SpreadLike = 0.3,
+    prior: Mapping[str, str] | None = None,
     uncertainty: Mapping[str, Range] | None = None,
     coast: int = 0,
     noise: Mapping[str, float] | None = None,
@@ -48,6 +49,8 @@ def evaluate(
         seed: of the plants, the noise and the excitations.
         spread: parameters are uniform in nominal value ± spread times their scale, or within a
             factor (`factor:3`).
+        prior: distributions of parameters, as for `information_gain`; the others have the spread.
+            The table then has the expected information gain.
         uncertainty: what else may differ, as in `falsify`: plants are drawn from it, and
             estimated as if nothing did.
         coast: samples after an experiment, under the input that ends it, whose outputs count for
@@ -81,6 +84,7 @@ def evaluate(
             "num_steps": trained.layout.num_steps,
             "seed": seed,
             "spread": spread,
+            **of_prior(prior),
             "uncertainty": by_name("uncertainty", uncertainty, "a dict of ranges by name"),
             "coast": coast,
             "methods": {name: {"excitation": word}},

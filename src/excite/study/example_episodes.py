@@ -41,11 +41,10 @@ def example_episodes(
         seeds: by agent, the one to show.
     """
     plant, episodes = study.build_plant(), {}
-    box = study.build_uncertainty(plant)
+    given = study.build_uncertainty(plant), study.coast, study.build_prior(plant)
     keys = episode_keys(study)[:CHUNK]  # as for the table: no new compilation
     for name, seed, excitation in _excitations(study, plant, folder, seeds):
-        choices = study.num_steps, study.spread, keys, box, study.coast
-        batch = run_episodes(plant, excitation, *choices)
+        batch = run_episodes(plant, excitation, study.num_steps, study.spread, keys, *given)
         run, params = jax.tree.map(lambda leaf: leaf[0], (batch.trajectory, batch.params))
         estimator, estimates = _running(study, plant, run.inputs, run.measured)
         about = {"estimator": estimator, **({} if seed is None else {"seed": seed})}

@@ -24,8 +24,9 @@ def seed_folder(folder: Path, agent: str, seed: int) -> Path:
 def agent_settings(study: Study, plant: AbstractPlant, agent: str) -> dict[str, object]:
     """All settings, except the plant, that determine the result of a seed, JSON-ready."""
     own = study.agent(agent).settings(plant, study.uncertainty)
-    coast = {"coast": study.coast} if study.coast else {}  # earlier fingerprints stay valid
-    return {**own, "spread": study.spread, "num_steps": study.num_steps, **coast}
+    later = {"coast": study.coast, "prior": study.prior}
+    used = {name: value for name, value in later.items() if value}  # older fingerprints stay valid
+    return {**own, "spread": study.spread, "num_steps": study.num_steps, **used}
 
 
 def fingerprint(study: Study, plant: AbstractPlant, agent: str) -> str:

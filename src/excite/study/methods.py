@@ -17,18 +17,20 @@ from jaxtyping import Array, Float, Key
 
 from ..description import names_of
 from ..environment import Episodes, run_episodes
-from ..estimation import AbstractEstimator, stack_experiments
+from ..estimation import NLS, AbstractEstimator, stack_experiments
+from ..estimation.contract import transitions
+from ..estimation.information_gain import information_gain
 from ..excitation import AbstractExcitation
-from ..information import d_optimality, require_noise
+from ..information import d_optimality, require_bound
 from ..plant import AbstractPlant
 from ..progress import Progress
-from ..report.rows import BoundByLength, Row, StudyFacts
+from ..report.rows import BoundByLength, ExpectedGain, Nats, Row, StudyFacts
 from ..report.study_table import StudyTable
 from ..rig.filter import SafetyFilter
 from ..rig.simulated import drawn_hardware, evaluate_on_rig, readings_per_sample
 from ..safety import Supervision, Trip
 from ..simulation import Trajectory
-from .spec import Study
+from .spec import GainSettings, Study
 from .statistics import Scores, table_row
 
 CHUNK = 100
@@ -44,8 +46,10 @@ def estimate_all(
 
     def one(rows: tuple[Array, Array]) -> tuple[Array, Array, Array]:
         inputs, measured = rows
-        data = stack_experiments(plant, [inputs], [measured], True)
-        estimate = estimator(plant, data)
+        seen, data = plant, stack_experiments(plant, [inputs], [measured], True)
+        if plant.definition.observes_state and isinstance(estimator, NLS):
+            seen, data = transitions(plant, data)
+        estimate = estimator(seen, data)
         variance = jnp.diagonal(estimate.covariance)
         return jnp.stack(estimate.params), jnp.sqrt(variance), estimate.status
 
@@ -70,9 +74,9 @@ def num_chunks(study: Study) -> int:
 def player_of(study: Study, plant: AbstractPlant) -> Play:
     """A function that makes the study's experiments: on the plant, or on its simulated rig."""
     if study.rig is None:
-        box = study.build_uncertainty(plant)
+        given = study.build_uncertainty(plant), study.coast, study.build_prior(plant)
         return lambda excitation, keys: (
-            run_episodes(plant, excitation, study.num_steps, study.spread, keys, box, study.coast),
+            run_episodes(plant, excitation, study.num_steps, study.spread, keys, *given),
             {},
         )
     rules, numbers = Supervision.of(plant.description), study.rig.numbers()
@@ -107,7 +111,7 @@ def evaluate_method(
     Raises:
         ValueError: for a sensor without noise, which has no Cramér-Rao bound.
     """
-    require_noise(plant)
+    require_bound(plant)
     estimators = study.build_estimators(plant)
     middle = np.mean(plant.input_limits, axis=0)
     keys = episode_keys(study)
@@ -125,16 +129,42 @@ def evaluate_method(
     if study.lengths:
         bounds = {"bound_by_length": _bound_by_length(study, plant, excitation)}
         rows = [row.model_copy(update=bounds) for row in rows]
+    if study.gain is not None:
+        gained = {"expected_gain": _expected_gain(study, plant, excitation)}
+        rows = [row.model_copy(update=gained) for row in rows]
     return rows, np.sqrt(np.concatenate(squares).mean(axis=0))
+
+
+def _expected_gain(
+    study: Study, plant: AbstractPlant, excitation: AbstractExcitation
+) -> ExpectedGain:
+    """What an experiment of the study is expected to tell."""
+    own = (study.gain or GainSettings()).model_dump()
+    found = information_gain(
+        plant, excitation, steps=study.num_steps, prior=study.prior or None, spread=study.spread,
+        seed=study.seed, progress=lambda *_: None, **own,
+    )  # fmt: skip
+    lower, upper = (
+        Nats(mean=bound.value, std_error=bound.std_error) for bound in (found.lower, found.upper)
+    )
+    return ExpectedGain(
+        lower=lower,
+        upper=upper,
+        plants=found.num_plants,
+        samples=found.num_samples,
+        from_prior=found.from_prior,
+        warnings=found.warnings,
+    )
 
 
 def _bound_by_length(
     study: Study, plant: AbstractPlant, excitation: AbstractExcitation
 ) -> BoundByLength:
     """Bounds of shorter experiments; signals are designed again for each length."""
-    keys, box = episode_keys(study)[:CHUNK], study.build_uncertainty(plant)
+    keys = episode_keys(study)[:CHUNK]
+    given = keys, study.build_uncertainty(plant), 0, study.build_prior(plant)
     every = [
-        run_episodes(plant, excitation, length, study.spread, keys, box) for length in study.lengths
+        run_episodes(plant, excitation, length, study.spread, *given) for length in study.lengths
     ]
     bounds = [np.asarray(episodes.bound).mean(axis=0) for episodes in every]
     names = names_of(plant.definition.parameters)

@@ -11,14 +11,16 @@ import jax
 import pydantic
 from pydantic import Field
 
-from ..description import names_of, unknown, wrong_type
+from ..description import by_name, names_of, unknown, wrong_type
 from ..environment import Env, InformationGain
 from ..estimation import ARX, AbstractEstimator, Decrement
 from ..estimation.catalogue import ESTIMATORS, estimator_named
+from ..estimation.prior import PriorPlants
+from ..estimation.prior_knowledge import plants_of
 from ..excitation import AbstractExcitation
 from ..excitation.catalogue import excitation_and_origin, excitation_named
 from ..files import folder_word
-from ..information import require_noise
+from ..information import require_bound
 from ..plant import AbstractARXPlant, AbstractPlant
 from ..plant.catalogue import (
     PlantLike,
@@ -74,6 +76,21 @@ class ClairvoyantSettings(Settings):
     updates: Count = CLAIRVOYANT.num_updates
 
 
+class GainSettings(Settings):
+    """Expected information gain of every method, in nats; see `information_gain`.
+
+    Attributes:
+        plants: that are drawn, each with a record.
+        samples: of the evidence of each record.
+        from_prior: whether these are drawn from the prior: the usual figure of benchmarks, which
+            can only be compared for the same number of samples.
+    """
+
+    plants: Annotated[int, Field(ge=2, le=1_000_000, strict=True)] = 256
+    samples: Annotated[int, Field(ge=1, le=100_000_000, strict=True)] = 1000
+    from_prior: Annotated[bool, Field(strict=True)] = False
+
+
 class RigSettings(Settings):
     """Experiments on the plant's simulated rig (`excite.rig.simulated`), not on the plant.
 
@@ -117,6 +134,9 @@ class Study(Settings):
         seed: of plants, noise and excitations.
         spread: parameters are uniform in nominal value ± spread times their scale (by
             default the nominal value itself), or within a factor such as "factor:3".
+        prior: distributions of parameters ("normal:MEAN:SD", "lognormal:MEDIAN:SD", with SD in
+            percent or not); the others have the spread. Plants are drawn from it.
+        gain: where every method's expected information gain is computed.
         uncertainty: what else may differ, see `Uncertainty`: all are evaluated on plants drawn
             from it; agents by gradient are trained to be safe in it, and falsified.
         coast: samples after an experiment, under the input that ends it, in which it must be safe
@@ -147,6 +167,8 @@ class Study(Settings):
     num_steps: Count = 500
     seed: Annotated[int, Field(ge=0, lt=2**63, strict=True)] = 0
     spread: SpreadSetting = 0.3
+    prior: dict[str, str] = {}
+    gain: GainSettings | None = None
     uncertainty: dict[str, Any] = {}
     coast: Annotated[int, Field(ge=0, le=100_000, strict=True)] = 0
     sensor: dict[str, SensorSettings] = {}
@@ -192,6 +214,20 @@ class Study(Settings):
         if self.rig is not None:
             raise ValueError("experiments on a rig differ by spread alone: leave uncertainty out")
         return Uncertainty.of(plant, self.spread, self.uncertainty)
+
+    def build_prior(self, plant: AbstractPlant) -> PriorPlants | None:
+        """The distribution of the parameters; None where they have the spread alone.
+
+        Raises:
+            ValueError: for a distribution that is not allowed, and beside what knows none.
+        """
+        others = {"uncertainty": self.uncertainty, "rig": self.rig, "clairvoyant": self.clairvoyant}
+        for name, other in others.items():
+            if self.prior and other:
+                raise ValueError(f"{name} is for plants of the spread: leave it or the prior out")
+        if self.gain is not None and self.rig is not None:
+            raise ValueError("the expected gain is that of the plant: leave gain or the rig out")
+        return plants_of(plant, self.prior, self.spread) if self.prior else None
 
     def build_methods(self, plant: AbstractPlant) -> dict[str, AbstractExcitation]:
         """The study's excitations, checked against the plant and the number of steps."""
@@ -248,7 +284,8 @@ class Study(Settings):
     def env(self, agent: str, plant: AbstractPlant) -> Env:
         """The decision process of an agent."""
         own = self.agent(agent)
-        return own.env(plant, self.spread, self.num_steps, self.uncertainty, self.coast)
+        prior = self.build_prior(plant)
+        return own.env(plant, self.spread, self.num_steps, self.uncertainty, self.coast, prior)
 
     def bound_curves(self) -> list[str]:
         """Agents whose learning curves hold the Cramér-Rao bound instead of errors."""
@@ -261,6 +298,7 @@ class Study(Settings):
         try:
             plant = self.build_plant()
             self.build_uncertainty(plant)
+            self.build_prior(plant)
             if self.coast and self.rig is not None:
                 raise ValueError("experiments on a rig end with the last sample: leave coast out")
             self.build_methods(plant)
@@ -291,7 +329,7 @@ class Study(Settings):
             except ValueError as error:
                 raise ValueError(f"agents.{name}: {error}") from None
         if self.agents:
-            require_noise(plant)
+            require_bound(plant)
             if self.num_steps < 2:
                 raise ValueError("num_steps must be at least 2 where agents are trained, got 1")
 
@@ -327,9 +365,16 @@ class Study(Settings):
         return study_from({**self.model_dump(), **settings}, "settings")
 
 
+def of_prior(prior: Mapping[str, str] | None) -> dict[str, object]:
+    """The settings of a study file for a prior, under which the expected gain is computed too."""
+    given = by_name("prior", prior, "a dict of distributions by parameter")
+    return {"prior": given, "gain": {} if given else None}
+
+
 _TABLES = {
     "": Study,
     "clairvoyant": ClairvoyantSettings,
+    "gain": GainSettings,
     "rig": RigSettings,
     "sensor": SensorSettings,
     "reference": ReferenceRow,

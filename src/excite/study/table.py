@@ -16,9 +16,11 @@ from ..report.rows import (
     CountsBySeed,
     Difference,
     ErrorStatistics,
+    ExpectedGain,
     Gap,
     LargestOutput,
     MeanSd,
+    Nats,
     RigCounts,
     Row,
     Rows,
@@ -232,9 +234,9 @@ def across_seeds(
 
 def _where_asked_for(
     rows: Sequence[Row], viable: Sequence[Row]
-) -> dict[str, RigCounts | BoundByLength | float]:
+) -> dict[str, RigCounts | BoundByLength | ExpectedGain | float]:
     """Entries of a row that only some studies have."""
-    found: dict[str, RigCounts | BoundByLength | float] = {}
+    found: dict[str, RigCounts | BoundByLength | ExpectedGain | float] = {}
     counts = [row.on_rig.model_dump(exclude_unset=True) for row in rows if row.on_rig is not None]
     if counts:
         found["on_rig"] = RigCounts(**_sums(counts))
@@ -250,7 +252,23 @@ def _where_asked_for(
         }
         lengths = bounds[0].num_steps
         found["bound_by_length"] = BoundByLength(num_steps=lengths, cramer_rao_percent=percent)
+    gains = [row.expected_gain for row in viable if row.expected_gain is not None]
+    if gains:
+        told = dict.fromkeys(text for gain in gains for text in gain.warnings)
+        bounds_of = {
+            name: _mean_of_seeds([getattr(gain, name) for gain in gains])
+            for name in ("lower", "upper")
+        }
+        found["expected_gain"] = gains[0].model_copy(update={**bounds_of, "warnings": tuple(told)})
     return found
+
+
+def _mean_of_seeds(bounds: Sequence[Nats]) -> Nats:
+    """Mean of a bound over seeds, which share their plants and differ in their policies."""
+    of_plants = _mean([bound.std_error**2 for bound in bounds])
+    means = np.array([bound.mean for bound in bounds])
+    of_seeds = float(np.var(means, ddof=1)) / len(means) if len(means) > 1 else 0.0
+    return Nats(mean=float(np.mean(means)), std_error=math.sqrt(of_plants + of_seeds))
 
 
 def _sums(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:

@@ -16,7 +16,7 @@ from ..progress import SHOWN, Progress
 from .folder import seed_folder
 from .objectives import decision_of, rewards_of
 from .run import run_study
-from .spec import Study, plant_tables, study_from
+from .spec import Study, of_prior, plant_tables, study_from
 from .table import best_seeds
 
 
@@ -31,10 +31,12 @@ def train(
     window: int | None = None,
     memory: int | None = None,
     clock: float | Sequence[float] = (),
+    change_price: float = 0.0,
     training: Mapping[str, object] | None = None,
     updates: int | None = None,
     seeds: int = 1,
     spread: SpreadLike = 0.3,
+    prior: Mapping[str, str] | None = None,
     uncertainty: Mapping[str, Range] | None = None,
     coast: int = 0,
     steps: int = 500,
@@ -69,11 +71,15 @@ def train(
         memory: numbers that the policy carries from step to step, by a gated recurrent unit;
             default none. With a memory, a window of one sample is enough. By gradient only.
         clock: frequencies [Hz] whose sine and cosine are observed too.
+        change_price: of the squared change of an input from step to step [1 / input unit²],
+            subtracted from the objective, which must be information.
         training: hyper-parameters of the method (`excite.training.settings`).
         updates: gradient updates, default 1000; the hyper-parameter `num_updates`.
         seeds: independent trainings; the best policy is returned.
         spread: plants are drawn from nominal values ± this fraction, or within a factor
             (`factor:3`).
+        prior: distributions of parameters, as for `information_gain`; the others have the spread.
+            Information is then rewarded in nats, and the comparison has the expected gain.
         uncertainty: what else may differ, as in `falsify`: the policy is trained to be safe
             there too (by gradient), and its file says what a search found.
         coast: samples after an experiment, under the input that ends it, in which it must be safe
@@ -109,6 +115,7 @@ def train(
         "window": window,
         "memory": memory,
         "clocks": _several("clock", clock, Real, "a frequency in Hz, or several"),
+        "change_price": change_price or None,
         "uncertainty": by_name("uncertainty", uncertainty, "a dict of ranges by name"),
     }
     agent = {
@@ -121,6 +128,7 @@ def train(
         "episodes": episodes,
         "num_steps": steps,
         "spread": spread,
+        **of_prior(prior),
         "coast": coast,
         "seeds": seeds,
     }

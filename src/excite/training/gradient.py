@@ -258,19 +258,23 @@ def train(
     settings: GradientSettings,
     seed: int,
     *,
+    first: Weights | None = None,
     resume: Checkpoint | None = None,
     on_boundary: OnBoundary = lambda *_: None,
 ) -> Trained:
     """Trains a policy; the same seed gives the same weights, interrupted or not.
 
     Args:
+        first: weights with which it begins, such as those of a policy for a similar objective;
+            default random ones.
         resume: where to continue.
         on_boundary: called after every update.
 
     Raises:
         ValueError: where gradients are no longer finite.
     """
-    return train_all(env, settings, [seed], resume=resume, on_boundary=on_boundary)[0]
+    own = {"first": first, "resume": resume, "on_boundary": on_boundary}
+    return train_all(env, settings, [seed], **own)[0]
 
 
 def train_all(
@@ -278,6 +282,7 @@ def train_all(
     settings: GradientSettings,
     seeds: Sequence[int],
     *,
+    first: Weights | None = None,
     resume: Checkpoint | None = None,
     on_boundary: OnBoundary = lambda *_: None,
 ) -> list[Trained]:
@@ -285,7 +290,7 @@ def train_all(
 
     `on_boundary` gets the mean of their validations.
     """
-    course, keys = started(env, settings, seeds)
+    course, keys = started(env, settings, seeds, first)
     if resume is not None:
         course = _restored(course, resume)
     for i in range(course.num_updates, settings.num_updates + 1):
@@ -349,13 +354,13 @@ def _restored(course: _Course, saved: Checkpoint) -> _Course:
 
 
 def started(
-    env: Env, settings: GradientSettings, seeds: Sequence[int]
+    env: Env, settings: GradientSettings, seeds: Sequence[int], first: Weights | None = None
 ) -> tuple[_Course, Callable[[int], Key[Array, "seed plant"]]]:
     """Trainings at their beginning, and the keys of the plants of an update."""
     pairs = jax.vmap(jax.random.split)(jnp.stack([jax.random.key(seed) for seed in seeds]))
 
     def start(key: PRNGKeyArray) -> Optimisation:
-        weights = _first_policy(env, settings, key)
+        weights = _first_policy(env, settings, key) if first is None else first
         network = Network(weights, env.layout, settings.through_measurements)
         return Optimisation.start(network, settings, env)
 

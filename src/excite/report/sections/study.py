@@ -42,8 +42,8 @@ from .elements import (
 
 _BESIDE = 4  # episodes and learning curves in one figure
 _LEARNING = "Policies without exploration noise during training: median and band over the seeds."
-_COMPARED = ("plant", "episodes", "num_steps", "seed", "seeds", "spread", "sensor", "rig",
-             "decision", "training", "gradient")  # fmt: skip
+_COMPARED = ("plant", "episodes", "num_steps", "seed", "seeds", "spread", "prior", "gain", "sensor",
+             "rig", "decision", "training", "gradient")  # fmt: skip
 _ADVICE = "rerun 'excite study run' to write it again"
 
 
@@ -63,7 +63,7 @@ class StudyRun(Run):
         """The section of a study."""
         t, claims = self.table, _claims(self)
         answer = answered(t.rows, t.study, claims)
-        notes = "".join(map(paragraph, footnotes(t.study)))
+        notes = "".join(map(paragraph, footnotes(t.study, t.rows)))
         seeds = t.best_seeds
         searched = bullets(
             f"{agent}, seed {seeds[agent]}: {told}" for agent, told in claims.items()
@@ -218,6 +218,8 @@ def _settings(run: StudyRun) -> str:
         ("num_steps", s.num_steps),
         ("seed", s.seed),
         ("spread", s.spread),
+        ("prior", s.prior),
+        ("gain", s.gain),
         ("sensor", s.sensor),
         ("training seeds of each agent", s.seeds if s.agents else None),
         ("lengths", s.lengths),
