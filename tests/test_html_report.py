@@ -18,12 +18,12 @@ import pytest
 
 from excite.cli import main
 from excite.policy import read_policy
+from excite.report import html as html_report
 from excite.report.answer import answered
 from excite.report.estimates import parameter_cells, residual_cells, residual_in_words
 from excite.report.html import report_html
 from excite.report.numbers import number
 from excite.report.rows import EstimateSummary, Row, StudyFacts
-from excite.report.sections import elements
 from excite.report.study_table import difference_cells, footnotes
 from excite.report.svg import inline_svg
 from excite.study.table import finished_table
@@ -113,19 +113,19 @@ class Page(HTMLParser):
 @pytest.fixture(autouse=True)
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Figures are most of the work, and most tests read the words."""
-    monkeypatch.setattr(elements, "inline_svg", lambda *_: "<svg></svg>")
+    monkeypatch.setattr(html_report, "inline_svg", lambda *_: "<svg></svg>")
 
 
 @pytest.fixture
 def drawn(undrawn: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(elements, "inline_svg", inline_svg)
+    monkeypatch.setattr(html_report, "inline_svg", inline_svg)
 
 
 @cache
 def page_of(*runs: Path, drawn: bool = False) -> Page:
     with pytest.MonkeyPatch.context() as patch:
         if drawn:
-            patch.setattr(elements, "inline_svg", inline_svg)
+            patch.setattr(html_report, "inline_svg", inline_svg)
         return Page(report_html(runs))
 
 

@@ -20,7 +20,7 @@ def report(runs: tuple[Path, ...], out: Path, overwrite: bool, as_json: bool) ->
     RUN is a run folder of `excite identify`, `excite campaign` or `excite study run`, or a
     record with its sidecar; several are shown side by side.
     """
-    from ..report.html import report as verb
+    from ..report.report import report as verb
 
     with progress_bar("report") as progress:
         page = verb(runs, out, overwrite=overwrite, progress=progress).encode()

@@ -10,20 +10,10 @@ from ...description import PlantDescription
 from ...files import read_json
 from ...record import RECORD_KIND, Record
 from ...record.figure import episode_figure
-from .elements import (
-    Run,
-    Section,
-    facts,
-    figure,
-    folded,
-    heading,
-    paragraph,
-    plant_facts,
-    record_in,
-    signals_table,
-    understood,
-)
+from ..content import Element, Figure, Folded, Heading, Paragraph, Section
+from .elements import Run, facts, plant_facts, record_in, signals_table, understood
 
+_CODE = "record = ex.read_record(run)\nrecord"
 _ABOUT_THE_FILE = ("kind", "plant", "plant_hash", "dt", "provenance", "ended", "params")
 
 
@@ -52,15 +42,15 @@ class Recorded(Run):
             )
         caption = f"{self.path.name}: inputs, outputs."
         parts = [
-            ended,
-            heading("Measured"),
+            *ended,
+            Heading("Measured"),
             signals_table(d, [record]),
-            figure(episode_figure(d, record), f"{name}-in", caption),
-            heading("Settings and provenance"),
+            Figure(episode_figure(d, record), f"{name}-in", caption, "record.plot()"),
+            Heading("Settings and provenance"),
             about,
-            folded("The plant", plant_facts(d)),
+            Folded("The plant", [plant_facts(d)]),
         ]
-        return Section(f"{d.name}: a record", self.path, "".join(parts))
+        return Section(f"{d.name}: a record", self.path, parts, _CODE)
 
 
 def read_recorded(path: Path) -> Recorded:
@@ -85,14 +75,14 @@ def read_recorded(path: Path) -> Recorded:
     return Recorded(path, plant, record_in(path, plant))
 
 
-def _ended(metadata: Mapping[str, object]) -> str:
+def _ended(metadata: Mapping[str, object]) -> list[Element]:
     """How an experiment on a rig ended; nothing for a simulation."""
     if "ended" not in metadata:
-        return ""
+        return []
     ended = metadata["ended"]
     if ended is None:
-        return paragraph("The experiment is still running, or its process was killed.")
+        return [Paragraph("The experiment is still running, or its process was killed.")]
     if not isinstance(ended, Mapping):
         raise TypeError("how it ended")
     details = {k: v for k, v in ended.items() if k != "reason"}
-    return heading("How it ended") + paragraph(ended["reason"]) + facts(details.items())
+    return [Heading("How it ended"), Paragraph(str(ended["reason"])), facts(details.items())]
