@@ -107,7 +107,7 @@ class Folded:
     """Content that a screen shows on demand."""
 
     summary: str
-    body: Sequence[Element]
+    body: Sequence[Paragraph | Facts | Table]
 
 
 Element = Answer | Heading | Paragraph | Notes | Bullets | Facts | Table | Figure | Code | Folded
@@ -158,3 +158,8 @@ class Document:
         if len(self.sections) == 1:
             return [self.title]
         return [f"{i}. {section.title}" for i, section in enumerate(self.sections, 1)]
+
+    @property
+    def figures(self) -> list[Figure]:
+        """Those of all sections."""
+        return [p for section in self.sections for p in section.body if isinstance(p, Figure)]

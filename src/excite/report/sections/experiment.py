@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import shlex
 from collections.abc import Mapping, Sequence
@@ -13,7 +14,8 @@ from ...description import RARE, PlantDescription, display_unit, names_of
 from ...files import read_columns
 from ...record import Record
 from ...record.figure import episode_figure
-from ..content import Bullets, Element, Figure, Folded, Heading, Paragraph, Section, Table
+from ..answer import told_of_identification
+from ..content import Answer, Bullets, Element, Figure, Folded, Heading, Paragraph, Section, Table
 from ..estimates import largest_correlation, parameter_cells, parameter_header, residual_cells
 from ..figures import (
     autocorrelation_figure,
@@ -52,10 +54,11 @@ from excite.report.figures import (
 from excite.report.rows import EstimateSummary
 
 result = EstimateSummary.read(run / "estimate.json")
-records = [ex.read_record(run / f"record{ending}.csv") for ending in ENDINGS]
+endings = ENDINGS
+records = [ex.read_record(run / f"record{ending}.csv") for ending in endings]
 plant = records[0].description
 outputs = [output.name for output in plant.outputs]
-simulated = [pd.read_csv(run / f"WORD{ending}.csv")[outputs].to_numpy() for ending in ENDINGS]
+simulated = [pd.read_csv(run / f"WORD{ending}.csv")[outputs].to_numpy() for ending in endings]
 pd.DataFrame({name: parameter.data() for name, parameter in result.params.items()}).T"""
 _WHITENESS = """\
 residuals = [record.outputs - own for record, own in zip(records, simulated, strict=True)]
@@ -87,6 +90,7 @@ class Experiment(Run):
         with understood(self.marker.folder / "estimate.json", _ADVICE):
             cells = [parameter_cells(n, p) for n, p in result.params.items()]
             parts = [
+                Answer(told_of_identification(result)),
                 Heading("Parameters"),
                 Table(parameter_header(), cells, name="Estimates and their 95 % intervals"),
                 *_truth(self),
@@ -141,7 +145,7 @@ def _code(experiment: Experiment) -> str:
     count = len(result.files)
     endings = [""] if count == 1 else [f"_{i}" for i in range(1, count + 1)]
     word = "predicted" if result.is_predicted else "simulated"
-    return _CODE.replace("ENDINGS", repr(endings)).replace("WORD", word)
+    return _CODE.replace("ENDINGS", json.dumps(endings)).replace("WORD", word)
 
 
 def _truth(experiment: Experiment) -> list[Element]:

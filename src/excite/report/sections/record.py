@@ -10,7 +10,8 @@ from ...description import PlantDescription
 from ...files import read_json
 from ...record import RECORD_KIND, Record
 from ...record.figure import episode_figure
-from ..content import Element, Figure, Folded, Heading, Paragraph, Section
+from ..answer import told_of_record
+from ..content import Answer, Element, Figure, Folded, Heading, Paragraph, Section
 from .elements import Run, facts, plant_facts, record_in, signals_table, understood
 
 _CODE = "record = ex.read_record(run)\nrecord"
@@ -29,7 +30,7 @@ class Recorded(Run):
         """The section of a record."""
         d, record = self.plant, self.record
         with understood(self.path.with_suffix(".json")):
-            ended = _ended(record.metadata)
+            answer, ended = Answer(told_of_record(d, record)), _ended(record.metadata)
             about = facts(
                 [
                     ("samples", len(record.time)),
@@ -42,6 +43,7 @@ class Recorded(Run):
             )
         caption = f"{self.path.name}: inputs, outputs."
         parts = [
+            answer,
             *ended,
             Heading("Measured"),
             signals_table(d, [record]),
@@ -76,12 +78,10 @@ def read_recorded(path: Path) -> Recorded:
 
 
 def _ended(metadata: Mapping[str, object]) -> list[Element]:
-    """How an experiment on a rig ended; nothing for a simulation."""
-    if "ended" not in metadata:
-        return []
-    ended = metadata["ended"]
+    """How an experiment on a rig ended; nothing for one that did not, and a simulation."""
+    ended = metadata.get("ended")
     if ended is None:
-        return [Paragraph("The experiment is still running, or its process was killed.")]
+        return []
     if not isinstance(ended, Mapping):
         raise TypeError("how it ended")
     details = {k: v for k, v in ended.items() if k != "reason"}
