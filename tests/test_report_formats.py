@@ -11,7 +11,8 @@ from typing import Any
 import nbformat
 import numpy as np
 import pytest
-from test_html_report import contents, estimate, excite, read, refused, renamed
+from markdown_it import MarkdownIt
+from test_html_report import Page, contents, estimate, excite, read, refused, renamed
 
 import excite as ex
 from excite.description import PlantDescription
@@ -94,14 +95,9 @@ def sentences(run: str) -> tuple[str, ...]:
     return told_of_identification(estimate(Path(run)))
 
 
-def markdown_tables(text: str) -> list[list[list[str]]]:
-    """The tables of a page, as GitHub reads them: rows of cells."""
-    tables = [part.splitlines() for part in re.findall(r"(?:^\|.*\|\n)+", text, re.M)]
-    cells = [[re.split(r"(?<!\\)\|", line)[1:-1] for line in lines] for lines in tables]
-    assert all(len(row) == len(rows[0]) for rows in cells for row in rows)
-    shown = [[[re.sub(r"\\(?=\W|_)", "", c).strip() for c in r] for r in rows] for rows in cells]
-    assert all(set("".join(rows[1])) <= {"-", ":"} for rows in shown)
-    return [[rows[0], *rows[2:]] for rows in shown]
+def shown(text: str) -> Page:
+    """Markdown as a browser gets it."""
+    return Page(MarkdownIt("commonmark").enable(["table", "strikethrough"]).render(text))
 
 
 def assert_is_latex(text: str) -> None:
@@ -158,7 +154,7 @@ def test_every_format_begins_with_the_answer(run, here, undrawn):
 
 
 def test_tables_are_those_of_the_command_line(here, undrawn):
-    tables = markdown_tables(ex.report(["one", "bench"], "r.md"))
+    tables = shown(ex.report(["one", "bench"], "r.md")).tables
     header, *rows = next(t for t in tables if t[0][0] == "symbol")
     assert header[:3] == ["symbol", "unit", "estimate"]
     assert rows == [parameter_cells(n, p) for n, p in estimate(here / "one").params.items()]
@@ -216,10 +212,15 @@ def test_a_notebook_reads_the_runs_and_draws_their_figures(here, monkeypatch):
 @pytest.mark.parametrize("hostile", HOSTILE)
 def test_a_name_that_is_code_is_shown_and_not_obeyed(hostile, here, undrawn):
     words = ("J_p", "nls", "kg m²", *read(Path("one/estimate.json"))["verdict"])
-    renamed(Path("one/estimate.json"), *words, new=hostile)
-    renamed(Path("one/record.json"), "chirp", new=hostile)
-    tables = markdown_tables(ex.report("one", "r.md"))
-    assert tables[0][1][0] == tables[0][1][1] == hostile
+    renamed(Path("one/estimate.json"), *words, new="harmless")
+    renamed(Path("one/record.json"), "chirp", new="harmless")
+    tags = shown(ex.report("one", "harmless.md")).tags
+    for name in ("estimate", "record"):
+        renamed(Path(f"one/{name}.json"), "harmless", new=hostile)
+    seen = shown(ex.report("one", "r.md"))
+    assert seen.tables[0][1][:2] == [hostile, hostile]
+    assert hostile in seen.words  # the sentence of the verdict
+    assert seen.tags == tags
     page = ex.report("one", "r.tex")
     assert_is_latex(page)
     assert latex.text(hostile) in page
@@ -247,7 +248,9 @@ def test_every_element_is_markdown():
     for line in (r"1\. is no list", r"- \- one", r"- \#two", "- a: b", "    `y`",
                  r"![A\*](my%20r_files/run1-a.svg)", r"*A\**"):  # fmt: skip
         assert line in page.splitlines()
-    assert markdown_tables(page)[0] == [["", "a_b"], ["[x]", "-1"], ["*y", "J_p -- ±2 %"]]
+    seen = shown(page)
+    assert seen.tables[0] == [["", "a_b"], ["[x]", "-1"], ["*y", "J_p -- ±2 %"]]
+    assert {"1. is no list", "- one", "#two", "A*", "excite x\n`y`\n"} <= set(seen.words)
 
 
 def test_a_character_that_the_fonts_do_not_have_is_shown_by_its_number():
