@@ -239,18 +239,18 @@ def document(*body: Element) -> Document:
 def test_every_element_is_markdown():
     page = markdown_page(
         document(
-            Paragraph("1. is no list"), Bullets([]), Bullets(["- one", "#two"]),
+            Paragraph("1000. is no list"), Bullets([]), Bullets(["- one", "#two"]),
             Facts([("a", "b")]), ODD, Code("excite x\n`y`"),
             Figure(new_figure(1)[0], "run1-a", "A*"),
         ),
         "my r_files",
     )  # fmt: skip
-    for line in (r"1\. is no list", r"- \- one", r"- \#two", "- a: b", "    `y`",
+    for line in (r"1000\. is no list", r"- \- one", r"- \#two", "- a: b", "    `y`",
                  r"![A\*](my%20r_files/run1-a.svg)", r"*A\**"):  # fmt: skip
         assert line in page.splitlines()
     seen = shown(page)
     assert seen.tables[0] == [["", "a_b"], ["[x]", "-1"], ["*y", "J_p -- ±2 %"]]
-    assert {"1. is no list", "- one", "#two", "A*", "excite x\n`y`\n"} <= set(seen.words)
+    assert {"1000. is no list", "- one", "#two", "A*", "excite x\n`y`\n"} <= set(seen.words)
 
 
 def test_a_character_that_the_fonts_do_not_have_is_shown_by_its_number():
@@ -258,12 +258,14 @@ def test_a_character_that_the_fonts_do_not_have_is_shown_by_its_number():
 
 
 def test_every_element_is_latex():
-    page = latex_page(document(Bullets([]), Facts([("[a]", "[b]")]), ODD, Code("a --b 'c'")), "r")
+    page = latex_page(
+        document(Bullets([]), Facts([("[a]", "[b]")]), ODD, Code("a --b 'c'\nd")), "r"
+    )
     assert_is_latex(page)
     assert r"{}[x] & $-$1 \\" in page
     assert r"{}*y & $J_{p}$ -{}- $\pm$2 \% \\" in page
     assert r"\item[{[a]}]{} [b]" in page
-    assert r"a -{}-b \textquotesingle{}c\textquotesingle{}" in page
+    assert r"a -{}-b \textquotesingle{}c\textquotesingle{}" "\n\nd" in page
     assert "itemize" not in page
 
 
@@ -303,7 +305,7 @@ def test_a_document_can_be_compiled(here):
         ("--out r.pdf", "r.pdf: reports end in .html, .md, .tex, .ipynb"),
         ("--out r", "r: reports end in"),
         ("--out r.md --format html", "r.md ends in .md, but the format is html"),
-        ("--out r.md --format word", "a format is html, md, tex and ipynb: got 'word'"),
+        ("--out r.md --format word", "unknown format 'word' (there is html, md, tex, ipynb)"),
         ("--out old.md", "old.md exists"),
         ("--out kept.md", "kept_files has figures; choose another name or add --overwrite"),
         ("--out mine.md --overwrite", "mine_files is no folder of a report's figures"),
@@ -397,7 +399,11 @@ def test_an_identification_is_answered_by_its_parameters_and_whether_to_believe_
         half = 100 * (p.ci95[1] - p.estimate) / p.estimate
         assert f"{name} = {parameter_cells(name, p)[2]} {p.unit} ± {half:.2g} %" in first
     assert f"The plant fits pitch by {result.fit_percent['pitch']:.2f} %; the tests" in second
-    assert "no reason to doubt" in second
+    assert second.endswith("no reason to doubt the intervals.")
+    more = changed(result, verdict=(*result.verdict, "something else"))[1]
+    assert more.endswith("no reason to doubt the intervals, but read what can be identified.")
+    ahead = changed(result, prediction_fit_percent={"pitch": 12.34})[1]
+    assert ahead.startswith("One step ahead, the plant fits pitch by 12.34 %")
     wrong, coloured = {"pitch": 1e-9}, {"pitch": 1e-9}
     doubted = changed(result, structure_p_value=wrong, misfit_factor=3.0)[1]
     assert "follows the input" in doubted

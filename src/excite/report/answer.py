@@ -170,7 +170,7 @@ def told_of_record(d: PlantDescription, record: Record) -> tuple[str, ...]:
         if not (part.warning_level is None and part.critical_level is None)
     ]
     levels = "; ".join(reached) or "no output has a safety level"
-    told = f"In {lasted:.4g} s {levels}, as measured." if reached else f"{levels.capitalize()}."
+    told = f"In {lasted:.4g} s, {levels}, as measured." if reached else f"{levels.capitalize()}."
     if "ended" not in record.metadata:
         return (told,)
     ended = record.metadata["ended"]
@@ -208,7 +208,8 @@ def told_of_identification(result: EstimateSummary) -> tuple[str, ...]:
     told = f"From {result.files[0] if count == 1 else f'{count} records'}, {result.estimator}"
     told += f" estimates {listed([*found[:_MOST_PARAMETERS], *more])} (95 % intervals)"
     told += f"; {listed(held)} {'is' if len(held) == 1 else 'are'} held, not estimated" * bool(held)
-    return f"{told}.", f"The plant fits {_fits(result)}; {_believed(result)}."
+    fitting = "One step ahead, the plant" if result.is_predicted else "The plant"
+    return f"{told}.", f"{fitting} fits {_fits(result)}; {_believed(result)}."
 
 
 def _in_words(p: EstimatedParameter) -> str:
@@ -224,7 +225,8 @@ def _in_words(p: EstimatedParameter) -> str:
 def _fits(result: EstimateSummary) -> str:
     """The fit of every output, and the least of the held-out records."""
     fits = [f"{name} by {number(value, 4)} %" for name, value in result.model_fit_percent.items()]
-    outside = [fit for v in result.validation for fit in v.fit_percent.values()]
+    found = [v.prediction_fit_percent or v.fit_percent for v in result.validation]
+    outside = [fit for fits_of_one in found for fit in fits_of_one.values()]
     least = f" (held out: {number(min(outside), 4)} %)" if outside else ""
     return f"{listed(fits)}{least}"
 
@@ -246,4 +248,5 @@ def _believed(result: EstimateSummary) -> str:
         return f"the residual of {listed(coloured)} is not white, as noise of the sensor would be"
     if not any(map(math.isfinite, tested)):
         return "the residual is too small or too short to be tested"
-    return "the tests of its residual give no reason to doubt the intervals"
+    more = ", but read what can be identified" * (len(result.verdict) > 1)
+    return f"the tests of its residual give no reason to doubt the intervals{more}"

@@ -40,18 +40,17 @@ _PLAIN = {
     "‘": r"\textquoteleft{}", "’": "'", "„": r"\quotedblbase{}",
     "“": r"\textquotedblleft{}", "”": r"\textquotedblright{}",
 }  # fmt: skip
-_MATHS = {
-    "±": r"\pm", "×": r"\times", "÷": r"\div", "·": r"\cdot", "−": "-", "²": "^2", "³": "^3",
-    "°": r"^\circ", "µ": r"\mu", "∞": r"\infty", "≤": r"\leq", "≥": r"\geq", "≈": r"\approx",
-    "→": r"\to", "√": r"\surd", "∂": r"\partial", "∑": r"\sum",
-}  # fmt: skip
 _SMALL = (
     "alpha beta gamma delta epsilon zeta eta theta iota kappa lambda mu nu xi pi rho varsigma "
     "sigma tau upsilon phi chi psi omega"
 )
 _LARGE = "Gamma Delta Theta Lambda Xi Pi Sigma Upsilon Phi Psi Omega"
 _GREEK = zip("αβγδεζηθικλμνξπρςστυφχψωΓΔΘΛΞΠΣΥΦΨΩ", f"{_SMALL} {_LARGE}".split(), strict=True)
-_MATHS |= {letter: f"\\{word}" for letter, word in _GREEK}
+_MATHS = {letter: f"\\{word}" for letter, word in _GREEK} | {
+    "±": r"\pm", "×": r"\times", "÷": r"\div", "·": r"\cdot", "−": "-", "²": "^2", "³": "^3",
+    "°": r"^\circ", "µ": r"\mu", "∞": r"\infty", "≤": r"\leq", "≥": r"\geq", "≈": r"\approx",
+    "→": r"\to", "√": r"\surd", "∂": r"\partial", "∑": r"\sum",
+}  # fmt: skip
 _NOT_THERE = "ħĸĿŀſ"  # of the letters up to U+017F
 
 
@@ -125,7 +124,8 @@ def _element(part: Element, folder: str) -> str:
             shown = rf"\includegraphics[{size}]{{{folder}/{name}.pdf}}"
             return _float("figure", [r"\centering", shown, rf"\caption{{{text(caption)}}}"])
         case content.Code(lines):
-            typed = _escaped(lines).replace("'", r"\textquotesingle{}")
+            typed = "\n\n".join(map(_escaped, lines.splitlines()))
+            typed = typed.replace("'", r"\textquotesingle{}")
             return rf"{{\raggedright\ttfamily {typed}\par}}"
         case content.Folded(summary, body):
             return "\n\n".join([rf"\subsubsection*{{{text(summary)}}}", *_blocks(body, folder)])
@@ -149,14 +149,8 @@ def _tables(table: content.Table) -> Iterator[str]:
     repeated = table.labels if table.labels < len(table.header) else 1
     for header, rows in fitting_tables(table.header, table.rows, _WIDTH, repeated):
         widths = _widths(header, rows)
-        columns = "".join(
-            rf">{{\raggedright\arraybackslash}}p{{{width / _WIDTH:.2f}\linewidth}}"
-            if width
-            else "l"
-            if i < table.labels
-            else "r"
-            for i, width in enumerate(widths)
-        )
+        kinds = ["l"] * table.labels + ["r"] * len(header)
+        columns = "".join(_prose(w) if w else k for k, w in zip(kinds, widths, strict=False))
         longest = sum(2 + max(map(len, column)) for column in zip(header, *rows, strict=True))
         begin, end = (_TO_THE_PAGE, "}") if longest > _SURE else ("", "")
         for part in _pages(rows, widths):
@@ -166,6 +160,11 @@ def _tables(table: content.Table) -> Iterator[str]:
             lines += [*map(_row, part), r"\bottomrule", rf"\end{{tabular}}{end}"]
             yield _float("table", lines)
             caption = f"{title}, continued."
+
+
+def _prose(width: int) -> str:
+    """A column of prose."""
+    return rf">{{\raggedright\arraybackslash}}p{{{width / _WIDTH:.2f}\linewidth}}"
 
 
 def _row(cells: Sequence[str]) -> str:

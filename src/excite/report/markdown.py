@@ -14,7 +14,7 @@ from .content import Document, Element, Section
 from .tables import markdown_table
 
 _SPECIAL = re.compile(r"[\\`*\[\]<|$~]|&(?=#?\w+;)|(?<!\w)_|_(?!\w)")
-_BEGINS_A_BLOCK = re.compile(r"(?<=^\d)(?=[.)])|(?<=^\d\d)(?=[.)])|^(?=[-+>#=])")
+_BEGINS_A_BLOCK = re.compile(r"^(?:(\d+)(?=[.)](?:\s|$))|(?=[-+>#]))")
 
 
 def markdown_page(document: Document, folder: str) -> str:
@@ -84,4 +84,4 @@ def markdown(part: Element, level: int = 2, folder: str = "") -> str:
 
 def _line(words: str) -> str:
     """Text that begins a line, where it is no list, heading or quotation."""
-    return _BEGINS_A_BLOCK.sub(r"\\", text(words), count=1)
+    return _BEGINS_A_BLOCK.sub(r"\1\\", text(words))

@@ -10,7 +10,7 @@ from typing import Any
 
 import matplotlib
 
-from ..description import listed, path_from, wrong_type
+from ..description import path_from, unknown, wrong_type
 from ..files import require_new_file, write_bytes, write_with_files
 from ..progress import SHOWN, Progress
 from ..record.figure import image
@@ -25,10 +25,7 @@ from .svg import make_plain
 FORMATS = ("html", "md", "tex", "ipynb")
 """Formats of a report, and the endings of their files."""
 _WITH_FIGURES = {"md": (markdown_page, "svg"), "tex": (latex_page, "pdf")}
-_FONTS: dict[Any, Any] = {
-    "svg.fonttype": "path",
-    "pdf.fonttype": 42,
-}  # shown alike everywhere; TrueType
+_FONTS: dict[Any, Any] = {"svg.fonttype": "path", "pdf.fonttype": 42}  # alike everywhere
 _OWN = re.compile(r"run\d+-\w+\.(svg|pdf)")
 _LATEX_NAME = re.compile(r"[\w.+=, -]+")
 
@@ -123,7 +120,7 @@ def _drawn(figure: Figure, ending: str) -> bytes:
 def _format_of(out: Path | None, format: str | None) -> str:
     """The format that was asked for; ValueError where that is none, or two."""
     if format is not None and format not in FORMATS:
-        raise ValueError(f"a format is {listed(FORMATS)}: got {format!r}")
+        raise unknown("format", str(format), FORMATS)
     if out is None:
         if format in _WITH_FIGURES:
             raise ValueError(f"a report in the format {format} needs out: its figures are files")
