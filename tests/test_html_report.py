@@ -18,12 +18,12 @@ import pytest
 
 from excite.cli import main
 from excite.policy import read_policy
+from excite.report import html as html_report
 from excite.report.answer import answered
 from excite.report.estimates import parameter_cells, residual_cells, residual_in_words
 from excite.report.html import report_html
 from excite.report.numbers import number
 from excite.report.rows import EstimateSummary, Row, StudyFacts
-from excite.report.sections import elements
 from excite.report.study_table import difference_cells, footnotes
 from excite.report.svg import inline_svg
 from excite.study.table import finished_table
@@ -113,19 +113,19 @@ class Page(HTMLParser):
 @pytest.fixture(autouse=True)
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Figures are most of the work, and most tests read the words."""
-    monkeypatch.setattr(elements, "inline_svg", lambda *_: "<svg></svg>")
+    monkeypatch.setattr(html_report, "inline_svg", lambda *_: "<svg></svg>")
 
 
 @pytest.fixture
 def drawn(undrawn: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(elements, "inline_svg", inline_svg)
+    monkeypatch.setattr(html_report, "inline_svg", inline_svg)
 
 
 @cache
 def page_of(*runs: Path, drawn: bool = False) -> Page:
     with pytest.MonkeyPatch.context() as patch:
         if drawn:
-            patch.setattr(elements, "inline_svg", inline_svg)
+            patch.setattr(html_report, "inline_svg", inline_svg)
         return Page(report_html(runs))
 
 
@@ -706,7 +706,8 @@ def test_the_command_writes_the_page_and_tells(here, capsys):
     assert excite("report", "one", "rig.csv", "--out", "r.html", "--json") == 0
     told = json.loads(capsys.readouterr().out)
     written = (here / "r.html").read_bytes()
-    assert told == {"file": "r.html", "runs": ["one", "rig.csv"], "bytes": len(written)}
+    about = {"file": "r.html", "runs": ["one", "rig.csv"], "bytes": len(written)}
+    assert told == {**about, "figures": None}
     assert written.decode() == report_html([Path("one"), Path("rig.csv")])
     assert excite("report", "rig.csv", "--out", "r.html", "--overwrite") == 0
     assert (here / "r.html").read_text() == report_html([Path("rig.csv")])

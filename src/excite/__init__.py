@@ -35,7 +35,7 @@ _PLACES = {
     "evaluate": "study.evaluate",
     "falsify": "study.falsify",
     "run_study": "study.run",
-    "report": "report.html",
+    "report": "report.report",
     "run": "rig.session",
     "next_experiment": "study.next_experiment",
     "choose_experiments": "study.selection",
@@ -133,7 +133,7 @@ if TYPE_CHECKING:
     from .policy.file import read_policy as read_policy
     from .record.read import read_record as read_record
     from .record.record import Record as Record
-    from .report.html import report as report
+    from .report.report import report as report
     from .rig.session import run as run
     from .simulation import simulate as simulate
     from .study.campaign import Campaign as Campaign

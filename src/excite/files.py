@@ -154,6 +154,30 @@ def write_bytes(path: Path, content: bytes) -> None:
         Path(name).unlink(missing_ok=True)
 
 
+def write_with_files(path: Path, content: bytes, folder: Path, files: Mapping[str, bytes]) -> None:
+    """Writes a file and a folder beside it, both completely or not at all.
+
+    A folder of this name is replaced; without files there is none.
+
+    Raises:
+        ValueError: where they cannot be written.
+    """
+    try:
+        with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as unfinished:
+            new, old = Path(unfinished, "new"), Path(unfinished, "old")
+            new.mkdir()
+            for name, part in files.items():
+                (new / name).write_bytes(part)
+            (new.parent / path.name).write_bytes(content)
+            if folder.exists():
+                folder.rename(old)
+            if files:
+                new.rename(folder)
+            os.replace(new.parent / path.name, path)
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be written ({error.strerror})") from None
+
+
 def require_folder(path: Path) -> None:
     """Raises ValueError where the folder of a file does not exist."""
     if not path.parent.is_dir():

@@ -46,9 +46,9 @@ def save(figure: matplotlib.figure.Figure, path: Path) -> None:
 
 
 def image(figure: matplotlib.figure.Figure, kind: str) -> bytes:
-    """A figure as the content of a png, svg or pdf file."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format=kind, dpi=150)
+    """A figure as the content of a png, svg or pdf file, which holds no date."""
+    buffer, dates = io.BytesIO(), {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
+    figure.savefig(buffer, format=kind, dpi=150, metadata=dates.get(kind))
     return buffer.getvalue()
 
 

@@ -1,4 +1,8 @@
-"""What a study answers: which excitation tells most and stays safe, and by how much."""
+"""What a run answers, in a few sentences.
+
+A study: which excitation tells most and stays safe, and by how much. A record: whether it reached
+a safety level, and when. An identification: the parameters, and whether to believe them.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +11,12 @@ import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from .numbers import number
-from .rows import Row, StudyFacts
+import numpy as np
+
+from ..description import RARE, Output, PlantDescription, display_unit, listed
+from ..record import Record
+from .numbers import digits_for, number
+from .rows import EstimatedParameter, EstimateSummary, Row, StudyFacts
 from .study_table import violations_cell
 from .tables import Table
 
@@ -17,6 +25,7 @@ _USUAL = "chirp"  # of the methods that are not trained, what others are compare
 _OFTEN = 0.05  # of the experiments: an estimator that fails more often is not chosen
 _NEARLY = 1.05  # a ratio of standard errors below it is no difference
 _MOST_ROWS = 14  # of a table that fits a screen
+_MOST_PARAMETERS = 6  # of a sentence
 
 
 @dataclass(frozen=True)
@@ -150,3 +159,94 @@ def _gain(best: Row, usual: Row) -> float | None:
     if len(ratios) < len(best.parameters) or not all(0 < r < math.inf for r in ratios):
         return None
     return math.exp(statistics.fmean(map(math.log, ratios)))
+
+
+def told_of_record(d: PlantDescription, record: Record) -> tuple[str, ...]:
+    """Whether an experiment reached a safety level and when, and how it ended on a rig."""
+    lasted = record.time[-1] - record.time[0]
+    reached = [
+        _reached(part, record.time - record.time[0], np.abs(record.outputs[:, i]))
+        for i, part in enumerate(d.outputs)
+        if not (part.warning_level is None and part.critical_level is None)
+    ]
+    levels = "; ".join(reached) or "no output has a safety level"
+    told = f"In {lasted:.4g} s, {levels}, as measured." if reached else f"{levels.capitalize()}."
+    if "ended" not in record.metadata:
+        return (told,)
+    ended = record.metadata["ended"]
+    if ended is None:
+        return told, "The experiment is still running, or its process was killed."
+    return told, f"The experiment ended after {lasted:.4g} s: {str(ended['reason']).rstrip('.')}."
+
+
+def _reached(part: Output, time: np.ndarray, size: np.ndarray) -> str:
+    """The highest safety level that an output reached, and when first."""
+    unit, factor = display_unit(part.unit)
+    largest = float(np.max(size, initial=0.0, where=np.isfinite(size)))
+    most, below = f"{number(factor * largest)} {unit}", ""
+    for word, level in (("critical", part.critical_level), ("warning", part.warning_level)):
+        if level is None:
+            continue
+        named = f"its {word} level ({factor * level:.4g} {unit})"
+        if largest >= level:
+            first = f"{part.name} reached {named} after {time[np.argmax(size >= level)]:.4g} s"
+            safe = f" and stayed below {below}" * bool(below)
+            return f"{first}{safe}: its largest value is {most}"
+        below = named
+    return f"{part.name} stayed below {below}: its largest value is {most}"
+
+
+def told_of_identification(result: EstimateSummary) -> tuple[str, ...]:
+    """The parameters with their intervals, and what the residual says of them."""
+    if not result.is_usable:
+        why = f": {result.verdict[-1]}" if result.verdict else ""
+        return (f"There is no estimate ({result.status}){why}.",)
+    count = len(result.files)
+    found = [f"{name} = {_in_words(p)}" for name, p in result.params.items() if not p.held]
+    held = [name for name, p in result.params.items() if p.held]
+    more = [f"{len(found) - _MOST_PARAMETERS} more"] * (len(found) > _MOST_PARAMETERS)
+    told = f"From {result.files[0] if count == 1 else f'{count} records'}, {result.estimator}"
+    told += f" estimates {listed([*found[:_MOST_PARAMETERS], *more])} (95 % intervals)"
+    told += f"; {listed(held)} {'is' if len(held) == 1 else 'are'} held, not estimated" * bool(held)
+    fitting = "One step ahead, the plant" if result.is_predicted else "The plant"
+    return f"{told}.", f"{fitting} fits {_fits(result)}; {_believed(result)}."
+
+
+def _in_words(p: EstimatedParameter) -> str:
+    """An estimate with half of its interval."""
+    shown = f"{number(p.estimate, digits_for(p.estimate, p.std_error))} {p.unit}".strip()
+    half = max(abs(end - p.estimate) for end in p.ci95)
+    if not math.isfinite(half):
+        return f"{shown} (its interval is open)"
+    relative = f"{100 * half / abs(p.estimate):.2g} %" if p.estimate else f"{half:.2g} {p.unit}"
+    return f"{shown} ± {relative.strip()}"
+
+
+def _fits(result: EstimateSummary) -> str:
+    """The fit of every output, and the least of the held-out records."""
+    fits = [f"{name} by {number(value, 4)} %" for name, value in result.model_fit_percent.items()]
+    found = [v.prediction_fit_percent or v.fit_percent for v in result.validation]
+    outside = [fit for fits_of_one in found for fit in fits_of_one.values()]
+    least = f" (held out: {number(min(outside), 4)} %)" if outside else ""
+    return f"{listed(fits)}{least}"
+
+
+def _believed(result: EstimateSummary) -> str:
+    """What the tests of the residual say of the intervals."""
+    follow = [name for name, p in result.structure_p_value.items() if p < RARE]
+    coloured = [name for name, p in result.whiteness_p_value.items() if p < RARE]
+    tested = [*result.structure_p_value.values(), *result.whiteness_p_value.values()]
+    if follow:
+        factor = result.misfit_factor
+        wider = f"; the intervals are {factor:.2g} times as wide for this" * (factor > 1)
+        return (
+            f"the residual of {listed(follow)} follows the input, so that the structure of the "
+            "plant is wrong for these data or they differ from its description: the estimates "
+            f"are to be doubted{wider}"
+        )
+    if coloured:
+        return f"the residual of {listed(coloured)} is not white, as noise of the sensor would be"
+    if not any(map(math.isfinite, tested)):
+        return "the residual is too small or too short to be tested"
+    more = ", but read what can be identified" * (len(result.verdict) > 1)
+    return f"the tests of its residual give no reason to doubt the intervals{more}"

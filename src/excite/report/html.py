@@ -2,35 +2,24 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable, Sequence
+import html
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
-import matplotlib
-
 from .. import __version__
-from ..description import path_from, wrong_type
-from ..files import require_new_file, write_bytes
-from ..progress import SHOWN, Progress
-from ..record.figure import MAX_POINTS, at_most
-from .sections.campaign import read_campaign
-from .sections.elements import Marker, Run, Section, paragraph, text
-from .sections.experiment import Experiment, comparison, read_experiment
-from .sections.record import read_recorded
-from .sections.study import StudyRun, common_methods, read_study_run
-from .svg import PAGE_STYLE
+from ..record.figure import MAX_POINTS
+from . import content
+from .content import Document, Element, Section
+from .document import described, drawing, read_runs
+from .svg import inline_svg
 
 MAX_BYTES = 3_000_000
 """Size above which a page is drawn again with fewer points, so that it can be mailed."""
 _NUM_POINTS = (MAX_POINTS, 1000, 250)
 _TOO_LARGE = f"This page is larger than {MAX_BYTES / 1e6:g} MB: several pages are easier to send."
 _STYLE = Path(__file__).with_name("page.css")
-_KINDS: dict[str, Callable[[Marker], Run]] = {
-    "excite identification": read_experiment,
-    "excite campaign": read_campaign,
-    "excite study": read_study_run,
-}
-_DRAWING = threading.Lock()  # Matplotlib's settings are global
+_NARROW = 8  # columns that fit a page that stands upright
+_NARROW_FIGURE = 12.0  # inches that fit a screen
 
 
 def report_html(
@@ -48,110 +37,28 @@ def report_html(
     Raises:
         ValueError: for a path that cannot be read as one of them.
     """
-    every = [_read(path) for path in runs]  # reports damaged files before drawing starts
+    every = read_runs(runs)  # reports damaged files before drawing starts
     page = ""
     for points in _NUM_POINTS:
-        with _DRAWING, matplotlib.rc_context(PAGE_STYLE), at_most(points):
-            page = _drawn(every, runs, progress)
+        with drawing(points):
+            page = _page(described(every, runs, progress))
         if len(page.encode()) <= MAX_BYTES:
             return page
-    return page.replace("<main>\n", f"<main>\n{paragraph(_TOO_LARGE)}", 1)
+    return page.replace("<main>\n", f"<main>\n{_paragraph(_TOO_LARGE)}", 1)
 
 
-def report(
-    runs: str | Path | Sequence[str | Path],
-    out: str | Path | None = None,
-    *,
-    overwrite: bool = False,
-    progress: Progress = SHOWN,
-) -> str:
-    """A report of run folders and records as one self-contained HTML page.
-
-        >>> import excite as ex
-        >>> ex.simulate("aero2", steps=60).save("report_of_this.csv")
-        >>> page = ex.report("report_of_this.csv")
-        >>> page[:15]
-        '<!DOCTYPE html>'
-
-    Args:
-        runs: one or several folders of `excite identify`, `excite campaign` and `excite study
-            run`, and records with their sidecar.
-        out: file to write, .html.
-        overwrite: whether the file may exist.
-        progress: called with what is drawn, how many are done, and the total.
-
-    Returns:
-        The page's text.
-
-    Raises:
-        ValueError: for a path that cannot be read as one of them, an `out` that is no .html
-            file, or one that exists, unless `overwrite`.
-    """
-    if out is not None:
-        if Path(out).suffix.lower() != ".html":
-            raise ValueError(f"{out}: reports end in .html")
-        require_new_file(Path(out), overwrite)
-    given = [runs] if isinstance(runs, str | Path) else runs
-    allowed = "a run folder, a record's file, or several"
-    if not isinstance(given, Sequence):
-        raise wrong_type("runs", runs, allowed)
-    page = report_html([path_from("runs", path, allowed) for path in given], progress)
-    if out is not None:
-        write_bytes(Path(out), page.encode())
-    return page
-
-
-def _drawn(
-    every: Sequence[Run],
-    runs: Sequence[Path],
-    progress: Callable[[str, int, int], None],
-) -> str:
-    """The page, with the present limit on the points of a line."""
-    sections = []
-    for i, run in enumerate(every):
-        progress(runs[i].name, i, len(runs))
-        sections.append(run.section(f"run{i + 1}"))
-    progress("done", len(runs), len(runs))
-    return _document(sections, _beside(every))
-
-
-def _beside(runs: Sequence[Run]) -> str:
-    """Comparisons of several experiments and of several studies, numbered as in the contents."""
-    experiments: dict[str, Experiment] = {}
-    studies: dict[str, StudyRun] = {}
-    for i, run in enumerate(runs, 1):
-        if isinstance(run, Experiment):
-            experiments[f"{i}. {run.marker.folder.absolute().name}"] = run
-        elif isinstance(run, StudyRun):
-            studies[f"{i}. {run.marker.folder.absolute().name}"] = run
-    parts = []
-    if len(experiments) > 1:
-        parts.append(("Experiments side by side", comparison(experiments)))
-    if len(studies) > 1:
-        parts.append(("Studies side by side", common_methods(studies)))
-    return "".join(f"<section>\n<h2>{h}</h2>\n{b}</section>\n" for h, b in parts if b)
-
-
-def _read(path: Path) -> Run:
-    """A run folder or a record of any kind."""
-    if path.is_file():
-        return read_recorded(path)
-    if not path.exists():
-        raise ValueError(f"{path}: no such folder or record")
-    marker = Marker.read(path, _KINDS)
-    return _KINDS[marker.kind](marker)
-
-
-def _document(sections: Sequence[Section], beside: str) -> str:
+def _page(document: Document) -> str:
     """The page; for several runs with a list of contents and a comparison."""
-    numbered = {f"{i}. {s.title}": s for i, s in enumerate(sections, 1)}
-    title, contents = f"{len(sections)} runs", _contents(list(numbered.items()))
-    if len(sections) == 1:
-        numbered, contents = {"": sections[0]}, _source(sections[0])
-        title = sections[0].title
+    title, sections, titles = document.title, document.sections, document.titles
+    several = len(sections) > 1
+    contents = _contents(sections, titles) if several else _source(sections[0])
+    beside = "".join(
+        f"<section>\n<h2>{text(name)}</h2>\n{_body(body)}</section>\n"
+        for name, body in document.beside
+    )
     body = "".join(
-        f'<section id="run{i}">\n{_head(t, s)}{s.body}</section>\n'
-        for i, (t, s) in enumerate(numbered.items(), 1)
+        f'<section id="run{i}">\n{_head(name, section) * several}{_body(section.body)}</section>\n'
+        for i, (name, section) in enumerate(zip(titles, sections, strict=True), 1)
     )
     return f"""<!DOCTYPE html>
 <html lang="en">
@@ -173,17 +80,97 @@ def _document(sections: Sequence[Section], beside: str) -> str:
 """
 
 
+def text(value: str) -> str:
+    """Text of a page; everything that comes from a file passes it."""
+    return html.escape(value)
+
+
 def _head(title: str, section: Section) -> str:
-    return f"<h2>{text(title)}</h2>\n{_source(section)}" if title else ""
+    return f"<h2>{text(title)}</h2>\n{_source(section)}"
 
 
 def _source(section: Section) -> str:
     return f'<p class="source">{text(section.name)}</p>\n'
 
 
-def _contents(sections: Sequence[tuple[str, Section]]) -> str:
+def _contents(sections: Sequence[Section], titles: Sequence[str]) -> str:
     links = "".join(
-        f'<li><a href="#run{i}">{text(title)}</a> <small>{text(s.name)}</small></li>\n'
-        for i, (title, s) in enumerate(sections, 1)
+        f'<li><a href="#run{i}">{text(title)}</a> <small>{text(section.name)}</small></li>\n'
+        for i, (title, section) in enumerate(zip(titles, sections, strict=True), 1)
     )
     return f'<nav aria-label="Contents"><ol>\n{links}</ol></nav>\n'
+
+
+def _body(parts: Iterable[Element]) -> str:
+    return "".join(map(_element, parts))
+
+
+def _element(part: Element) -> str:
+    match part:
+        case content.Answer(sentences):
+            return f'<div class="answer">\n{"".join(map(_paragraph, sentences))}</div>\n'
+        case content.Heading(words):
+            return f"<h3>{text(words)}</h3>\n"
+        case content.Paragraph(words):
+            return _paragraph(words)
+        case content.Notes(paragraphs):
+            return f'<div class="notes">\n{"".join(map(_paragraph, paragraphs))}</div>\n'
+        case content.Bullets(items):
+            lines = "".join(f"<li>{text(item)}</li>\n" for item in items)
+            return f"<ul>\n{lines}</ul>\n" if lines else ""
+        case content.Facts(pairs):
+            lines = "".join(f"<dt>{text(n)}</dt><dd>{text(v)}</dd>\n" for n, v in pairs)
+            return f"<dl>\n{lines}</dl>\n"
+        case content.Table():
+            return _table(part)
+        case content.Figure():
+            return _figure(part)
+        case content.Code(lines):
+            return f"<pre><code>{text(lines)}</code></pre>\n"
+        case content.Folded(summary, body):
+            return f"<details><summary>{text(summary)}</summary>\n{_body(body)}</details>\n"
+
+
+def _paragraph(words: str) -> str:
+    return f"<p>{text(words)}</p>\n"
+
+
+def _table(table: content.Table) -> str:
+    """A table; a wide one scrolls in its box.
+
+    A line is drawn where the first of its words changes, and published rows are marked.
+    """
+
+    def cells(kind: str, row: Sequence[str]) -> str:
+        tags = [kind if i < table.labels else f'{kind} class="number"' for i in range(len(row))]
+        return "".join(f"<{t}>{text(c)}</{kind}>" for t, c in zip(tags, row, strict=True))
+
+    lines, before = [], None
+    for row in table.rows:
+        classes = ["first"] * (row[0] != before) + ["published"] * ("as published" in row)
+        lines.append(f'<tr class="{" ".join(classes)}">{cells("td", row)}</tr>\n')
+        before = row[0]
+    is_wide = len(table.header) > _NARROW
+    box = _reachable(f"table: {table.title}", " wide") if is_wide else '<div class="scroll">'
+    return (
+        f"{box}<table>\n"
+        f"<thead><tr>{cells('th', table.header)}</tr></thead>\n"
+        f"<tbody>\n{''.join(lines)}</tbody></table></div>\n"
+        + _paragraph(table.caption)
+        * bool(table.caption)
+    )
+
+
+def _figure(figure: content.Figure) -> str:
+    """A figure in a box that scrolls."""
+    caption = text(figure.caption)
+    svg = inline_svg(figure.drawn, figure.name)
+    labelled = svg.replace("<svg", f'<svg role="img" aria-label="{caption}"', 1)
+    is_wide = bool(figure.drawn.get_figwidth() > _NARROW_FIGURE)
+    box = _reachable(f"figure: {figure.caption}") if is_wide else '<div class="scroll">'
+    return f"<figure>{box}{labelled}</div><figcaption>{caption}</figcaption></figure>\n"
+
+
+def _reachable(name: str, also: str = "") -> str:
+    """The opening tag of a box that scrolls, also by the keyboard, with a name."""
+    return f'<div class="scroll{also}" tabindex="0" role="region" aria-label="{text(name)}">'

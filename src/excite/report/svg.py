@@ -37,17 +37,11 @@ class _PlainLog(matplotlib.ticker.LogFormatter):
 def inline_svg(figure: matplotlib.figure.Figure, prefix: str) -> str:
     """A figure as an SVG element of a page; the page's style sets its colours.
 
-    It has no title, because a page has headings and captions.
-
     Args:
+        figure: that is made plain.
         prefix: of the figure's ids; unique on the page.
     """
-    if figure.get_suptitle():
-        figure.suptitle("")
-    for axes in figure.axes:
-        for axis in (axes.xaxis, axes.yaxis):
-            if axis.get_scale() in ("log", "symlog"):
-                _set_plain(axis)
+    make_plain(figure)
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
     svg = ElementTree.fromstring(buffer.getvalue())
@@ -66,6 +60,16 @@ def inline_svg(figure: matplotlib.figure.Figure, prefix: str) -> str:
         }
     svg.attrib = {"viewBox": svg.attrib["viewBox"], "style": f"--width: {svg.attrib['width']}"}
     return re.sub(r"\s*\n\s*", "\n", ElementTree.tostring(svg, encoding="unicode"))
+
+
+def make_plain(figure: matplotlib.figure.Figure) -> None:
+    """Takes the title of a figure, because a report has captions, and mathematics from its axes."""
+    if figure.get_suptitle():
+        figure.suptitle("")
+    for axes in figure.axes:
+        for axis in (axes.xaxis, axes.yaxis):
+            if axis.get_scale() in ("log", "symlog"):
+                _set_plain(axis)
 
 
 def _set_plain(axis: matplotlib.axis.Axis) -> None:

@@ -10,7 +10,8 @@ from collections.abc import Iterable, Sequence
 Table = tuple[list[str], list[list[str]]]
 """Column titles and rows."""
 
-_PROSE = 40  # characters from which the cells of a column are broken into lines
+PROSE = 40
+"""Characters from which the cells of a column are broken into lines."""
 
 
 def text_table(
@@ -41,9 +42,7 @@ def _lines(
     """One table, first columns and prose to the left, the rest to the right."""
     columns = list(zip(header, *rows, strict=True))
     widths, least = [max(map(len, c)) for c in columns], list(map(_least_width, columns))
-    is_left = [
-        i < labels or max(map(len, c[1:]), default=0) > _PROSE for i, c in enumerate(columns)
-    ]
+    is_left = [i < labels or max(map(len, c[1:]), default=0) > PROSE for i, c in enumerate(columns)]
     while sum(widths) + 2 * (len(widths) - 1) > width and widths != least:
         widths[max(range(len(widths)), key=lambda i: (widths[i] > least[i], widths[i]))] -= 1
 
@@ -78,10 +77,10 @@ def _wrapped(cell: str, width: int) -> list[str]:
 def _least_width(column: Sequence[str]) -> int:
     """Characters that a column needs: all of its cells, or of prose some words a line."""
     widest = max(map(len, column))
-    if widest <= _PROSE:
+    if widest <= PROSE:
         return widest
     return min(
-        widest, max(_PROSE // 2, *(len(w) for cell in column for w in _words(cell).split(" ")))
+        widest, max(PROSE // 2, *(len(w) for cell in column for w in _words(cell).split(" ")))
     )
 
 
@@ -117,7 +116,16 @@ def html_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]])
     return f"<table>\n{caption}{head}<tbody>\n{body}</tbody></table>\n"
 
 
-def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    """The lines of a table as Markdown."""
+def markdown_table(
+    header: Sequence[str], rows: Iterable[Sequence[str]], labels: int | None = None
+) -> list[str]:
+    """The lines of a table as Markdown.
+
+    Args:
+        header: column titles.
+        rows: of cells.
+        labels: how many columns are words; numbers stand on the right. Default: all.
+    """
     lines = ["| " + " | ".join(cells) + " |" for cells in (header, *rows)]
-    return [lines[0], "|" + " --- |" * len(header), *lines[1:]]
+    words = len(header) if labels is None else min(labels, len(header))
+    return [lines[0], "|" + " --- |" * words + " ---: |" * (len(header) - words), *lines[1:]]

@@ -12,27 +12,27 @@ from ...description import PlantDescription, names_of
 from ...files import read_columns, read_json
 from ...record import Record
 from ...record.figure import episode_figure
+from ..content import Bullets, Element, Figure, Folded, Heading, Paragraph, Section, Table
 from ..figures import knowledge_figure
 from ..numbers import digits_for, number
-from .elements import (
-    Marker,
-    Run,
-    Section,
-    bullets,
-    command,
-    facts,
-    figure,
-    folded,
-    heading,
-    paragraph,
-    plant_facts,
-    record_in,
-    signals_table,
-    table,
-    understood,
-)
+from .elements import Marker, Run, again, facts, plant_facts, record_in, signals_table, understood
 
 _MAX_RECORDS = 6  # drawn of one campaign
+_CODE = """\
+import json
+
+import pandas as pd
+
+records = [ex.read_record(path) for path in sorted(run.glob("round-*.csv"))]
+campaign = json.loads((run / "campaign.json").read_text(encoding="utf-8"))
+pd.DataFrame(campaign["rounds"])"""
+_KNOWLEDGE = """\
+from excite.report.figures import knowledge_figure
+
+knowledge = pd.read_csv(run / "knowledge.csv")
+halves = {name: values.to_numpy() for name, values in knowledge.items()}
+samples = halves["sample"].astype(int)
+knowledge_figure("", samples, halves, campaign["rounds"], campaign["allowed"])"""
 _ADVICE = "'excite campaign' writes it again"
 _SETTINGS = ("policy_hash", "spread", "most_rounds", "coast", "redesign")
 
@@ -59,57 +59,56 @@ class CampaignRun(Run):
         d, c = self.marker.plant, self.content
         with understood(self.marker.folder / "campaign.json", _ADVICE):
             ended = str(c["reason"] or c["interrupted"] or "not ended")
+            expected = f"Expected before the first round: {c['expected']}."
             parts = [
-                paragraph(f"Expected before the first round: {c['expected']}.")
-                if c["expected"]
-                else "",
-                bullets(c["warnings"]),
-                heading("What is known"),
-                table(*known_table(d, c)),
-                self._knowledge(name),
-                heading("Rounds"),
-                table(*rounds_table(c["rounds"])),
-                _rivals(c["structure"]),
-                heading("Measured"),
-                signals_table(d, self.records) if self.records else paragraph("Nothing yet."),
+                *([Paragraph(expected)] if c["expected"] else []),
+                Bullets(list(map(str, c["warnings"]))),
+                Heading("What is known"),
+                Table(*known_table(d, c), name="What is known of each quantity"),
+                *self._knowledge(name),
+                Heading("Rounds"),
+                Table(*rounds_table(c["rounds"]), name="Rounds and their decisions"),
+                *_rivals(c["structure"]),
+                Heading("Measured"),
+                signals_table(d, self.records) if self.records else Paragraph("Nothing yet."),
                 *(
-                    figure(
+                    Figure(
                         episode_figure(d, record),
                         f"{name}-round{i}",
                         f"Round {i}: inputs and outputs.",
+                        f"records[{i - 1}].plot()",
                     )
                     for i, record in enumerate(self.records[:_MAX_RECORDS], 1)
                 ),
-                heading("Settings and provenance"),
+                Heading("Settings and provenance"),
                 facts(
                     [
                         *((key, c[key]) for key in _SETTINGS),
                         *((key, value) for key, value in c["settings"].items() if key not in c),
                     ]
                 ),
-                command(self.marker.command, "") if self.marker.command else "",
-                folded("The plant", plant_facts(d)),
+                *(again(self.marker.command, "") if self.marker.command else []),
+                Folded("The plant", [plant_facts(d)]),
             ]
         count = len(c["rounds"])
         played = f"{c['num_samples']} samples in {count} round{'s' * (count != 1)}"
         title = f"{d.name}: {ended} ({played})"
-        return Section(title, self.marker.folder, "".join(parts))
+        return Section(title, self.marker.folder, parts, _CODE)
 
-    def _knowledge(self, name: str) -> str:
+    def _knowledge(self, name: str) -> list[Element]:
         """The figure of what was known after each sample; nothing without an estimate."""
         if not self.knowledge:
-            return ""
+            return []
         samples = self.knowledge["sample"].astype(int)
         rounds, allowed = self.content["rounds"], self.content["allowed"]
         drawn = knowledge_figure("", samples, self.knowledge, rounds, allowed)
-        return figure(
-            drawn,
-            f"{name}-known",
+        caption = (
             "Half of each 95 % interval over the one asked for. Lines: the Cramér-Rao bound at the "
             "final estimate, for the declared noise and the inputs that were played. Dots: the "
             "intervals of the estimates, by which the rounds were judged; they know the noise of "
-            "the records. Rounds end at the dotted lines.",
+            "the records. Rounds end at the dotted lines."
         )
+        return [Figure(drawn, f"{name}-known", caption, _KNOWLEDGE)]
 
 
 def read_campaign(marker: Marker) -> CampaignRun:
@@ -147,23 +146,23 @@ def known_table(d: PlantDescription, c: Mapping[str, Any]) -> tuple[list[str], l
         if target and known is not None:
             is_reached = known["ci95_half"] is not None and known["ci95_half"] <= c["allowed"][name]
             reached = "reached" if is_reached else "missed"
-        rows.append([name, units.get(name, ""), *cells, target, reached])
+        rows.append([name, str(units.get(name, "")), *cells, str(target), reached])
     return ["quantity", "unit", "estimate", "± 95 %", "relative", "target", ""], rows
 
 
 def rounds_table(rounds: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[list[str]]]:
     """What every round played, how near it came to a level, and what was decided."""
     rows = [
-        [str(i), r["played"], str(r["num_samples"]), f"{100 * r['nearness']:.0f} %", r["ended"],
-         r["decision"]]
+        [str(i), str(r["played"]), str(r["num_samples"]), f"{100 * r['nearness']:.0f} %",
+         str(r["ended"]), str(r["decision"])]
         for i, r in enumerate(rounds, 1)
     ]  # fmt: skip
     return ["round", "played", "samples", "of the level", "ended", "decision"], rows
 
 
-def _rivals(structure: Mapping[str, Any] | None) -> str:
+def _rivals(structure: Mapping[str, Any] | None) -> list[Element]:
     """The rivals when they were last compared; nothing without rivals."""
     if structure is None:
-        return ""
-    rows = [[r["plant"], f"{r['probability']:.4f}"] for r in structure["rivals"]]
-    return heading("Which plant") + table(["rival", "probability"], rows, labels=1)
+        return []
+    rows = [[str(r["plant"]), f"{r['probability']:.4f}"] for r in structure["rivals"]]
+    return [Heading("Which plant"), Table(["rival", "probability"], rows, 1, "Rivals")]

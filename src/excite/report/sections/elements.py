@@ -1,48 +1,20 @@
-"""Elements of all sections of a report: text, tables, figures, settings.
-
-Everything that comes from a file passes `text`, which escapes it.
-"""
+"""What the sections of a report share: run folders, settings in words, tables of signals."""
 
 from __future__ import annotations
 
 import abc
 import contextlib
-import html
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-
-import matplotlib.figure
 
 from ...description import Input, Output, PlantDescription, display_unit
 from ...files import damaged, read_json
 from ...record import Record, read_record
+from ..content import Code, Element, Facts, Heading, Paragraph, Section, Table
 from ..numbers import number
-from ..svg import inline_svg
 
-_NUM_LABELS = 2  # columns of words before those of numbers
-_NARROW = 8  # columns that fit a page that stands upright
-_NARROW_FIGURE = 12.0  # inches that fit a screen
-
-
-@dataclass(frozen=True)
-class Section:
-    """One run in a report.
-
-    Attributes:
-        title: in plain text.
-        source: file or folder it was read from.
-        body: as HTML.
-    """
-
-    title: str
-    source: Path
-    body: str
-
-    @property
-    def name(self) -> str:
-        """Last part of its path; the report does not show the rest."""
-        return self.source.absolute().name
+_NOT_STORED = "The run folder does not store the command. Most likely:"
 
 
 @dataclass(frozen=True)
@@ -98,90 +70,15 @@ def understood(path: Path, advice: str = "") -> Iterator[None]:
         raise damaged(path, advice) from error
 
 
-def text(value: object) -> str:
-    """A value as escaped text of a page."""
-    return html.escape(str(value))
+def facts(pairs: Iterable[tuple[str, object]]) -> Facts:
+    """Names and values in words; empty values are left out."""
+    return Facts([(name, words) for name, value in pairs if (words := in_words(value))])
 
 
-def paragraph(value: str) -> str:
-    """A paragraph of plain text."""
-    return f"<p>{text(value)}</p>\n"
-
-
-def bullets(values: Iterable[str]) -> str:
-    """A list of plain texts; nothing where there are none."""
-    items = "".join(f"<li>{text(value)}</li>\n" for value in values)
-    return f"<ul>\n{items}</ul>\n" if items else ""
-
-
-def heading(value: str) -> str:
-    """A heading inside a section."""
-    return f"<h3>{text(value)}</h3>\n"
-
-
-def table(
-    header: Sequence[str],
-    rows: Sequence[Sequence[str]],
-    labels: int = _NUM_LABELS,
-    name: str = "",
-) -> str:
-    """A table; a wide one scrolls in its box.
-
-    Args:
-        name: for screen readers; default the titles of its columns.
-        labels: how many columns are words; a line is drawn where the first of them changes,
-            and published rows are marked.
-    """
-
-    def cells(kind: str, row: Sequence[str]) -> str:
-        tags = [kind if i < labels else f'{kind} class="number"' for i in range(len(row))]
-        return "".join(f"<{t}>{text(c)}</{kind}>" for t, c in zip(tags, row, strict=True))
-
-    lines, before = [], None
-    for row in rows:
-        classes = ["first"] * (row[0] != before) + ["published"] * ("as published" in row)
-        lines.append(f'<tr class="{" ".join(classes)}">{cells("td", row)}</tr>\n')
-        before = row[0]
-    box = '<div class="scroll">'
-    if len(header) > _NARROW:
-        box = _reachable(f"table: {name or ', '.join(filter(None, header))}", " wide")
-    return (
-        f"{box}<table>\n"
-        f"<thead><tr>{cells('th', header)}</tr></thead>\n"
-        f"<tbody>\n{''.join(lines)}</tbody></table></div>\n"
-    )
-
-
-def facts(pairs: Iterable[tuple[str, object]]) -> str:
-    """Names and values below each other; empty values are left out."""
-    rows = [(name, in_words(value)) for name, value in pairs]
-    body = "".join(f"<dt>{text(n)}</dt><dd>{text(v)}</dd>\n" for n, v in rows if v)
-    return f"<dl>\n{body}</dl>\n"
-
-
-def folded(summary: str, body: str) -> str:
-    """Content that is folded on the screen, and open in print."""
-    return f"<details><summary>{text(summary)}</summary>\n{body}</details>\n"
-
-
-def figure(drawn: matplotlib.figure.Figure, name: str, caption: str) -> str:
-    """A figure in a box that scrolls; `name` is unique on the page."""
-    svg = inline_svg(drawn, name)
-    labelled = svg.replace("<svg", f'<svg role="img" aria-label="{text(caption)}"', 1)
-    is_wide = bool(drawn.get_figwidth() > _NARROW_FIGURE)
-    box = _reachable(f"figure: {caption}") if is_wide else '<div class="scroll">'
-    return f"<figure>{box}{labelled}</div><figcaption>{text(caption)}</figcaption></figure>\n"
-
-
-def _reachable(name: str, also: str = "") -> str:
-    """The opening tag of a box that scrolls, also by the keyboard, with a name."""
-    return f'<div class="scroll{also}" tabindex="0" role="region" aria-label="{text(name)}">'
-
-
-def command(kept: str | None, likely: str) -> str:
+def again(kept: str | None, likely: str) -> list[Element]:
     """The command to repeat the run: that of the run folder, or the most likely one."""
-    remark = "" if kept else paragraph("The run folder does not store the command. Most likely:")
-    return f"{heading('Repeat the run')}{remark}<pre><code>{text(kept or likely)}</code></pre>\n"
+    remark = [] if kept else [Paragraph(_NOT_STORED)]
+    return [Heading("Repeat the run"), *remark, Code(kept or likely)]
 
 
 def in_words(value: object) -> str:
@@ -197,7 +94,7 @@ def in_words(value: object) -> str:
     return "" if value is None else str(value)
 
 
-def plant_facts(d: PlantDescription) -> str:
+def plant_facts(d: PlantDescription) -> Facts:
     """The content of a plant's description."""
     levels = {
         o.name: {"warning level": _level(o.warning_level, o.unit),
@@ -242,7 +139,7 @@ def origin_in_words(record: Record) -> str:
     return in_words(parts) or "no sidecar"
 
 
-def signals_table(d: PlantDescription, records: Collection[Record]) -> str:
+def signals_table(d: PlantDescription, records: Collection[Record]) -> Table:
     """Extremes of every input and output over some records, and the safety level reached."""
     rows = []
     for kind, parts in (("inputs", d.inputs), ("outputs", d.outputs)):
@@ -260,7 +157,8 @@ def signals_table(d: PlantDescription, records: Collection[Record]) -> str:
                     _reached(part, size),
                 ]
             )
-    return table(["signal", "unit", "smallest", "largest", "levels"], rows)
+    header = ["signal", "unit", "smallest", "largest", "levels"]
+    return Table(header, rows, name="Measured signals")
 
 
 def _reached(part: Input | Output, size: float) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import shlex
 from collections.abc import Mapping, Sequence
@@ -13,6 +14,8 @@ from ...description import RARE, PlantDescription, display_unit, names_of
 from ...files import read_columns
 from ...record import Record
 from ...record.figure import episode_figure
+from ..answer import told_of_identification
+from ..content import Answer, Bullets, Element, Figure, Folded, Heading, Paragraph, Section, Table
 from ..estimates import largest_correlation, parameter_cells, parameter_header, residual_cells
 from ..figures import (
     autocorrelation_figure,
@@ -24,19 +27,12 @@ from ..rows import EstimatedParameter, EstimateSummary
 from .elements import (
     Marker,
     Run,
-    Section,
-    bullets,
-    command,
+    again,
     facts,
-    figure,
-    folded,
-    heading,
     origin_in_words,
-    paragraph,
     plant_facts,
     record_in,
     signals_table,
-    table,
     understood,
 )
 
@@ -46,6 +42,27 @@ _TESTS = (
     "inputs, a sign that the structure of the plant is wrong for the data. Both are judged at "
     f"p = {RARE:g}."
 )
+_CODE = """\
+import pandas as pd
+
+from excite.record.figure import episode_figure
+from excite.report.figures import (
+    autocorrelation_figure,
+    correlation_figure,
+    identification_figure,
+)
+from excite.report.rows import EstimateSummary
+
+result = EstimateSummary.read(run / "estimate.json")
+endings = ENDINGS
+records = [ex.read_record(run / f"record{ending}.csv") for ending in endings]
+plant = records[0].description
+outputs = [output.name for output in plant.outputs]
+simulated = [pd.read_csv(run / f"WORD{ending}.csv")[outputs].to_numpy() for ending in endings]
+pd.DataFrame({name: parameter.data() for name, parameter in result.params.items()}).T"""
+_WHITENESS = """\
+residuals = [record.outputs - own for record, own in zip(records, simulated, strict=True)]
+autocorrelation_figure(plant, residuals)"""
 _ADVICE = "'excite identify --out' writes it again"
 
 
@@ -73,30 +90,31 @@ class Experiment(Run):
         with understood(self.marker.folder / "estimate.json", _ADVICE):
             cells = [parameter_cells(n, p) for n, p in result.params.items()]
             parts = [
-                heading("Parameters"),
-                table(parameter_header(), cells),
-                _truth(self),
-                heading("What can be identified"),
-                bullets(result.verdict),
-                heading("Measured"),
+                Answer(told_of_identification(result)),
+                Heading("Parameters"),
+                Table(parameter_header(), cells, name="Estimates and their 95 % intervals"),
+                *_truth(self),
+                Heading("What can be identified"),
+                Bullets(result.verdict),
+                Heading("Measured"),
                 signals_table(d, self.records),
-                _figures(self, name),
-                heading("Residual"),
-                table(*_residuals(self), labels=1),
-                paragraph(_TESTS),
-                figure(
+                *_figures(self, name),
+                Heading("Residual"),
+                _residuals(self),
+                Figure(
                     autocorrelation_figure(d, _residual_values(self)),
                     f"{name}-white",
                     "Autocorrelation of the residual. For white noise, 95 % of it lies between "
                     "the dashed lines.",
+                    _WHITENESS,
                 ),
-                _correlation(result, name),
-                heading("Settings and provenance"),
-                _provenance(self),
-                command(self.marker.command, _likely_command(result)),
+                *_correlation(result, name),
+                Heading("Settings and provenance"),
+                *_provenance(self),
+                *again(self.marker.command, _likely_command(result)),
             ]
         title = f"{d.name}: {result.estimator}, {result.status}"
-        return Section(title, self.marker.folder, "".join(parts))
+        return Section(title, self.marker.folder, parts, _code(self))
 
 
 def read_experiment(marker: Marker) -> Experiment:
@@ -121,13 +139,22 @@ def read_experiment(marker: Marker) -> Experiment:
     return Experiment(marker, plant, result, records, simulated)
 
 
-def _truth(experiment: Experiment) -> str:
+def _code(experiment: Experiment) -> str:
+    """Python that reads the run folder."""
+    result = experiment.result
+    count = len(result.files)
+    endings = [""] if count == 1 else [f"_{i}" for i in range(1, count + 1)]
+    word = "predicted" if result.is_predicted else "simulated"
+    return _CODE.replace("ENDINGS", json.dumps(endings)).replace("WORD", word)
+
+
+def _truth(experiment: Experiment) -> list[Element]:
     """Estimates beside the parameters of a simulated plant; nothing for a real one."""
     true = experiment.records[0].metadata.get("params")
     params = experiment.result.params
     others = [record.metadata.get("params") for record in experiment.records]
     if not isinstance(true, Mapping) or set(true) != set(params) or any(o != true for o in others):
-        return ""
+        return []
     rows = []
     for name, p in params.items():
         error = 100 * (p.estimate / true[name] - 1) if p.estimate and true[name] else None
@@ -135,29 +162,34 @@ def _truth(experiment: Experiment) -> str:
         inside = "–" if math.isnan(low) else "yes" if low <= true[name] <= high else "no"
         rows.append([name, p.unit, number(true[name], 5), f"{number(error)} %", inside])
     header = ["symbol", "unit", "true", "error", "inside the interval"]
-    return paragraph("The record is simulated; these are the true parameters:") + table(
-        header, rows
-    )
+    remark = Paragraph("The record is simulated; these are the true parameters:")
+    return [remark, Table(header, rows, name="True parameters")]
 
 
-def _figures(experiment: Experiment, name: str) -> str:
+def _figures(experiment: Experiment, name: str) -> list[Element]:
     """Signals and fit of the first records."""
-    d, parts = experiment.plant, []
+    d, parts = experiment.plant, list[Element]()
     word = "predicted" if experiment.result.is_predicted else "simulated"
     pairs = list(zip(experiment.records, experiment.simulated, strict=True))
     for i, (record, simulated) in enumerate(pairs[:_MAX_RECORDS], 1):
         file = experiment.result.files[i - 1]
         parts += [
-            figure(episode_figure(d, record), f"{name}-in{i}", f"{file}: inputs and outputs."),
-            figure(
+            Figure(
+                episode_figure(d, record),
+                f"{name}-in{i}",
+                f"{file}: inputs and outputs.",
+                f"episode_figure(plant, records[{i - 1}])",
+            ),
+            Figure(
                 identification_figure(d, experiment.result, record, simulated),
                 f"{name}-fit{i}",
                 f"{file}: measured and {word} output, residual, and parameters.",
+                f"identification_figure(plant, result, records[{i - 1}], simulated[{i - 1}])",
             ),
         ]
     if len(pairs) > _MAX_RECORDS:
-        parts.append(paragraph(f"{len(pairs) - _MAX_RECORDS} more records are not drawn."))
-    return "".join(parts)
+        parts.append(Paragraph(f"{len(pairs) - _MAX_RECORDS} more records are not drawn."))
+    return parts
 
 
 def _residual_values(experiment: Experiment) -> list[np.ndarray]:
@@ -165,7 +197,7 @@ def _residual_values(experiment: Experiment) -> list[np.ndarray]:
     return [record.outputs - simulated for record, simulated in pairs]
 
 
-def _residuals(experiment: Experiment) -> tuple[list[str], list[list[str]]]:
+def _residuals(experiment: Experiment) -> Table:
     """Fit and tests by output, and the fit of held-out records."""
     result, rows = experiment.result, []
     residuals = np.concatenate(_residual_values(experiment))
@@ -183,21 +215,23 @@ def _residuals(experiment: Experiment) -> tuple[list[str], list[list[str]]]:
     for percents, about in others:
         for output, percent in percents.items():
             rows.append([f"{output}, {about}", f"{number(percent, 4)} %", *"–––––"])
-    return ["output", "fit", "RMS residual", "white", "p", "follows the input", "p"], rows
+    header = ["output", "fit", "RMS residual", "white", "p", "follows the input", "p"]
+    return Table(header, rows, 1, "Fit and residual", _TESTS)
 
 
-def _correlation(result: EstimateSummary, name: str) -> str:
+def _correlation(result: EstimateSummary, name: str) -> list[Element]:
     drawn = correlation_figure(result)
     if drawn is None:
-        return ""
+        return []
     caption = (
         "95 % confidence region of each pair of parameters, in percent of the estimates. "
         f"Largest correlation: {largest_correlation(result)}."
     )
-    return heading("Correlation of the estimates") + figure(drawn, f"{name}-pairs", caption)
+    shown = Figure(drawn, f"{name}-pairs", caption, "correlation_figure(result)")
+    return [Heading("Correlation of the estimates"), shown]
 
 
-def _provenance(experiment: Experiment) -> str:
+def _provenance(experiment: Experiment) -> list[Element]:
     result = experiment.result
     own = facts(
         [
@@ -211,7 +245,8 @@ def _provenance(experiment: Experiment) -> str:
         for file, record in zip(result.files, experiment.records, strict=True)
     ]
     header = ["record", "samples", "sampling time", "duration", "origin"]
-    return own + table(header, rows, labels=1) + folded("The plant", plant_facts(experiment.plant))
+    plant = Folded("The plant", [plant_facts(experiment.plant)])
+    return [own, Table(header, rows, 1, "Records"), plant]
 
 
 def _lengths(record: Record) -> list[str]:
@@ -227,7 +262,7 @@ def _likely_command(result: EstimateSummary) -> str:
     )
 
 
-def comparison(numbered: Mapping[str, Experiment]) -> str:
+def comparison(numbered: Mapping[str, Experiment]) -> list[Element]:
     """Estimates with intervals, and fits, of several experiments side by side, by title."""
     header, experiments = ["", "unit", *numbered], list(numbered.values())
     names = {n: p.unit for e in experiments for n, p in e.result.params.items()}
@@ -239,7 +274,7 @@ def comparison(numbered: Mapping[str, Experiment]) -> str:
     for output in outputs:
         fits = [number(e.result.fit_percent.get(output), 4) for e in experiments]
         rows.append([f"fit of {output}", "%", *fits])
-    return table(header, rows, name="Experiments side by side")
+    return [Table(header, rows, name="Experiments side by side")]
 
 
 def _interval(name: str, params: Mapping[str, EstimatedParameter]) -> str:

@@ -10,20 +10,11 @@ from ...description import PlantDescription
 from ...files import read_json
 from ...record import RECORD_KIND, Record
 from ...record.figure import episode_figure
-from .elements import (
-    Run,
-    Section,
-    facts,
-    figure,
-    folded,
-    heading,
-    paragraph,
-    plant_facts,
-    record_in,
-    signals_table,
-    understood,
-)
+from ..answer import told_of_record
+from ..content import Answer, Element, Figure, Folded, Heading, Paragraph, Section
+from .elements import Run, facts, plant_facts, record_in, signals_table, understood
 
+_CODE = "record = ex.read_record(run)\nrecord"
 _ABOUT_THE_FILE = ("kind", "plant", "plant_hash", "dt", "provenance", "ended", "params")
 
 
@@ -39,7 +30,7 @@ class Recorded(Run):
         """The section of a record."""
         d, record = self.plant, self.record
         with understood(self.path.with_suffix(".json")):
-            ended = _ended(record.metadata)
+            answer, ended = Answer(told_of_record(d, record)), _ended(record.metadata)
             about = facts(
                 [
                     ("samples", len(record.time)),
@@ -52,15 +43,16 @@ class Recorded(Run):
             )
         caption = f"{self.path.name}: inputs, outputs."
         parts = [
-            ended,
-            heading("Measured"),
+            answer,
+            *ended,
+            Heading("Measured"),
             signals_table(d, [record]),
-            figure(episode_figure(d, record), f"{name}-in", caption),
-            heading("Settings and provenance"),
+            Figure(episode_figure(d, record), f"{name}-in", caption, "record.plot()"),
+            Heading("Settings and provenance"),
             about,
-            folded("The plant", plant_facts(d)),
+            Folded("The plant", [plant_facts(d)]),
         ]
-        return Section(f"{d.name}: a record", self.path, "".join(parts))
+        return Section(f"{d.name}: a record", self.path, parts, _CODE)
 
 
 def read_recorded(path: Path) -> Recorded:
@@ -85,14 +77,12 @@ def read_recorded(path: Path) -> Recorded:
     return Recorded(path, plant, record_in(path, plant))
 
 
-def _ended(metadata: Mapping[str, object]) -> str:
-    """How an experiment on a rig ended; nothing for a simulation."""
-    if "ended" not in metadata:
-        return ""
-    ended = metadata["ended"]
+def _ended(metadata: Mapping[str, object]) -> list[Element]:
+    """How an experiment on a rig ended; nothing for one that did not, and a simulation."""
+    ended = metadata.get("ended")
     if ended is None:
-        return paragraph("The experiment is still running, or its process was killed.")
+        return []
     if not isinstance(ended, Mapping):
         raise TypeError("how it ended")
     details = {k: v for k, v in ended.items() if k != "reason"}
-    return heading("How it ended") + paragraph(ended["reason"]) + facts(details.items())
+    return [Heading("How it ended"), Paragraph(str(ended["reason"])), facts(details.items())]

@@ -12,6 +12,18 @@ from ...files import folder_word, read_columns, read_json
 from ...policy import POLICY_ENDING, read_policy
 from ...record import Record
 from ..answer import answered
+from ..content import (
+    Answer,
+    Bullets,
+    Element,
+    Figure,
+    Folded,
+    Heading,
+    Notes,
+    Paragraph,
+    Section,
+    Table,
+)
 from ..figures import benchmark_figure
 from ..frontier import frontier_figure, lengths_figure
 from ..rows import EpisodeData, Options, StudyFacts
@@ -23,27 +35,17 @@ from ..study_table import (
     difference_cells,
     footnotes,
 )
-from .elements import (
-    Marker,
-    Run,
-    Section,
-    bullets,
-    command,
-    facts,
-    figure,
-    folded,
-    heading,
-    in_words,
-    paragraph,
-    plant_facts,
-    table,
-    understood,
-)
+from .elements import Marker, Run, again, facts, in_words, plant_facts, understood
 
 _BESIDE = 4  # episodes and learning curves in one figure
 _LEARNING = "Policies without exploration noise during training: median and band over the seeds."
 _COMPARED = ("plant", "episodes", "num_steps", "seed", "seeds", "spread", "prior", "gain", "sensor",
              "rig", "decision", "training", "gradient")  # fmt: skip
+_CODE = """\
+from excite.study.table import finished_table
+
+table = finished_table(run)
+table"""
 _ADVICE = "rerun 'excite study run' to write it again"
 
 
@@ -63,28 +65,24 @@ class StudyRun(Run):
         """The section of a study."""
         t, claims = self.table, _claims(self)
         answer = answered(t.rows, t.study, claims)
-        notes = "".join(map(paragraph, footnotes(t.study, t.rows)))
         seeds = t.best_seeds
-        searched = bullets(
-            f"{agent}, seed {seeds[agent]}: {told}" for agent, told in claims.items()
-        )
-        everything = table(*t.cells(), name=t.study.heading)
+        searched = [f"{agent}, seed {seeds[agent]}: {told}" for agent, told in claims.items()]
+        header, rows = answer.table()
         parts = [
-            f'<div class="answer">\n{"".join(map(paragraph, answer.sentences))}</div>\n',
-            _frontier(t, name),
-            table(*answer.table(), labels=1, name="the excitations"),
-            paragraph(answer.caption),
-            _comparisons(t, name),
-            heading("Searched for violations") + searched if searched else "",
-            _learning(self, name),
-            _episodes(self, name),
-            heading("All results"),
-            everything,
-            f'<div class="notes">\n{notes}</div>\n',
-            _differences(t),
-            _settings(self),
+            Answer(answer.sentences),
+            *_frontier(t, name),
+            Table(header, rows, 1, "the excitations", answer.caption),
+            *_comparisons(t, name),
+            *([Heading("Searched for violations"), Bullets(searched)] if searched else []),
+            *_learning(self, name),
+            *_episodes(self, name),
+            Heading("All results"),
+            Table(*t.cells(), name=t.study.heading),
+            Notes(footnotes(t.study, t.rows)),
+            *_differences(t),
+            *_settings(self),
         ]
-        return Section(t.study.heading, self.marker.folder, "".join(parts))
+        return Section(t.study.heading, self.marker.folder, parts, _CODE)
 
 
 def read_study_run(marker: Marker) -> StudyRun:
@@ -101,36 +99,45 @@ def read_study_run(marker: Marker) -> StudyRun:
     return StudyRun(marker, StudyTable.in_folder(folder, study, _ADVICE))
 
 
-def _frontier(found: StudyTable, name: str) -> str:
+def _frontier(found: StudyTable, name: str) -> list[Element]:
     """Information against violations; nothing where there is only one method."""
     if len({row.method for row in found.rows}) < 2:
-        return ""
+        return []
     caption = "Information of each method, and how many experiments reach the critical level."
-    return figure(frontier_figure(found.rows, found.study.heading), f"{name}-frontier", caption)
+    drawn = frontier_figure(found.rows, found.study.heading)
+    return [Figure(drawn, f"{name}-frontier", caption, _drawn_by("frontier"))]
 
 
-def _comparisons(found: StudyTable, name: str) -> str:
+def _comparisons(found: StudyTable, name: str) -> list[Element]:
     """Error against bound, bound against length."""
     rows, title = found.rows, found.study.heading
-    parts = [
-        heading("Error against bound"),
-        figure(
+    parts: list[Element] = [
+        Heading("Error against bound"),
+        Figure(
             benchmark_figure(rows, title),
             f"{name}-errors",
             "Mean relative error of each method and estimator; grey: error of an efficient "
             "estimator with the same data.",
+            "table.plot()",
         ),
     ]
     if any(row.bound_by_length for row in rows):
         parts += [
-            heading("Bound against length"),
-            figure(
+            Heading("Bound against length"),
+            Figure(
                 lengths_figure(rows, title),
                 f"{name}-lengths",
                 "Smallest possible standard deviation against the number of samples.",
+                _drawn_by("lengths"),
             ),
         ]
-    return "".join(parts)
+    return parts
+
+
+def _drawn_by(word: str) -> str:
+    """Python that draws a figure of a study's rows."""
+    call = f"{word}_figure(table.rows, table.study.heading)"
+    return f"from excite.report.frontier import {word}_figure\n\n{call}"
 
 
 def _claims(run: StudyRun) -> dict[str, str]:
@@ -143,7 +150,7 @@ def _claims(run: StudyRun) -> dict[str, str]:
     return claims
 
 
-def _learning(run: StudyRun, name: str) -> str:
+def _learning(run: StudyRun, name: str) -> list[Element]:
     """Learning curves of all agents; empty where none are stored."""
     folder, study, plant = run.marker.folder / "seeds", run.table.study, run.marker.plant
     paths = {
@@ -151,7 +158,7 @@ def _learning(run: StudyRun, name: str) -> str:
         for agent in study.agents
     }
     if not all(path.is_file() for files in paths.values() for path in files):
-        return ""
+        return []
     names = ("steps", "violation_rate", *(f"relative_error_{p.name}" for p in plant.parameters))
     advice = "delete its folder: 'excite study run' trains that seed again"
     curves: dict[str, Sequence[Curve]] = {
@@ -163,24 +170,24 @@ def _learning(run: StudyRun, name: str) -> str:
         chosen = {agent: curves[agent] for agent in part}
         with understood(folder, advice):
             drawn = curves_figure(plant, chosen, study.heading, run.table.bound_curves)
-        figures.append(figure(drawn, f"{name}-curves{i}", _LEARNING))
-    return heading("Learning") * bool(figures) + "".join(figures)
+        figures.append(Figure(drawn, f"{name}-curves{i}", _LEARNING))
+    return [Heading("Learning"), *figures] if figures else []
 
 
-def _episodes(run: StudyRun, name: str) -> str:
+def _episodes(run: StudyRun, name: str) -> list[Element]:
     """One episode of each method and agent; empty where none is stored."""
     path, plant = run.marker.folder / "episodes.json", run.marker.plant
     caption = "Inputs, outputs with their safety levels, and running estimates."
     if not path.is_file():
-        return ""
+        return []
     figures, content = [], read_json(path, advice=_ADVICE)
     with understood(path, _ADVICE):
         episodes = {n: _episode(plant, EpisodeData.model_validate(e)) for n, e in content.items()}
         for i, part in enumerate(_groups(list(episodes)), 1):
             chosen = {method: episodes[method] for method in part}
             drawn = agents_figure(plant, chosen, run.table.study.heading)
-            figures.append(figure(drawn, f"{name}-episodes{i}", caption))
-    return heading("One episode each") + "".join(figures)
+            figures.append(Figure(drawn, f"{name}-episodes{i}", caption))
+    return [Heading("One episode each"), *figures]
 
 
 def _episode(d: PlantDescription, data: EpisodeData) -> tuple[Record, np.ndarray]:
@@ -202,14 +209,15 @@ def _groups(names: Sequence[str]) -> list[Sequence[str]]:
     return [list(part) for part in np.array_split(np.array(names, object), count or 1) if len(part)]
 
 
-def _differences(found: StudyTable) -> str:
+def _differences(found: StudyTable) -> list[Element]:
     if not found.differences:
-        return ""
+        return []
     title = f"Differences, {found.differences[0].estimator}"
-    return folded(title, paragraph(DIFFERENCES) + table(*difference_cells(found.differences)))
+    cells = Table(*difference_cells(found.differences), name="Differences between methods")
+    return [Folded(title, [Paragraph(DIFFERENCES), cells])]
 
 
-def _settings(run: StudyRun) -> str:
+def _settings(run: StudyRun) -> list[Element]:
     """Every setting of the study, and its source."""
     s, marker = run.table.study, run.marker
     common = [
@@ -235,28 +243,29 @@ def _settings(run: StudyRun) -> str:
         [n, a.method, in_words(a.targets) or "all", in_words(a.decision), in_words(a.training)]
         for n, a in s.agents.items()
     ]
-    parts = [heading("Settings and provenance"), facts(common)]
+    parts: list[Element] = [Heading("Settings and provenance"), facts(common)]
     parts += _choices("method", "excitation", s.methods)
     parts += _choices("estimator", "kind", s.estimators)
     if agents:
-        parts.append(table(["agent", "trained by", "for", "decision", "training"], agents, 5))
+        header = ["agent", "trained by", "for", "decision", "training"]
+        parts.append(Table(header, agents, 5, "Agents"))
     for words, lines in (("Inferred, not stated by the source", s.inferred), ("Ours", s.ours)):
         if lines:
-            parts += [paragraph(f"{words}:"), bullets(lines)]
-    again = command(marker.command, f"excite study run {s.name}.toml --out FOLDER")
-    return "".join([*parts, folded("The plant", plant_facts(marker.plant)), again])
+            parts += [Paragraph(f"{words}:"), Bullets(lines)]
+    parts.append(Folded("The plant", [plant_facts(marker.plant)]))
+    return parts + again(marker.command, f"excite study run {s.name}.toml --out FOLDER")
 
 
-def _choices(what: str, kind: str, choices: Mapping[str, Options]) -> list[str]:
+def _choices(what: str, kind: str, choices: Mapping[str, Options]) -> list[Element]:
     """A table of methods or estimators and their options; nothing where there are none."""
     rows = [
         [name, str(own[kind]), in_words({k: v for k, v in own.items() if k != kind})]
         for name, own in choices.items()
     ]
-    return [table([what, kind, "options"], rows, 3)] if rows else []
+    return [Table([what, kind, "options"], rows, 3, f"{what.capitalize()}s")] if rows else []
 
 
-def common_methods(numbered: Mapping[str, StudyRun]) -> str:
+def common_methods(numbered: Mapping[str, StudyRun]) -> list[Element]:
     """Methods of several studies side by side, by title; empty without common methods.
 
     Studies whose plants have other parameters or outputs are not compared.
@@ -264,20 +273,22 @@ def common_methods(numbered: Mapping[str, StudyRun]) -> str:
     groups: dict[tuple[str, ...], dict[str, StudyRun]] = {}
     for title, run in numbered.items():
         first = run.table.rows[0]
-        alike = (*first.parameters, first.max_abs_output.output, first.max_abs_output.unit)
-        groups.setdefault(alike, {})[title] = run
-    return "".join(_compared(group) for group in groups.values() if len(group) > 1)
+        columns = (*first.parameters, first.max_abs_output.output, first.max_abs_output.unit)
+        groups.setdefault(columns, {})[title] = run
+    alike = [group for group in groups.values() if len(group) > 1]
+    return [part for group in alike for part in _compared(group)]
 
 
-def _compared(group: Mapping[str, StudyRun]) -> str:
+def _compared(group: Mapping[str, StudyRun]) -> list[Element]:
     """The table of common methods, and how the studies differ."""
     common = common_table({title: run.table for title, run in group.items()})
     if common is None:
-        return paragraph(f"{' and '.join(group)} have no method and estimator in common.")
-    return table(*common, 3, name="methods in several studies") + _settings_beside(group)
+        return [Paragraph(f"{' and '.join(group)} have no method and estimator in common.")]
+    header, rows = common
+    return [Table(header, rows, 3, "methods in several studies"), *_settings_beside(group)]
 
 
-def _settings_beside(group: Mapping[str, StudyRun]) -> str:
+def _settings_beside(group: Mapping[str, StudyRun]) -> list[Element]:
     """The settings in which studies differ, which may explain differences in their results."""
     studies = [run.table.study for run in group.values()]
     every = [_flat({key: getattr(study, key) for key in _COMPARED}) for study in studies]
@@ -287,9 +298,9 @@ def _settings_beside(group: Mapping[str, StudyRun]) -> str:
         if len(set(words)) > 1:
             rows.append([key, *words])
     if not rows:
-        return ""
-    differ = table(["", *group], rows, 1 + len(group), name="settings in which they differ")
-    return paragraph("Settings in which they differ; a dash is the default:") + differ
+        return []
+    differ = Table(["", *group], rows, 1 + len(group), "settings in which they differ")
+    return [Paragraph("Settings in which they differ; a dash is the default:"), differ]
 
 
 def _flat(settings: Mapping[str, object]) -> dict[str, str]:
