@@ -13,6 +13,7 @@ import math
 import os
 from collections.abc import Iterator
 from datetime import UTC, datetime
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,10 @@ from starlette.routing import Route
 
 from ..description import PlantDescription
 from ..files import folder_word
-from ..report.sections.campaign import known_table, rounds_table
+from ..report.key_figures import of_identification, of_study, of_training
+from ..report.rows import EstimateSummary, StudyFacts
+from ..report.sections.campaign import known_table, outcome, rounds_table
+from ..report.study_table import StudyTable
 from .requests import RefusedError, without_folders
 
 _TYPES = {
@@ -34,6 +38,7 @@ _TYPES = {
     ".safetensors": "application/octet-stream",
 }
 _DEPTH, _MAX_RUNS, _MAX_CURVES, _MAX_TEXT = 4, 500, 256, 4 * 2**20
+_RESULTS = ("run.json", "study.json", "table.json", "estimate.json", "campaign.json")
 
 
 def routes(folder: Path) -> list[Route]:
@@ -131,18 +136,57 @@ def _json(run: Path, name: str) -> dict[str, object]:
 
 
 def _summary(name: str, run: Path) -> dict[str, object]:
-    marker, study = _json(run, "run.json"), _json(run, "study.json")
+    written = list[tuple[int, ...]]()
+    for file in _RESULTS:
+        with contextlib.suppress(OSError):  # there is none, or it was removed in the meantime
+            seen = (run / file).lstat()
+            written.append((seen.st_mtime_ns, seen.st_size, seen.st_ino))
+    return {"name": name, "changed": _changed(run), **_found_in(run, tuple(written))}
+
+
+@lru_cache(2 * _MAX_RUNS)
+def _found_in(run: Path, written: object) -> dict[str, object]:
+    """What the result files of a run say, read again when one was written."""
+    del written
+    marker, study, kind = _json(run, "run.json"), _json(run, "study.json"), _kind(run)
     plant = marker.get("plant")
+    is_finished = bool(_json(run, "campaign.json").get("reason")) or any(
+        _is_inside(run / f, run) for f in ("table.json", "estimate.json")
+    )
     return {
-        "name": name,
-        "kind": str(marker.get("kind", "")).removeprefix("excite "),
+        "kind": kind,
         "plant": str(plant.get("name", "")) if isinstance(plant, dict) else "",
         "command": without_folders(str(marker.get("command") or "")),
         "title": str(study.get("title") or study.get("name") or ""),
-        "changed": _changed(run),
-        "is_finished": bool(_json(run, "campaign.json").get("reason"))
-        or any(_is_inside(run / f, run) for f in ("table.json", "estimate.json")),
+        "figures": _key_figures(run, kind),
+        "is_finished": is_finished,
     }
+
+
+def _kind(run: Path) -> str:
+    """Identification, campaign, study, or that of a study that `excite train` made."""
+    marker = _json(run, "run.json")
+    is_training = str(marker.get("command", "")).startswith("excite train ")
+    return "training" if is_training else str(marker.get("kind", "")).removeprefix("excite ")
+
+
+def _key_figures(run: Path, kind: str) -> str:
+    """What a run found, in one line; empty where it is not finished or damaged."""
+    with contextlib.suppress(LookupError, TypeError, AttributeError, ArithmeticError, ValueError):
+        if kind == "identification":
+            return of_identification(EstimateSummary.of(_json(run, "estimate.json")))
+        if kind == "campaign":
+            return outcome(_json(run, "campaign.json"))
+        if kind in ("study", "training"):
+            table = table_of(run)
+            return of_training(table) if kind == "training" else of_study(table)
+    return ""
+
+
+def table_of(run: Path) -> StudyTable:
+    """The table of a finished study; ValueError where there is none, or it is damaged."""
+    study = StudyFacts.model_validate(_json(run, "study.json"))
+    return StudyTable.model_validate({**_json(run, "table.json"), "study": study})
 
 
 def _changed(run: Path) -> str:

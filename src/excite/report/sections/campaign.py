@@ -58,7 +58,7 @@ class CampaignRun(Run):
         """The section of a campaign."""
         d, c = self.marker.plant, self.content
         with understood(self.marker.folder / "campaign.json", _ADVICE):
-            ended = str(c["reason"] or c["interrupted"] or "not ended")
+            title = f"{d.name}: {outcome(c)}"
             parts = [
                 paragraph(f"Expected before the first round: {c['expected']}.")
                 if c["expected"]
@@ -90,9 +90,6 @@ class CampaignRun(Run):
                 command(self.marker.command, "") if self.marker.command else "",
                 folded("The plant", plant_facts(d)),
             ]
-        count = len(c["rounds"])
-        played = f"{c['num_samples']} samples in {count} round{'s' * (count != 1)}"
-        title = f"{d.name}: {ended} ({played})"
         return Section(title, self.marker.folder, "".join(parts))
 
     def _knowledge(self, name: str) -> str:
@@ -110,6 +107,15 @@ class CampaignRun(Run):
             "intervals of the estimates, by which the rounds were judged; they know the noise of "
             "the records. Rounds end at the dotted lines.",
         )
+
+
+def outcome(content: Mapping[str, Any]) -> str:
+    """How a campaign ended, and after how many samples."""
+    ended, count = (
+        content["reason"] or content["interrupted"] or "not ended",
+        len(content["rounds"]),
+    )
+    return f"{ended} ({content['num_samples']} samples in {count} round{'s' * (count != 1)})"
 
 
 def read_campaign(marker: Marker) -> CampaignRun:

@@ -1,0 +1,191 @@
+"""The run folder on the bench page: its table, and what is done with several runs."""
+
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from chromium import require_chromium
+from commands import PATIENCE
+from served import served
+from starlette.testclient import TestClient
+
+import excite as ex
+from excite.files import read_json, write_json
+from excite.plant import Aero2
+from excite.report.answer import answered
+from excite.study.table import finished_table
+from excite.web import application
+from excite.web.sessions import PageSettings
+
+require_chromium()
+
+from axe_playwright_python.sync_playwright import Axe  # noqa: E402
+from playwright.sync_api import Locator, Page, expect  # noqa: E402
+
+HERE = "http://127.0.0.1:8000"
+RESULTS = Path(__file__).parents[2] / "results"
+WAIT = 1000 * PATIENCE  # milliseconds
+IN_ALL_SIZES = pytest.mark.parametrize(
+    ("scheme", "width"), [("light", 1440), ("dark", 1024), ("light", 390), ("dark", 390)]
+)
+
+
+@pytest.fixture(scope="module")
+def identified(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Run folders of two identifications."""
+    folder = tmp_path_factory.mktemp("identified")
+    for name, seed in (("chirp", 1), ("prbs", 2)):
+        record = ex.simulate("aero2", name, steps=200, seed=seed)
+        command = f"excite identify {name}.csv --plant aero2"
+        ex.identify(record, "aero2").save(folder / name, command=command)
+    return folder
+
+
+@pytest.fixture
+def runs(identified: Path, tmp_path: Path) -> Path:
+    """A run folder: two studies, two identifications, a campaign; the oldest is the first."""
+    folder = tmp_path / "runs"
+    folder.mkdir()
+    files = ("run.json", "study.json", "table.json", "table.md")
+    for name in ("frontier", "table1"):
+        (folder / name).mkdir()
+        for file in files:
+            shutil.copy(RESULTS / name / file, folder / name / file)
+    for name in ("chirp", "prbs"):
+        shutil.copytree(identified / name, folder / "some" / name)
+    (folder / "known").mkdir()
+    plant = Aero2().description.to_dict()
+    write_json(folder / "known" / "run.json", {"kind": "excite campaign", "plant": plant})
+    write_json(folder / "known" / "campaign.json", {
+        "reason": "every target is reached", "interrupted": "", "targets": {}, "allowed": {},
+        "estimate": {}, "rounds": [{}, {}], "num_samples": 80,
+    })  # fmt: skip
+    for day, run in enumerate(("known", "table1", "some/prbs", "frontier", "some/chirp"), 1):
+        for path in (folder / run).iterdir():
+            os.utime(path, (86400 * day, 86400 * day))
+    return folder
+
+
+@pytest.fixture
+def client(runs: Path, tmp_path: Path) -> TestClient:
+    app = application(PageSettings(runs, num_workers=0), tmp_path)
+    opened = TestClient(app, base_url=HERE, headers={"origin": HERE})
+    assert opened.post("/api/session", json={}).is_success
+    return opened
+
+
+@pytest.fixture
+def address(runs: Path) -> Iterator[str]:
+    with served(runs, "--workers", "1") as where:
+        yield where
+
+
+def names(page: Page) -> Locator:
+    """The runs in the table, from top to bottom."""
+    return page.locator("#run-list tbody th")
+
+
+def require_access(page: Page, scheme: Any, width: int) -> None:
+    """Nothing hinders people who do not see or point; nothing needs scrolling sideways."""
+    page.emulate_media(color_scheme=scheme)
+    page.set_viewport_size({"width": width, "height": 900})
+    violations = Axe().run(page).response["violations"]
+    assert [(v["id"], v["nodes"][0]["html"]) for v in violations] == []
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+
+
+# -------------------------------------------------------------------------- the table of runs
+
+
+def test_key_figures_are_those_of_the_results(client: TestClient, runs: Path):
+    listed = {run["name"]: run for run in client.get("/api/runs").json()["runs"]}
+    assert {name: run["kind"] for name, run in listed.items()} == {
+        "frontier": "study", "table1": "study", "known": "campaign",
+        "some/chirp": "identification", "some/prbs": "identification",
+    }  # fmt: skip
+    table = finished_table(RESULTS / "frontier")
+    best = answered(table.rows, table.study, {}).best
+    assert best is not None
+    told = listed["frontier"]["figures"]
+    assert told.startswith(f"{best.method}: log det {best.log_det_information:.2f}, violations 0/")
+    ended = "every target is reached (80 samples in 2 rounds)"
+    assert listed["known"]["figures"] == ended
+    words = listed["some/chirp"]["figures"].split(", ")
+    assert [word.split()[0] for word in words] == ["J_p", "K_pu", "D_p", "fit"]
+
+
+def test_key_figures_follow_what_is_written(client: TestClient, runs: Path):
+    def told(name: str) -> Any:
+        return next(r for r in client.get("/api/runs").json()["runs"] if r["name"] == name)
+
+    assert "log det" in told("table1")["figures"]
+    shutil.copy(RESULTS / "frontier" / "table.json", runs / "table1" / "table.json")
+    shutil.copy(RESULTS / "frontier" / "study.json", runs / "table1" / "study.json")
+    assert told("table1")["figures"] == told("frontier")["figures"]
+    (runs / "table1" / "table.json").write_text("{}")
+    assert told("table1")["figures"] == ""  # it is damaged, and listed all the same
+    (runs / "table1" / "table.json").unlink()
+    assert not told("table1")["is_finished"]
+    (runs / "table1" / "table.json").symlink_to(RESULTS / "table1" / "table.json")
+    assert told("table1")["figures"] == ""  # links are not followed
+
+
+def test_a_training_is_told_by_its_agent(client: TestClient, runs: Path):
+    marker = read_json(runs / "table1" / "run.json")
+    write_json(runs / "table1" / "run.json", {**marker, "command": "excite train aero2 --out x"})
+    [run] = [r for r in client.get("/api/runs").json()["runs"] if r["name"] == "table1"]
+    assert run["kind"] == "training"
+    agents = finished_table(RESULTS / "table1").study.agents
+    assert {told.partition(":")[0] for told in run["figures"].split("; ")} == set(agents)
+
+
+def test_runs_are_sorted_and_filtered(address: str, page: Page):
+    page.goto(f"{address}/#runs")
+    newest = ["some/chirp", "frontier", "some/prbs", "table1", "known"]
+    expect(names(page)).to_have_text(newest)
+    head = page.get_by_role("columnheader")
+    expect(head.nth(1)).to_have_attribute("aria-sort", "descending")
+    head.nth(1).get_by_role("button").click()
+    expect(names(page)).to_have_text(newest[::-1])
+    # The same by the keyboard; equal ones by their names.
+    kind = page.get_by_role("button", name="kind")
+    kind.focus()
+    page.keyboard.press("Enter")
+    expect(head.nth(3)).to_have_attribute("aria-sort", "ascending")
+    by_kind = ["known", "some/chirp", "some/prbs", "frontier", "table1"]
+    expect(names(page)).to_have_text(by_kind)
+    expect(page.locator("[aria-sort]")).to_have_count(1)
+    expect(kind).to_be_focused()
+    words = page.get_by_label("Words of name")
+    words.fill("STUDY gradient")
+    expect(names(page)).to_have_text(["frontier"])
+    expect(page.locator("#run-count")).to_have_text("1 of 5 runs")
+    words.fill("some")
+    # It is the same after a look at another part of the page, and after a reload.
+    page.get_by_role("link", name="Training").click()
+    page.get_by_role("link", name="Runs").click()
+    expect(names(page)).to_have_text(["some/chirp", "some/prbs"])
+    page.reload()
+    expect(names(page)).to_have_text(["some/chirp", "some/prbs"])
+    expect(words).to_have_value("some")
+    expect(head.nth(3)).to_have_attribute("aria-sort", "ascending")
+
+
+def test_a_run_is_opened_by_the_keyboard(address: str, page: Page):
+    page.goto(f"{address}/#runs")
+    page.get_by_role("link", name="some/prbs").focus()
+    page.keyboard.press("Enter")
+    expect(page).to_have_url(f"{address}/#runs/some%2Fprbs")
+    expect(page.locator("#run-view td").first).to_be_visible()
+    expect(page.get_by_role("link", name="some/prbs")).to_be_focused()
+    expect(page.get_by_role("link", name="some/prbs")).to_have_attribute("aria-current", "true")
+
+
+@IN_ALL_SIZES
+def test_nothing_hinders_at_the_table_of_runs(scheme: str, width: int, address: str, page: Page):
+    page.goto(f"{address}/#runs/some%2Fchirp")
+    expect(page.locator("#run-view td").first).to_be_visible()
+    require_access(page, scheme, width)
