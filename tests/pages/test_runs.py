@@ -13,12 +13,15 @@ from served import served
 from starlette.testclient import TestClient
 
 import excite as ex
-from excite.files import read_json, write_json
+from excite.files import locked_folder, read_json, write_json
 from excite.plant import Aero2
 from excite.report.answer import answered
 from excite.study.table import finished_table
 from excite.web import application
+from excite.web.deletions import _delete
+from excite.web.requests import RefusedError
 from excite.web.sessions import PageSettings
+from excite.web.trainings import Training
 
 require_chromium()
 
@@ -189,3 +192,182 @@ def test_nothing_hinders_at_the_table_of_runs(scheme: str, width: int, address: 
     page.goto(f"{address}/#runs/some%2Fchirp")
     expect(page.locator("#run-view td").first).to_be_visible()
     require_access(page, scheme, width)
+
+
+# --------------------------------------------------------------------------------- deletion
+
+
+def tree(folder: Path) -> dict[str, bytes]:
+    """Every file of a folder and its content."""
+    files = (path for path in folder.rglob("*") if path.is_file())
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
+
+
+def delete(client: TestClient, *names: object) -> Any:
+    return client.post("/api/deletions", json={"names": names})
+
+
+def test_deleted_runs_are_moved_and_come_back(client: TestClient, runs: Path):
+    before = tree(runs)
+    deletion = delete(client, "some/chirp", "frontier").json()["deletion"]
+    [place] = (runs / ".deleted").iterdir()
+    assert place.name == deletion
+    moved = {name: text for name, text in before.items() if name.startswith(("some/c", "front"))}
+    assert tree(place) == moved
+    listed = [run["name"] for run in client.get("/api/runs").json()["runs"]]
+    assert listed == ["known", "some/prbs", "table1"]
+    asked = {"name": f".deleted/{deletion}/frontier", "file": "run.json"}
+    assert client.get("/api/run/file", params=asked).status_code == 404  # no longer on the page
+    undone = client.delete(f"/api/deletions/{deletion}").json()
+    assert undone == {"names": ["frontier", "some/chirp"]}
+    assert tree(runs) == before
+    assert list((runs / ".deleted").iterdir()) == []
+    assert client.delete(f"/api/deletions/{deletion}").status_code == 404
+
+
+def test_nothing_is_overwritten(client: TestClient, runs: Path):
+    deletion = delete(client, "some/chirp", "frontier").json()["deletion"]
+    for block in (Path.touch, Path.mkdir):  # a file and a folder, both empty
+        block(runs / "some" / "chirp")
+        before = tree(runs)
+        answer = client.delete(f"/api/deletions/{deletion}")
+        assert answer.status_code == 409
+        assert answer.json()["sentence"] == "some/chirp exists already; nothing was moved"
+        assert tree(runs) == before  # also what was moved first
+        assert not (runs / "frontier").exists()
+        (runs / "some" / "chirp").rename(runs / block.__name__)
+    assert client.delete(f"/api/deletions/{deletion}").is_success
+    assert (runs / "some" / "chirp" / "run.json").is_file()
+
+
+def test_a_link_is_not_followed_by_a_deletion(client: TestClient, runs: Path, tmp_path: Path):
+    deletion = delete(client, "some/chirp", "some/prbs").json()["deletion"]
+    (tmp_path / "elsewhere").mkdir()
+    (runs / "some").rmdir()
+    (runs / "some").symlink_to(tmp_path / "elsewhere", target_is_directory=True)
+    answer = client.delete(f"/api/deletions/{deletion}")
+    assert answer.status_code == 409
+    assert "link" in answer.json()["sentence"]
+    (runs / ".deleted").rename(tmp_path / "trash")
+    (runs / ".deleted").symlink_to(tmp_path / "trash", target_is_directory=True)
+    assert delete(client, "frontier").status_code == 409
+    assert client.delete(f"/api/deletions/{deletion}").status_code == 409
+    assert list((tmp_path / "elsewhere").iterdir()) == []
+    assert (runs / "frontier" / "run.json").is_file()
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["..", "../runs/frontier", "/etc", "some", "some/../frontier", ".", "", "frontier/", 3, None,
+     "known/../../secret", ".deleted", "frontier\x00"],
+)  # fmt: skip
+def test_only_listed_runs_are_deleted(name: object, client: TestClient, runs: Path):
+    """All that are named, or none."""
+    before = tree(runs)
+    answer = delete(client, "frontier", name)
+    assert answer.status_code == 404
+    assert answer.json()["sentence"] == "the run folder has no such run"
+    assert tree(runs) == before
+    for path in ("..", "%2e%2e", "x", ""):
+        assert client.delete(f"/api/deletions/{path}").status_code in (404, 405)
+    assert tree(runs) == before
+
+
+@pytest.mark.parametrize("names", [[], {}, "frontier", None])
+def test_a_deletion_names_runs(names: object, client: TestClient):
+    assert client.post("/api/deletions", json={"names": names}).status_code == 400
+
+
+def test_a_run_folder_that_is_a_run_stays(runs: Path, tmp_path: Path):
+    app = application(PageSettings(runs / "frontier", num_workers=0), tmp_path)
+    client = TestClient(app, base_url=HERE, headers={"origin": HERE})
+    client.post("/api/session", json={})
+    assert delete(client, ".").status_code == 409
+    assert (runs / "frontier" / "run.json").is_file()
+
+
+def test_a_run_that_is_being_written_stays(client: TestClient, runs: Path):
+    with locked_folder(runs / "frontier", "this study"):
+        answer = delete(client, "table1", "frontier")
+        assert answer.status_code == 409
+        assert answer.json()["sentence"].startswith("frontier cannot be deleted: another process")
+        assert (runs / "table1" / "run.json").is_file()
+    assert delete(client, "table1", "frontier").is_success
+
+
+def test_a_run_that_is_being_trained_stays(runs: Path):
+    training = Training("x", runs / "frontier", ["train", "aero2", "--objective", "D"])
+    with pytest.raises(RefusedError, match="frontier is being trained; stop it first"):
+        _delete(runs, ["frontier"], [training])
+    training.state = "stopped"
+    assert _delete(runs, ["frontier"], [training])
+
+
+@pytest.mark.parametrize("headers", [{"origin": "http://evil.example"}, {"cookie": ""}])
+def test_who_does_not_come_from_the_page_deletes_nothing(headers, client: TestClient, runs: Path):
+    deletion = delete(client, "known").json()["deletion"]
+    before = tree(runs)
+    asked = {"names": ["frontier"]}
+    assert client.post("/api/deletions", json=asked, headers=headers).status_code == 403
+    assert client.delete(f"/api/deletions/{deletion}", headers=headers).status_code == 403
+    assert client.post("/api/deletions", json=asked, headers={"host": "evil"}).status_code == 421
+    assert tree(runs) == before
+
+
+def test_runs_are_deleted_and_restored_by_the_keyboard(address: str, page: Page, runs: Path):
+    before = tree(runs)
+    page.goto(f"{address}/#runs/frontier")
+    expect(page.locator("#run-view h2").first).to_be_visible()
+    button = page.get_by_role("button", name="Delete")
+    expect(button).to_be_disabled()
+    for name in ("frontier", "known"):
+        page.get_by_label(f"Select {name}", exact=True).focus()
+        page.keyboard.press("Space")
+    button.focus()
+    page.keyboard.press("Enter")
+    expect(page.locator("#runs .status").first).to_have_text("Deleted: frontier, known.")
+    expect(names(page)).to_have_text(["some/chirp", "some/prbs", "table1"])
+    expect(page.locator("#run-view")).to_be_empty()  # what was shown is deleted
+    expect(page).to_have_url(f"{address}/#runs")
+    assert not (runs / "frontier").exists()
+    undo = page.get_by_role("button", name="Undo deletion of 2 runs")
+    expect(undo).to_be_focused()
+    page.reload()
+    undo.focus()
+    page.keyboard.press("Enter")
+    expect(page.locator("#runs .status").first).to_have_text("Restored: frontier, known.")
+    expect(names(page)).to_have_count(5)
+    expect(undo).to_be_hidden()
+    expect(page.get_by_role("link", name="frontier")).to_be_focused()
+    assert tree(runs) == before
+
+
+def test_what_is_not_shown_is_not_selected(address: str, page: Page, runs: Path):
+    page.goto(f"{address}/#runs")
+    expect(names(page)).to_have_count(5)
+    everything = page.get_by_label("Select all runs in the table")
+    everything.check()
+    page.get_by_label("Words of name").fill("some")
+    expect(names(page)).to_have_count(2)
+    page.get_by_label("Words of name").fill("")
+    expect(names(page)).to_have_count(5)
+    expect(page.locator("#run-list tbody input:checked")).to_have_count(2)
+    expect(everything).not_to_be_checked()
+    page.get_by_role("button", name="Delete").click()
+    expect(names(page)).to_have_count(3)
+    assert (runs / "frontier").is_dir()
+
+
+def test_a_deletion_that_is_refused_says_why(address: str, page: Page, runs: Path):
+    page.goto(f"{address}/#runs")
+    page.get_by_label("Select frontier", exact=True).check()
+    with locked_folder(runs / "frontier", "this study"):
+        page.get_by_role("button", name="Delete").click()
+        expect(page.locator("#runs .status").first).to_contain_text("another process writes")
+    expect(names(page)).to_have_count(5)
+    page.get_by_role("button", name="Delete").click()
+    undo = page.get_by_role("button", name="Undo deletion of frontier")
+    shutil.rmtree(runs / ".deleted")  # emptied by the user
+    undo.click()
+    expect(page.locator("#runs .status").first).to_contain_text("no such deletion")
+    expect(undo).to_be_hidden()

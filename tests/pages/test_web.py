@@ -737,6 +737,8 @@ def test_a_request_from_elsewhere_changes_nothing(headers: dict[str, str], page:
         ("POST", "/api/session"),
         ("DELETE", "/api/jobs/x"),
         ("DELETE", "/api/trainings/x"),
+        ("POST", "/api/deletions"),
+        ("DELETE", "/api/deletions/x"),
     ):
         assert page.request(method, path, headers=headers, json={}).status_code == 403
     if "sec-fetch-site" in headers:

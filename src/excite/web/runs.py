@@ -11,7 +11,7 @@ import csv
 import json
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
 from functools import lru_cache
 from pathlib import Path
@@ -86,9 +86,12 @@ def _is_text(name: str) -> bool:
 
 def run_of(folder: Path, request: Request) -> Path:
     """The run that a request names."""
-    runs = found(folder)
-    name = request.query_params.get("name", "")
-    if name not in runs:
+    return run_named(found(folder), request.query_params.get("name"))
+
+
+def run_named(runs: Mapping[str, Path], name: object) -> Path:
+    """The run of a name from a browser among those that were found."""
+    if not isinstance(name, str) or name not in runs:
         raise RefusedError(404, "the run folder has no such run")
     return runs[name]
 

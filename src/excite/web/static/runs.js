@@ -1,6 +1,6 @@
-// The run folder as a table: sorted, filtered; one of its runs is shown below.
+// The run folder as a table: sorted, filtered, deleted from; one of its runs is shown below.
 
-import { el, get, say } from "./api.js";
+import { el, get, post, remove, say } from "./api.js";
 import { clear, show } from "./run.js";
 
 const section = document.getElementById("runs"), table = document.getElementById("run-list");
@@ -8,12 +8,19 @@ const filter = document.getElementById("run-filter"), body = table.querySelector
 const date = ({ changed }) => changed && new Date(changed).toLocaleString("sv").slice(0, 16); // 2026-11-27 08:15
 const COLUMNS = { run: ({ name }) => name, date, plant: ({ plant }) => plant, kind: ({ kind }) => kind, "key figures": figures };
 /** What stays in this tab of the browser, also after the page is loaded again. */
-const state = { column: "date", isDescending: true, words: "", ...JSON.parse(sessionStorage.getItem("runs")) };
-let all = [], asked = "", chosen = "";
+const state = { column: "date", isDescending: true, words: "", deletions: [], ...JSON.parse(sessionStorage.getItem("runs")) };
+const drop = document.getElementById("run-delete"), undo = document.getElementById("run-undo");
+const everyBox = el("input", { type: "checkbox", "aria-label": "Select all runs in the table", change: () => {
+  boxes().forEach((box) => { box.checked = everyBox.checked; });
+  select();
+} });
+let all = [], asked = "", chosen = "", selected = new Set();
 
 filter.value = state.words;
 filter.addEventListener("input", () => { state.words = filter.value; list(); });
-table.querySelector("thead").append(el("tr", {}, ...Object.keys(COLUMNS).map((column) => el("th", { scope: "col" },
+drop.addEventListener("click", deleteSelected);
+undo.addEventListener("click", restore);
+table.querySelector("thead").append(el("tr", {}, el("td", {}, everyBox), ...Object.keys(COLUMNS).map((column) => el("th", { scope: "col" },
   el("button", { type: "button", click: () => {
     state.isDescending = state.column === column && !state.isDescending;
     state.column = column;
@@ -57,10 +64,68 @@ function list() {
     if (head.textContent === state.column) head.setAttribute("aria-sort", state.isDescending ? "descending" : "ascending");
     else head.removeAttribute("aria-sort");
   });
-  const focused = body.contains(document.activeElement) ? document.activeElement.hash : null;
-  body.replaceChildren(...found.map((run) => el("tr", {},
+  const focused = body.contains(document.activeElement) ? document.activeElement : null;
+  selected = new Set(found.map(({ name }) => name).filter((name) => selected.has(name))); // what is not seen is not selected
+  body.replaceChildren(...found.map((run) => el("tr", { "data-name": run.name },
+    el("td", {}, el("input", { type: "checkbox", "aria-label": `Select ${run.name}`, checked: selected.has(run.name), change: select })),
     el("th", { scope: "row" }, el("a", { href: `#runs/${encodeURIComponent(run.name)}`, "aria-current": run.name === chosen && "true" }, run.name)),
     ...Object.values(COLUMNS).slice(1).map((cell) => el("td", {}, cell(run))))));
-  [...body.querySelectorAll("a")].find(({ hash }) => hash === focused)?.focus();
+  if (focused) [...body.rows].find(({ dataset }) => dataset.name === focused.closest("tr").dataset.name)?.querySelector(focused.localName).focus();
   document.getElementById("run-count").textContent = found.length < all.length ? `${found.length} of ${all.length} runs` : `${all.length} runs`;
+  select();
+}
+
+const boxes = () => [...body.querySelectorAll("input")];
+const count = (names) => (names.length === 1 ? names[0] : `${names.length} runs`);
+const listed = (names) => (names.length > 5 ? count(names) : names.join(", "));
+
+/** Which runs are selected, and what can be done with them. */
+function select() {
+  const chosenBoxes = boxes().filter(({ checked }) => checked);
+  selected = new Set(chosenBoxes.map((box) => box.closest("tr").dataset.name));
+  everyBox.checked = selected.size > 0 && selected.size === boxes().length;
+  everyBox.indeterminate = selected.size > 0 && !everyBox.checked;
+  drop.disabled = !selected.size;
+  undo.hidden = !state.deletions.length;
+  if (!undo.hidden) undo.textContent = `Undo deletion of ${count(state.deletions.at(-1).names)}`;
+}
+
+/** Deletes what is selected; the run that is shown is taken away with it. */
+async function deleteSelected() {
+  const names = [...selected];
+  drop.disabled = true; // not twice
+  try {
+    const { deletion } = await post("api/deletions", { names });
+    state.deletions.push({ deletion, names });
+    if (names.includes(chosen)) {
+      chosen = "";
+      clear();
+      history.replaceState(null, "", "#runs");
+    }
+    await relist(`Deleted: ${listed(names)}.`);
+    undo.focus();
+  } catch (error) {
+    say(section, error.message, true);
+    select();
+  }
+}
+
+/** Undoes the last deletion. */
+async function restore() {
+  try {
+    const { names } = await remove(`api/deletions/${state.deletions.at(-1).deletion}`);
+    state.deletions.pop();
+    await relist(`Restored: ${listed(names)}.`);
+    [...body.rows].find(({ dataset }) => names.includes(dataset.name))?.querySelector("a").focus();
+  } catch (error) {
+    if (error.status === 404) state.deletions.pop(); // it is no longer on the disk
+    say(section, error.message, true);
+    list();
+  }
+}
+
+async function relist(sentence) {
+  all = (await get("api/runs")).runs;
+  list();
+  say(section, sentence);
 }
