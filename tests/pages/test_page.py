@@ -256,7 +256,7 @@ def test_the_header_is_skipped_to_the_part_that_is_shown(address: str, page: Pag
     expect(page).to_have_url(f"{address}/#main")
     expect(page.locator("#runs")).to_be_visible()
     page.keyboard.press("Tab")
-    expect(page.get_by_label("Name, kind, plant or date")).to_be_focused()
+    expect(page.get_by_label("Words of name, date, plant, kind or figures")).to_be_focused()
 
 
 def test_columns_are_chosen_before_anything_is_identified(address: str, page: Page):

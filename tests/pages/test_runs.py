@@ -1,11 +1,14 @@
 """The run folder on the bench page: its table, and what is done with several runs."""
 
+import itertools
 import os
+import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+import numpy as np
 import pytest
 from chromium import require_chromium
 from commands import PATIENCE
@@ -13,9 +16,11 @@ from served import served
 from starlette.testclient import TestClient
 
 import excite as ex
-from excite.files import locked_folder, read_json, write_json
+from excite.files import json_ready, locked_folder, read_json, write_json
 from excite.plant import Aero2
-from excite.report.answer import answered
+from excite.report.answer import answered, best_columns
+from excite.report.html import report_html
+from excite.report.study_table import common_table, violations_cell
 from excite.study.table import finished_table
 from excite.web import application
 from excite.web.deletions import _delete
@@ -31,9 +36,6 @@ from playwright.sync_api import Locator, Page, expect  # noqa: E402
 HERE = "http://127.0.0.1:8000"
 RESULTS = Path(__file__).parents[2] / "results"
 WAIT = 1000 * PATIENCE  # milliseconds
-IN_ALL_SIZES = pytest.mark.parametrize(
-    ("scheme", "width"), [("light", 1440), ("dark", 1024), ("light", 390), ("dark", 390)]
-)
 
 
 @pytest.fixture(scope="module")
@@ -91,13 +93,15 @@ def names(page: Page) -> Locator:
     return page.locator("#run-list tbody th")
 
 
-def require_access(page: Page, scheme: Any, width: int) -> None:
+def require_access(page: Page) -> None:
     """Nothing hinders people who do not see or point; nothing needs scrolling sideways."""
-    page.emulate_media(color_scheme=scheme)
-    page.set_viewport_size({"width": width, "height": 900})
-    violations = Axe().run(page).response["violations"]
-    assert [(v["id"], v["nodes"][0]["html"]) for v in violations] == []
-    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    schemes: tuple[Literal["light", "dark"], ...] = ("light", "dark")
+    for scheme, width in itertools.product(schemes, (1440, 1024, 390)):
+        page.emulate_media(color_scheme=scheme)
+        page.set_viewport_size({"width": width, "height": 900})
+        violations = Axe().run(page).response["violations"]
+        assert [(v["id"], v["nodes"][0]["html"]) for v in violations] == []
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
 
 
 # -------------------------------------------------------------------------- the table of runs
@@ -187,11 +191,10 @@ def test_a_run_is_opened_by_the_keyboard(address: str, page: Page):
     expect(page.get_by_role("link", name="some/prbs")).to_have_attribute("aria-current", "true")
 
 
-@IN_ALL_SIZES
-def test_nothing_hinders_at_the_table_of_runs(scheme: str, width: int, address: str, page: Page):
+def test_nothing_hinders_at_the_table_of_runs(address: str, page: Page):
     page.goto(f"{address}/#runs/some%2Fchirp")
     expect(page.locator("#run-view td").first).to_be_visible()
-    require_access(page, scheme, width)
+    require_access(page)
 
 
 # --------------------------------------------------------------------------------- deletion
@@ -371,3 +374,198 @@ def test_a_deletion_that_is_refused_says_why(address: str, page: Page, runs: Pat
     undo.click()
     expect(page.locator("#runs .status").first).to_contain_text("no such deletion")
     expect(undo).to_be_hidden()
+
+
+# ------------------------------------------------------------------------------- comparison
+
+
+def compared(client: TestClient, *names: str) -> Any:
+    answer = client.get("/api/runs/compared", params=[("name", name) for name in names])
+    assert answer.is_success, answer.text
+    return answer.json()
+
+
+def test_identifications_are_compared_as_in_a_report(client: TestClient, runs: Path):
+    names = ["some/chirp", "some/prbs"]
+    told = compared(client, *names)
+    [table] = told["tables"]
+    assert table["header"] == ["", "unit", *names]
+    report = report_html([runs / name for name in names])
+    beside = report.partition("Experiments side by side")[2].partition("</table>")[0]
+    for row in table["rows"]:
+        assert "".join(re.findall(r"<td[^>]*>([^<]*)</td>", beside)).count("".join(row)) == 1
+    assert told["notes"] == []
+    assert told["experiments"]["total"] == 2
+    for name, traces in zip(names, told["experiments"]["runs"], strict=True):
+        record = ex.read_record(runs / name / "record.csv", Aero2().description)
+        assert traces["name"] == name
+        np.testing.assert_array_equal(traces["time"], record.time - record.time[0])
+        np.testing.assert_array_equal(traces["inputs"], json_ready(record.inputs))
+        np.testing.assert_array_equal(traces["outputs"], record.outputs)
+
+
+def test_studies_are_compared_by_their_common_methods(client: TestClient):
+    told = compared(client, "frontier", "table1", "some/chirp")
+    tables = {name: finished_table(RESULTS / name) for name in ("frontier", "table1")}
+    common = common_table(tables)
+    assert common is not None
+    assert [(t["header"], t["rows"]) for t in told["tables"]] == [common]
+    assert told["experiments"] is None  # there is only one
+
+
+def test_what_cannot_be_compared_is_told(client: TestClient, runs: Path):
+    for file in ("run.json", "study.json", "table.json"):
+        shutil.copy(RESULTS / "dc_motor" / file, runs / "table1" / file)
+    told = compared(client, "frontier", "table1")
+    assert told["notes"][0] == "frontier, table1: no method and estimator in common."
+    assert "nothing in common" in compared(client, "known", "some/chirp")["notes"][0]
+    marker = read_json(runs / "some/chirp" / "run.json")
+    marker["plant"]["inputs"][0]["name"] = "force"
+    write_json(runs / "known" / "run.json", marker)
+    shutil.copy(runs / "some/chirp" / "record.csv", runs / "known" / "round-01.csv")
+    told = compared(client, "some/chirp", "some/prbs", "known")
+    assert told["notes"] == ["known: other inputs or outputs, which are not drawn."]
+    (runs / "some/chirp" / "record.csv").rename(runs / "away.csv")
+    (runs / "some/chirp" / "record.csv").symlink_to(runs / "away.csv")
+    told = compared(client, "some/chirp", "some/prbs")
+    assert told["experiments"] is None  # links are not followed
+    asked = client.get("/api/runs/compared", params={"name": "frontier"})
+    assert (asked.status_code, asked.json()["sentence"]) == (
+        400, "two to 12 runs can be compared: got 1"
+    )  # fmt: skip
+    for name in ("..", "some", "", "/etc"):
+        asked = client.get("/api/runs/compared", params=[("name", "frontier"), ("name", name)])
+        assert asked.status_code == 404
+
+
+def test_runs_are_compared_by_the_keyboard(address: str, page: Page, runs: Path):
+    (runs / "some/prbs").rename(runs / "some/a, b")
+    page.goto(f"{address}/#runs")
+    button = page.get_by_role("button", name="Compare")
+    for name in ("some/chirp", "some/a, b"):
+        expect(button).to_be_disabled()
+        page.get_by_label(f"Select {name}", exact=True).focus()
+        page.keyboard.press("Space")
+    button.focus()
+    page.keyboard.press("Enter")
+    expect(page).to_have_url(f"{address}/#runs/some%2Fchirp,some%2Fa%2C%20b")
+    for _ in range(2):  # also after a reload
+        table = page.get_by_role("region", name="Estimates with 95 % intervals")
+        expect(table.get_by_role("columnheader")).to_have_text(["unit", "some/chirp", "some/a, b"])
+        expect(table.locator("tbody tr")).to_have_count(6)
+        legends = page.locator("#run-view .legend")
+        expect(legends).to_have_text(2 * ["some/chirpsome/a, b"])
+        expect(page.locator("#run-list input:checked")).to_have_count(2)
+        page.reload()
+    page.get_by_role("link", name="frontier").click()
+    expect(page.locator("#run-view h2").first).to_have_text(re.compile("^Frontier"))
+    page.go_back()
+    expect(table).to_be_visible()
+    page.goto(f"{address}/#runs/some%2Fchirp,nothing")
+    expect(page.locator("#runs .status").first).to_have_text("The run folder has no run nothing.")
+    expect(page.locator("#run-view")).to_be_empty()
+
+
+def test_nothing_hinders_at_a_comparison(address: str, page: Page):
+    page.goto(f"{address}/#runs/some%2Fchirp,some%2Fprbs")
+    expect(page.locator("#run-view canvas")).to_have_count(2)
+    require_access(page)
+
+
+# ----------------------------------------------------------------------------------- studies
+
+
+def test_a_study_is_shown_as_its_table(client: TestClient):
+    for name in ("frontier", "table1"):
+        table, told = finished_table(RESULTS / name), client.get(f"/api/run?name={name}").json()
+        study = told["study"]
+        assert list(study["tables"]) == list(dict.fromkeys(row.estimator for row in table.rows))
+        for estimator, shown in study["tables"].items():
+            own = table.only(estimator)
+            header, cells = own.cells()
+            assert shown["header"] == [header[0], *header[2:]]
+            assert [row["cells"][1:] for row in shown["rows"]] == [row[2:] for row in cells]
+            ours = {row["cells"][0]: row["best"] for row in shown["rows"]}
+            assert {m: [i - 1 for i in sorted(b)] for m, b in best_columns(own).items()} == {
+                method: ours[method] for method in (row.method for row in own.rows)
+            }
+            assert len({row["cells"][0] for row in shown["rows"]}) == len(shown["rows"])
+        first = [row for row in table.rows if row.estimator == table.rows[0].estimator]
+        for row, point in zip(first, study["points"], strict=True):
+            assert (row.method, row.log_det_information) == (point["method"], point["log_det"])
+            assert (row.violation_rate.estimate, list(row.violation_rate.ci95)) == (
+                point["rate"], point["interval"]
+            )  # fmt: skip
+
+
+def test_a_study_that_is_damaged_is_shown_as_it_was_written(client: TestClient, runs: Path):
+    (runs / "table1" / "table.json").write_text("{}")
+    told = client.get("/api/run?name=table1").json()
+    assert told["study"] == {}
+    assert told["rows"]
+
+
+def test_the_estimator_of_a_study_is_chosen(address: str, page: Page):
+    page.goto(f"{address}/#runs/table1")
+    choice = page.get_by_label("Estimator", exact=True).and_(page.locator("#study-estimator"))
+    expect(choice).to_have_value("nls")
+    rows = page.get_by_role("region", name="Table of the study").locator("tbody tr")
+    expect(rows).to_have_count(14)  # seven methods, and as many published rows
+    for estimator in ("nls", "arx-rls"):
+        choice.select_option(estimator)
+        table = finished_table(RESULTS / "table1").only(estimator)
+        best = best_columns(table)
+        column, method = next((min(columns), m) for m, columns in best.items() if columns)
+        row = page.get_by_role("row", name=re.compile(rf"^{re.escape(method)} [^a]"))
+        marked = row.locator("td").nth(column - 2)
+        expect(marked).to_have_class("best")
+        text = next(cells for cells in table.cells()[1] if cells[0] == method)[column]
+        expect(marked).to_have_text(f"{text} best")
+        assert (
+            page.evaluate("(cell) => +getComputedStyle(cell).fontWeight", marked.element_handle())
+            > 600
+        )
+    # It is kept for the next study that has it.
+    page.get_by_role("link", name="frontier").click()
+    expect(page.locator("#run-view h2").first).to_have_text(re.compile("^Frontier"))
+    expect(choice).to_have_value("arx-rls")
+
+
+def test_the_frontier_answers_to_the_pointer_and_to_the_keyboard(address: str, page: Page):
+    page.goto(f"{address}/#runs/frontier")
+    chart, read = page.locator(".frontier"), page.locator("#run-view section [role=status]")
+    expect(chart.locator(".method")).to_have_count(17)
+    expect(chart.locator(".method.best")).to_have_count(1)
+    table = finished_table(RESULTS / "frontier").only("nls")
+    told = {
+        row.method: f"{row.method}: log det {row.log_det_information:.2f}, violations "
+        f"{violations_cell(row)}" for row in table.rows
+    }  # fmt: skip
+    told["gradient D"] += ", not beaten"
+    chart.scroll_into_view_if_needed()
+    for name in ("prbs", "gradient D"):
+        method = chart.locator(".method", has=page.get_by_text(name, exact=True))
+        box = method.locator("circle").bounding_box()
+        assert box is not None
+        page.mouse.move(box["x"] + box["width"] / 2 + 3, box["y"] + box["height"] / 2)
+        expect(read).to_have_text(told[name])
+        expect(method).to_have_class(re.compile("active"))
+    chart.focus()
+    page.keyboard.press("End")  # the most violations
+    expect(read).to_have_text(told["prbs"])
+    seen = [read.inner_text()]
+    for _ in range(20):
+        page.keyboard.press("ArrowLeft")
+        seen.append(read.inner_text())
+    assert set(seen) == set(told.values())
+    expect(read).to_have_text(told["random"])  # no violation, and the least information
+    page.set_viewport_size({"width": 390, "height": 900})
+    expect(chart.locator("svg")).to_have_attribute("width", re.compile(r"^3\d\d$"))
+    expect(chart.locator(".active")).to_have_count(1)
+
+
+@pytest.mark.parametrize("name", ["frontier", "table1"])
+def test_nothing_hinders_at_a_study(name: str, address: str, page: Page):
+    page.goto(f"{address}/#runs/{name}")
+    expect(page.locator(".frontier .method").first).to_be_attached()
+    require_access(page)

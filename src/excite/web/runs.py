@@ -22,11 +22,13 @@ from starlette.responses import FileResponse, JSONResponse
 from starlette.routing import Route
 
 from ..description import PlantDescription
-from ..files import folder_word
+from ..files import folder_word, json_ready
+from ..report.answer import answered, best_columns
+from ..report.frontier import frontier
 from ..report.key_figures import of_identification, of_study, of_training
 from ..report.rows import EstimateSummary, StudyFacts
 from ..report.sections.campaign import known_table, outcome, rounds_table
-from ..report.study_table import StudyTable
+from ..report.study_table import NUM_LABELS, StudyTable, footnotes, violations_cell
 from .requests import RefusedError, without_folders
 
 _TYPES = {
@@ -52,7 +54,7 @@ def routes(folder: Path) -> list[Route]:
         return JSONResponse(_content(run_of(folder, request)))
 
     def file(request: Request) -> FileResponse:
-        path = _files(run_of(folder, request)).get(request.query_params.get("file", ""))
+        path = files_of(run_of(folder, request)).get(request.query_params.get("file", ""))
         if path is None:
             raise RefusedError(404, "this run has no such file")
         return FileResponse(path, media_type=_TYPES[path.suffix], filename=path.name)
@@ -96,7 +98,7 @@ def run_named(runs: Mapping[str, Path], name: object) -> Path:
     return runs[name]
 
 
-def _files(run: Path) -> dict[str, Path]:
+def files_of(run: Path) -> dict[str, Path]:
     """Files of a run that are served, by name, also those of finished seeds."""
 
     def each() -> Iterator[Path]:
@@ -192,6 +194,22 @@ def table_of(run: Path) -> StudyTable:
     return StudyTable.model_validate({**_json(run, "table.json"), "study": study})
 
 
+def estimate_of(run: Path) -> EstimateSummary | None:
+    """What an identification found, or the last one of a campaign; None where there is none."""
+    for file in ("estimate.json", "estimate/estimate.json"):
+        with contextlib.suppress(ValueError):
+            return EstimateSummary.of(_json(run, file))
+    return None
+
+
+def plant_of_run(run: Path) -> PlantDescription | None:
+    """The plant of a run; None where its description is missing or damaged."""
+    plant: Any = _json(run, "run.json").get("plant")
+    with contextlib.suppress(LookupError, TypeError, AttributeError, ArithmeticError, ValueError):
+        return PlantDescription.from_dict(plant)
+    return None
+
+
 def _changed(run: Path) -> str:
     """When the newest file of a run was written, in UTC; empty where there is none."""
     times = list[float]()
@@ -205,16 +223,58 @@ def _changed(run: Path) -> str:
 
 def _content(run: Path) -> dict[str, object]:
     """Content of a run for the page: its table or estimate, and its files."""
-    files = _files(run)
+    files = files_of(run)
     return {
         **_summary(run.name, run),
         **_table(_text(run, "table.md")),
+        "study": _study(run),
         "estimate": _json(run, "estimate.json"),
         "campaign": _campaign(run),
         "curves": _curves(run),
         "figures": [name for name in files if name.endswith(".png")],
         "files": [name for name in files if not name.endswith(".png")],
     }
+
+
+def _study(run: Path) -> dict[str, object]:
+    """Answer, frontier and table by estimator of a study; empty where it is not finished."""
+    try:
+        table = table_of(run)
+    except ValueError:
+        return {}
+    answer, first = answered(table.rows, table.study, {}), table.only(table.rows[0].estimator)
+    best = frontier(table.rows)
+    points = [
+        {
+            "method": row.method,
+            "log_det": row.log_det_information,
+            "rate": row.violation_rate.estimate,
+            "interval": row.violation_rate.ci95,
+            "violations": violations_cell(row),
+            "is_best": row.method in best,
+        }
+        for row in first.rows
+    ]
+    estimators = dict.fromkeys(row.estimator for row in table.rows)
+    return {
+        "sentences": answer.sentences[:2],  # the third, on a search, is in the report
+        "estimator": answer.rows[0].estimator,
+        "tables": {name: _methods(table.only(name)) for name in estimators},
+        "points": json_ready(points),
+        "notes": footnotes(table.study),
+    }
+
+
+def _methods(table: StudyTable) -> dict[str, object]:
+    """The table of one estimator: a row a method, with the columns in which it is best."""
+    (header, cells), best = table.cells(), best_columns(table)
+    rows = []
+    for method, estimator, *numbers in cells:
+        is_own = estimator == table.rows[0].estimator  # or it is as published
+        columns = sorted(best[method]) if is_own else []
+        name = method if is_own else f"{method}, {estimator}"
+        rows.append({"cells": [name, *numbers], "best": [i - 1 for i in columns]})
+    return {"header": [header[0], *header[NUM_LABELS:]], "rows": rows}
 
 
 def _campaign(run: Path) -> dict[str, object]:

@@ -3,37 +3,47 @@
 import { download, el, get, say } from "./api.js";
 import { curves } from "./curves.js";
 import { table } from "./record.js";
+import { study } from "./study.js";
 
 const section = document.getElementById("runs"), view = document.getElementById("run-view");
-let shownRun = "", following = 0;
+let shown = "", following = 0;
 
-/** Takes away the run that is shown. */
-export function clear() {
-  shownRun = "";
+/** Takes away what is shown below the table; what is asked for next has a name. */
+export function clear(next = "") {
+  shown = next;
   clearTimeout(following);
   view.replaceChildren();
 }
 
+/** Shows something under the name that it was asked for, unless something else was in the meantime. */
+export function put(name, ...parts) {
+  if (shown !== name) return false;
+  view.replaceChildren(...parts);
+  if (!section.hidden && view.getBoundingClientRect().top > innerHeight / 2) view.scrollIntoView();
+  return true;
+}
+
 /** Shows a run, and follows a campaign that goes on. */
 export async function show(run) {
-  const isNew = shownRun !== run.name;
-  shownRun = run.name;
+  const isNew = shown !== run.name;
+  shown = run.name;
   clearTimeout(following);
   say(section, "");
   const name = encodeURIComponent(run.name), address = (file) => `api/run/file?name=${name}&file=${encodeURIComponent(file)}`;
   try {
     const content = await get(`api/run?name=${name}`);
-    if (shownRun !== run.name) return; // another was chosen while this one was loading
+    if (shown !== run.name) return; // another was chosen while this one was loading
     const card = el("section", { class: "card" }, el("h2", {}, content.title || run.name));
     if (content.estimate.params) {
       const estimate = el("table");
       table(estimate, content.estimate);
       card.append(el("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Table of parameters" }, estimate), el("ul", {}, ...(content.estimate.verdict ?? []).map((text) => el("li", {}, text))));
     }
-    if (content.rows.length) card.append(rows(content, "Table of the study"));
+    const told = content.study.tables ? study(content.study) : null;
+    if (told) card.append(...told.parts);
+    else if (content.rows.length) card.append(rows(content, "Table of the study"), ...content.notes.map((note) => el("p", { class: "hint" }, note)));
     if (content.campaign.told) card.append(el("p", {}, content.campaign.told));
     if (content.campaign.known) card.append(rows(content.campaign.known, "What is known"), el("h3", {}, "Rounds"), rows(content.campaign.rounds, "Rounds"));
-    card.append(...content.notes.map((note) => el("p", { class: "hint" }, note)));
     const link = (file) => download(address(file), file), isPolicy = (file) => file.endsWith(".safetensors");
     const policies = content.files.filter(isPolicy), others = content.files.filter((file) => !isPolicy(file));
     const report = content.is_finished ? [download(`api/run/report.html?name=${name}`, "Report")] : [];
@@ -41,8 +51,8 @@ export async function show(run) {
     card.append(el("p", { class: "row downloads" }, ...report, ...others.map(link)));
     if (policies.length) card.append(el("details", { open: policies.length < 4 }, el("summary", {}, `Policies (${policies.length})`), el("p", { class: "row downloads" }, ...policies.map(link))));
     const isFollowed = content.kind === "campaign" && !content.is_finished && !content.campaign.interrupted;
-    if (isFollowed) following = setTimeout(() => shownRun === run.name && !section.hidden && show(run), 2000);
-    view.replaceChildren(card);
+    if (isFollowed) following = setTimeout(() => shown === run.name && !section.hidden && show(run), 2000);
+    view.replaceChildren(card, ...(told?.card ? [told.card] : []));
     if (isNew && !section.hidden && view.getBoundingClientRect().top > innerHeight / 2) view.scrollIntoView();
     if (content.curves.length) {
       const learnt = el("section", { class: "card" }, el("h2", {}, "Learning curves"), el("div", { class: "plots small" }));
@@ -53,12 +63,12 @@ export async function show(run) {
       view.append(el("section", { class: "card" }, el("h2", {}, figure.replace(/\.png$/, "")), el("img", { src: address(figure), alt: `figure ${figure} of ${run.name}`, loading: "lazy" })));
     }
   } catch (error) {
-    if (shownRun === run.name) say(section, error.message, true);
+    if (shown === run.name) say(section, error.message, true);
   }
 }
 
 /** A table of texts. */
 export const rows = ({ header, rows: cells }, name) => el("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": name },
   el("table", {},
-    el("thead", {}, el("tr", {}, ...header.map((text) => el("th", { scope: "col" }, text)))),
+    el("thead", {}, el("tr", {}, ...header.map((text) => (text ? el("th", { scope: "col" }, text) : el("td"))))),
     el("tbody", {}, ...cells.map((row) => el("tr", {}, ...row.map((text, i) => (i ? el("td", {}, text) : el("th", { scope: "row" }, text))))))));

@@ -1,6 +1,7 @@
-// The run folder as a table: sorted, filtered, deleted from; one of its runs is shown below.
+// The run folder as a table: sorted, filtered, deleted from; what is chosen of it is shown below.
 
 import { el, get, post, remove, say } from "./api.js";
+import { compare } from "./compared.js";
 import { clear, show } from "./run.js";
 
 const section = document.getElementById("runs"), table = document.getElementById("run-list");
@@ -9,18 +10,20 @@ const date = ({ changed }) => changed && new Date(changed).toLocaleString("sv").
 const COLUMNS = { run: ({ name }) => name, date, plant: ({ plant }) => plant, kind: ({ kind }) => kind, "key figures": figures };
 /** What stays in this tab of the browser, also after the page is loaded again. */
 const state = { column: "date", isDescending: true, words: "", deletions: [], ...JSON.parse(sessionStorage.getItem("runs")) };
-const drop = document.getElementById("run-delete"), undo = document.getElementById("run-undo");
-const everyBox = el("input", { type: "checkbox", "aria-label": "Select all runs in the table", change: () => {
+const beside = document.getElementById("run-compare"), drop = document.getElementById("run-delete"), undo = document.getElementById("run-undo");
+const everyBox = el("input", { type: "checkbox", change: () => {
   boxes().forEach((box) => { box.checked = everyBox.checked; });
   select();
 } });
-let all = [], asked = "", chosen = "", selected = new Set();
+const labelled = (box, text) => el("td", {}, el("label", {}, box, el("span", { class: "unseen" }, text)));
+let all = [], asked = "", chosen = [], selected = new Set();
 
 filter.value = state.words;
 filter.addEventListener("input", () => { state.words = filter.value; list(); });
+beside.addEventListener("click", () => { location.hash = address([...selected]); });
 drop.addEventListener("click", deleteSelected);
 undo.addEventListener("click", restore);
-table.querySelector("thead").append(el("tr", {}, el("td", {}, everyBox), ...Object.keys(COLUMNS).map((column) => el("th", { scope: "col" },
+table.querySelector("thead").append(el("tr", {}, labelled(everyBox, "Select all runs in the table"), ...Object.keys(COLUMNS).map((column) => el("th", { scope: "col" },
   el("button", { type: "button", click: () => {
     state.isDescending = state.column === column && !state.isDescending;
     state.column = column;
@@ -31,22 +34,29 @@ function figures(run) {
   return run.is_finished ? run.figures : ["not finished", run.figures].filter(Boolean).join(": ");
 }
 
-/** Lists the runs; the one that the address names is shown, or else the one that was chosen before. */
-export async function open(wanted) {
-  const name = wanted || chosen;
-  asked = name;
+/** The address of a run, or of a comparison of several: "#runs/frontier", "#runs/chirp,prbs". */
+const address = (names) => `#runs/${names.map(encodeURIComponent).join(",")}`;
+
+function namesIn(place) {
+  try { return place.split(",").filter(Boolean).map(decodeURIComponent); } catch { return [place]; }
+}
+
+/** Lists the runs; those that the address names are shown, or else those that were chosen before. */
+export async function open(place) {
+  const names = place ? namesIn(place) : chosen, own = asked = address(names);
   try {
     all = (await get("api/runs")).runs;
-    if (asked !== name) return; // the address changed while the list was loading
+    if (asked !== own) return; // the address changed while the list was loading
     say(section, all.length ? "" : "The run folder is empty; studies and identifications appear here.");
-    const run = all.find((each) => each.name === name);
-    chosen = run ? name : "";
+    const runs = names.map((name) => all.find((run) => run.name === name)), isThere = !runs.includes(undefined);
+    chosen = isThere ? names : [];
+    if (names.length > 1 && isThere) selected = new Set(names);
     list();
-    if (run) await show(run);
-    else if (name) {
+    if (!isThere) {
       clear();
-      say(section, `The run folder has no run ${name}.`, true);
-    }
+      say(section, `The run folder has no run ${names.filter((_, i) => !runs[i]).join(", ")}.`, true);
+    } else if (names.length > 1) await compare(names);
+    else if (names.length) await show(runs[0]);
   } catch (error) {
     say(section, error.message, true);
   }
@@ -57,9 +67,9 @@ function list() {
   sessionStorage.setItem("runs", JSON.stringify(state));
   const words = state.words.toLowerCase().split(/\s+/).filter(Boolean), sign = state.isDescending ? -1 : 1;
   const text = (run) => [run.title, ...Object.values(COLUMNS).map((cell) => cell(run))].join(" ").toLowerCase();
-  const compare = (a, b) => a.localeCompare(b, "en", { numeric: true }), key = COLUMNS[state.column] ?? date;
+  const order = (a, b) => a.localeCompare(b, "en", { numeric: true }), key = COLUMNS[state.column] ?? date;
   const found = all.filter((run) => words.every((word) => text(run).includes(word)));
-  found.sort((a, b) => sign * compare(key(a), key(b)) || compare(a.name, b.name));
+  found.sort((a, b) => sign * order(key(a), key(b)) || order(a.name, b.name));
   table.querySelectorAll("thead th").forEach((head) => {
     if (head.textContent === state.column) head.setAttribute("aria-sort", state.isDescending ? "descending" : "ascending");
     else head.removeAttribute("aria-sort");
@@ -67,8 +77,8 @@ function list() {
   const focused = body.contains(document.activeElement) ? document.activeElement : null;
   selected = new Set(found.map(({ name }) => name).filter((name) => selected.has(name))); // what is not seen is not selected
   body.replaceChildren(...found.map((run) => el("tr", { "data-name": run.name },
-    el("td", {}, el("input", { type: "checkbox", "aria-label": `Select ${run.name}`, checked: selected.has(run.name), change: select })),
-    el("th", { scope: "row" }, el("a", { href: `#runs/${encodeURIComponent(run.name)}`, "aria-current": run.name === chosen && "true" }, run.name)),
+    labelled(el("input", { type: "checkbox", checked: selected.has(run.name), change: select }), `Select ${run.name}`),
+    el("th", { scope: "row" }, el("a", { href: address([run.name]), "aria-current": chosen.includes(run.name) && "true" }, run.name)),
     ...Object.values(COLUMNS).slice(1).map((cell) => el("td", {}, cell(run))))));
   if (focused) [...body.rows].find(({ dataset }) => dataset.name === focused.closest("tr").dataset.name)?.querySelector(focused.localName).focus();
   document.getElementById("run-count").textContent = found.length < all.length ? `${found.length} of ${all.length} runs` : `${all.length} runs`;
@@ -86,6 +96,7 @@ function select() {
   everyBox.checked = selected.size > 0 && selected.size === boxes().length;
   everyBox.indeterminate = selected.size > 0 && !everyBox.checked;
   drop.disabled = !selected.size;
+  beside.disabled = selected.size < 2;
   undo.hidden = !state.deletions.length;
   if (!undo.hidden) undo.textContent = `Undo deletion of ${count(state.deletions.at(-1).names)}`;
 }
@@ -97,8 +108,8 @@ async function deleteSelected() {
   try {
     const { deletion } = await post("api/deletions", { names });
     state.deletions.push({ deletion, names });
-    if (names.includes(chosen)) {
-      chosen = "";
+    if (names.some((name) => chosen.includes(name))) {
+      chosen = [];
       clear();
       history.replaceState(null, "", "#runs");
     }
