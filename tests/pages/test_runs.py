@@ -5,6 +5,7 @@ import os
 import re
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,7 +17,7 @@ from served import served
 from starlette.testclient import TestClient
 
 import excite as ex
-from excite.files import json_ready, locked_folder, read_json, write_json
+from excite.files import json_ready, locked_folder, read_json, took_lock, write_json
 from excite.plant import Aero2
 from excite.report.answer import answered, best_columns
 from excite.report.html import report_html
@@ -116,11 +117,11 @@ def test_key_figures_are_those_of_the_results(client: TestClient, runs: Path):
     table = finished_table(RESULTS / "frontier")
     best = answered(table.rows, table.study, {}).best
     assert best is not None
-    told = listed["frontier"]["figures"]
+    told = listed["frontier"]["key_figures"]
     assert told.startswith(f"{best.method}: log det {best.log_det_information:.2f}, violations 0/")
     ended = "every target is reached (80 samples in 2 rounds)"
-    assert listed["known"]["figures"] == ended
-    words = listed["some/chirp"]["figures"].split(", ")
+    assert listed["known"]["key_figures"] == ended
+    words = listed["some/chirp"]["key_figures"].split(", ")
     assert [word.split()[0] for word in words] == ["J_p", "K_pu", "D_p", "fit"]
 
 
@@ -128,16 +129,16 @@ def test_key_figures_follow_what_is_written(client: TestClient, runs: Path):
     def told(name: str) -> Any:
         return next(r for r in client.get("/api/runs").json()["runs"] if r["name"] == name)
 
-    assert "log det" in told("table1")["figures"]
+    assert "log det" in told("table1")["key_figures"]
     shutil.copy(RESULTS / "frontier" / "table.json", runs / "table1" / "table.json")
     shutil.copy(RESULTS / "frontier" / "study.json", runs / "table1" / "study.json")
-    assert told("table1")["figures"] == told("frontier")["figures"]
+    assert told("table1")["key_figures"] == told("frontier")["key_figures"]
     (runs / "table1" / "table.json").write_text("{}")
-    assert told("table1")["figures"] == ""  # it is damaged, and listed all the same
+    assert told("table1")["key_figures"] == ""  # it is damaged, and listed all the same
     (runs / "table1" / "table.json").unlink()
     assert not told("table1")["is_finished"]
     (runs / "table1" / "table.json").symlink_to(RESULTS / "table1" / "table.json")
-    assert told("table1")["figures"] == ""  # links are not followed
+    assert told("table1")["key_figures"] == ""  # links are not followed
 
 
 def test_a_training_is_told_by_its_agent(client: TestClient, runs: Path):
@@ -146,7 +147,7 @@ def test_a_training_is_told_by_its_agent(client: TestClient, runs: Path):
     [run] = [r for r in client.get("/api/runs").json()["runs"] if r["name"] == "table1"]
     assert run["kind"] == "training"
     agents = finished_table(RESULTS / "table1").study.agents
-    assert {told.partition(":")[0] for told in run["figures"].split("; ")} == set(agents)
+    assert {told.partition(":")[0] for told in run["key_figures"].split("; ")} == set(agents)
 
 
 def test_runs_are_sorted_and_filtered(address: str, page: Page):
@@ -429,10 +430,9 @@ def test_what_cannot_be_compared_is_told(client: TestClient, runs: Path):
     (runs / "some/chirp" / "record.csv").symlink_to(runs / "away.csv")
     told = compared(client, "some/chirp", "some/prbs")
     assert told["experiments"] is None  # links are not followed
-    asked = client.get("/api/runs/compared", params={"name": "frontier"})
-    assert (asked.status_code, asked.json()["sentence"]) == (
-        400, "two to 12 runs can be compared: got 1"
-    )  # fmt: skip
+    asked = client.get("/api/runs/compared")
+    sentence = "one to 12 runs can be compared: got 0"
+    assert (asked.status_code, asked.json()["sentence"]) == (400, sentence)
     for name in ("..", "some", "", "/etc"):
         asked = client.get("/api/runs/compared", params=[("name", "frontier"), ("name", name)])
         assert asked.status_code == 404
@@ -470,6 +470,85 @@ def test_nothing_hinders_at_a_comparison(address: str, page: Page):
     page.goto(f"{address}/#runs/some%2Fchirp,some%2Fprbs")
     expect(page.locator("#run-view canvas")).to_have_count(2)
     require_access(page)
+
+
+# ------------------------------------------------------------------------------- experiments
+
+
+@pytest.fixture
+def record(runs: Path) -> Path:
+    """A record of a rig in the run folder, beside files that are none."""
+    path = runs / "some" / "rig.csv"
+    ended = {"reason": "trip", "num_samples": 61}
+    about = {"provenance": {"played": "chirp", "rig": "simulated"}, "ended": ended}
+    made = ex.simulate("aero2", "chirp", steps=60)
+    replace(made, metadata={**made.metadata, **about}).save(path)
+    (runs / "bare.csv").write_text("time\n0\n")
+    for name in ("bare", "alone"):
+        write_json(runs / f"{name}.json", {"kind": "something else"})
+    for ending in (".csv", ".json"):
+        (runs / f"link{ending}").symlink_to(path.with_suffix(ending))
+        shutil.copy(path.with_suffix(ending), runs / "some" / "chirp" / f"inner{ending}")
+    return path
+
+
+def test_a_record_is_an_experiment(client: TestClient, record: Path):
+    listed = {run["name"]: run for run in client.get("/api/runs").json()["runs"]}
+    assert len(listed) == 6  # neither links, nor what is inside of another run
+    run = listed["some/rig.csv"]
+    assert (run["kind"], run["plant"], run["is_finished"]) == ("experiment", "aero2", True)
+    assert run["key_figures"] == "chirp, rig simulated, trip, 61 samples"
+    asked = {"name": "some/rig.csv"}
+    assert client.get("/api/run", params=asked).json()["files"] == ["rig.json", "rig.csv"]
+    served = client.get("/api/run/file", params={**asked, "file": "rig.csv"})
+    assert served.text == record.read_text()
+    for file in ("../chirp/record.csv", "run.json", "", "rig"):
+        answer = client.get("/api/run/file", params={**asked, "file": file})
+        assert answer.status_code == 404
+    content = read_json(record.with_suffix(".json"))
+    write_json(record.with_suffix(".json"), {**content, "ended": None})
+    [run] = [r for r in client.get("/api/runs").json()["runs"] if r["name"] == "some/rig.csv"]
+    assert not run["is_finished"]
+
+
+def test_an_experiment_is_compared_with_the_record_of_an_identification(
+    client: TestClient, record: Path
+):
+    told = compared(client, "some/chirp", "some/rig.csv")["experiments"]
+    assert [(run["name"], len(run["time"])) for run in told["runs"]] == [
+        ("some/chirp", 201), ("some/rig.csv", 61),
+    ]  # fmt: skip
+    [alone] = compared(client, "some/rig.csv")["experiments"]["runs"]
+    assert alone["outputs"] == ex.read_record(record, Aero2().description).outputs.tolist()
+
+
+def test_an_experiment_is_deleted_with_its_sidecar(client: TestClient, runs: Path, record: Path):
+    before = tree(runs)
+    with record.open("ab") as file:
+        assert took_lock(file)  # as while it is recorded
+        assert delete(client, "some/rig.csv").status_code == 409
+    deletion = delete(client, "some/rig.csv", "frontier").json()["deletion"]
+    place = runs / ".deleted" / deletion
+    moved = {"some/rig.csv", "some/rig.json"}
+    assert moved < set(tree(place))
+    record.write_text("another")
+    assert client.delete(f"/api/deletions/{deletion}").status_code == 409
+    assert record.read_text() == "another"
+    assert not record.with_suffix(".json").exists()  # not half of it
+    record.unlink()
+    assert client.delete(f"/api/deletions/{deletion}").is_success
+    assert tree(runs) == before
+
+
+def test_an_experiment_is_seen(address: str, page: Page, record: Path):
+    page.goto(f"{address}/#runs")
+    page.get_by_role("link", name="some/rig.csv").click()
+    expect(page.locator("#run-view canvas")).to_have_count(2)
+    expect(page.locator("#run-view p").first).to_have_text("chirp, rig simulated, trip, 61 samples")
+    require_access(page)
+    with page.expect_download(timeout=WAIT) as waiting:
+        page.locator("#run-view").get_by_role("link", name="Report").click()
+    assert "aero2: a record" in waiting.value.path().read_text()
 
 
 # ----------------------------------------------------------------------------------- studies

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
 from .answer import answered
 from .estimates import parameter_cells
@@ -11,6 +13,16 @@ from .rows import EstimateSummary, Row
 from .study_table import StudyTable, violations_cell
 
 _MOST = 3  # parameters in a line
+
+
+def of_experiment(sidecar: Mapping[str, Any]) -> str:
+    """What was played, on what, and how it ended."""
+    made, ended = sidecar.get("provenance") or {}, sidecar.get("ended") or {}
+    rig = f"rig {made['rig']}" if made.get("rig") else "simulated" * bool(made.get("simulated"))
+    end = f"{ended['reason']}, {ended['num_samples']} samples" if ended else ""
+    return ", ".join(
+        word for word in (made.get("excitation") or made.get("played"), rig, end) if word
+    )
 
 
 def of_identification(result: EstimateSummary) -> str:

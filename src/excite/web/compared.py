@@ -1,4 +1,4 @@
-"""Several runs of the run folder beside each other: estimates, methods and signals."""
+"""Runs of the run folder beside each other: estimates, methods and signals; the signals of one."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def routes(folder: Path) -> list[Route]:
 
     def compared(request: Request) -> JSONResponse:
         names = list(dict.fromkeys(request.query_params.getlist("name")))
-        if not 2 <= len(names) <= _MAX_RUNS:
-            raise RefusedError(400, f"two to {_MAX_RUNS} runs can be compared: got {len(names)}")
+        if not 1 <= len(names) <= _MAX_RUNS:
+            raise RefusedError(400, f"one to {_MAX_RUNS} runs can be compared: got {len(names)}")
         every = found(folder)
         return JSONResponse(_compared({name: run_named(every, name) for name in names}))
 
@@ -78,13 +78,14 @@ def _are_alike(studies: Mapping[str, StudyTable]) -> bool:
 def _experiments(runs: Mapping[str, Path]) -> tuple[dict[str, object] | None, list[str]]:
     """Signals of all experiments with the inputs and outputs of the first; which runs have others.
 
-    None where fewer than two runs have experiments that are alike.
+    None where not all are of one run, and fewer than two have experiments that are alike.
     """
     first: PlantDescription | None = None
     drawn, unlike, sources = list[dict[str, object]](), list[str](), set[str]()
     for name, run in runs.items():
         plant = plant_of_run(run)
         files = [path for file, path in files_of(run).items() if _RECORD.fullmatch(file)]
+        files = [run] if run.is_file() else files
         if plant is None or not files:
             continue
         first = first or plant
@@ -96,7 +97,7 @@ def _experiments(runs: Mapping[str, Path]) -> tuple[dict[str, object] | None, li
                 title = name if len(files) == 1 else f"{name}: {path.stem}"
                 drawn.append({"name": title, **_traces(record_in(path, plant))})
                 sources.add(name)
-    if first is None or len(sources) < 2:
+    if first is None or len(sources) < min(2, len(runs)):
         return None, []
     return {
         "plant": shown_plant(first),

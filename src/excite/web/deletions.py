@@ -20,7 +20,7 @@ from starlette.routing import Route
 
 from ..files import is_locked
 from .requests import Body, RefusedError
-from .runs import found, run_named
+from .runs import files_of, found, run_named
 from .trainings import Training
 
 FOLDER = ".deleted"
@@ -59,7 +59,7 @@ def _delete(folder: Path, names: Iterable[object], trainings: Sequence[Training]
             raise RefusedError(409, "the run folder itself is a run; it cannot be deleted here")
         if any(training.is_running and training.folder == run for training in trainings):
             raise RefusedError(409, f"{name} is being trained; stop it first")
-        if is_locked(run / ".lock"):
+        if is_locked(run / ".lock" if run.is_dir() else run):
             raise RefusedError(409, f"{name} cannot be deleted: another process writes into it")
     now = datetime.now(UTC).strftime("%Y-%m-%d-%H%M%S-")
     try:
@@ -69,7 +69,7 @@ def _delete(folder: Path, names: Iterable[object], trainings: Sequence[Training]
     except OSError as error:
         raise RefusedError(409, f"{FOLDER}: cannot be written ({error.strerror})") from None
     try:
-        _move({name: (run, place / name) for name, run in runs.items()})
+        _move(runs, place)
     finally:
         _remove_empty(place)
     return place.name
@@ -87,7 +87,7 @@ def _restore(folder: Path, deletion: str) -> list[str]:
         for parent in (folder / inside for inside in list(Path(name).parents)[:-1]):
             if parent.is_symlink() or (parent / "run.json").exists():
                 raise RefusedError(409, f"{name} cannot be restored: its folder is a link or a run")
-    _move({name: (run, folder / name) for name, run in runs.items()})
+    _move(runs, folder)
     _remove_empty(place)
     return list(runs)
 
@@ -98,19 +98,21 @@ def _trash(folder: Path) -> Path:
     return folder / FOLDER
 
 
-def _move(moves: Mapping[str, tuple[Path, Path]]) -> None:
-    """Moves folders from one path to another, all or none, to where nothing is."""
+def _move(runs: Mapping[str, Path], folder: Path) -> None:
+    """Moves runs to their names in a folder, all or none, to where nothing is."""
     done = list[tuple[Path, Path]]()
     try:
-        for name, (here, there) in moves.items():
-            if os.path.lexists(there):
-                raise RefusedError(409, f"{name} exists already; nothing was moved")
-            try:
-                there.parent.mkdir(parents=True, exist_ok=True)
-                os.replace(here, there)  # refuses a folder that is not empty
-            except OSError as error:
-                raise RefusedError(409, f"{name} cannot be moved ({error.strerror})") from None
-            done.append((here, there))
+        for name, run in runs.items():
+            for here in [run] if run.is_dir() else files_of(run).values():
+                there = (folder / name).with_name(here.name)
+                if os.path.lexists(there):
+                    raise RefusedError(409, f"{name} exists already; nothing was moved")
+                try:
+                    there.parent.mkdir(parents=True, exist_ok=True)
+                    os.replace(here, there)  # refuses a folder that is not empty
+                except OSError as error:
+                    raise RefusedError(409, f"{name} cannot be moved ({error.strerror})") from None
+                done.append((here, there))
     except RefusedError:
         for here, there in reversed(done):
             os.replace(there, here)

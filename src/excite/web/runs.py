@@ -11,7 +11,7 @@ import csv
 import json
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from datetime import UTC, datetime
 from functools import lru_cache
 from pathlib import Path
@@ -23,9 +23,10 @@ from starlette.routing import Route
 
 from ..description import PlantDescription
 from ..files import folder_word, json_ready
+from ..record import RECORD_KIND
 from ..report.answer import answered, best_columns
 from ..report.frontier import frontier
-from ..report.key_figures import of_identification, of_study, of_training
+from ..report.key_figures import of_experiment, of_identification, of_study, of_training
 from ..report.rows import EstimateSummary, StudyFacts
 from ..report.sections.campaign import known_table, outcome, rounds_table
 from ..report.study_table import NUM_LABELS, StudyTable, footnotes, violations_cell
@@ -67,18 +68,29 @@ def routes(folder: Path) -> list[Route]:
 
 
 def found(folder: Path) -> dict[str, Path]:
-    """Every run below the run folder, by its path in it."""
+    """Every run below the run folder, by its path in it: folders, and records outside of them."""
     runs: dict[str, Path] = {}
     for place, folders, files in os.walk(folder, followlinks=False):
         path = Path(place)
-        name = path.relative_to(folder).as_posix()
-        if "run.json" in files and _is_text(name) and len(runs) < _MAX_RUNS:
-            runs[name] = path
+        if "run.json" in files:
+            own = [path]
             folders.clear()
+        else:
+            own = [path / file for file in sorted(files) if _is_record(path / file, files)]
+        for run in own:
+            name = run.relative_to(folder).as_posix()
+            if _is_text(name) and len(runs) < _MAX_RUNS:
+                runs[name] = run
         folders[:] = [f for f in sorted(folders) if f[0] != "." and not (path / f).is_symlink()]
         if len(path.relative_to(folder).parts) >= _DEPTH:
             folders.clear()
     return runs
+
+
+def _is_record(path: Path, beside: Collection[str]) -> bool:
+    """Whether a file is a record with its sidecar, and neither is a link."""
+    is_named = path.suffix == ".csv" and path.with_suffix(".json").name in beside
+    return is_named and not path.is_symlink() and _marker(path).get("kind") == RECORD_KIND
 
 
 def _is_text(name: str) -> bool:
@@ -100,6 +112,8 @@ def run_named(runs: Mapping[str, Path], name: object) -> Path:
 
 def files_of(run: Path) -> dict[str, Path]:
     """Files of a run that are served, by name, also those of finished seeds."""
+    if run.is_file():
+        return {path.name: path for path in (run.with_suffix(".json"), run)}
 
     def each() -> Iterator[Path]:
         yield from run.iterdir()
@@ -142,9 +156,9 @@ def _json(run: Path, name: str) -> dict[str, object]:
 
 def _summary(name: str, run: Path) -> dict[str, object]:
     written = list[tuple[int, ...]]()
-    for file in _RESULTS:
+    for path in (run.with_suffix(".json"), *(run / file for file in _RESULTS)):
         with contextlib.suppress(OSError):  # there is none, or it was removed in the meantime
-            seen = (run / file).lstat()
+            seen = path.lstat()
             written.append((seen.st_mtime_ns, seen.st_size, seen.st_ino))
     return {"name": name, "changed": _changed(run), **_found_in(run, tuple(written))}
 
@@ -153,24 +167,35 @@ def _summary(name: str, run: Path) -> dict[str, object]:
 def _found_in(run: Path, written: object) -> dict[str, object]:
     """What the result files of a run say, read again when one was written."""
     del written
-    marker, study, kind = _json(run, "run.json"), _json(run, "study.json"), _kind(run)
+    marker, study, kind = _marker(run), _json(run, "study.json"), _kind(run)
     plant = marker.get("plant")
     is_finished = bool(_json(run, "campaign.json").get("reason")) or any(
         _is_inside(run / f, run) for f in ("table.json", "estimate.json")
     )
+    if kind == "experiment":
+        is_finished = marker.get("ended", "simulated") is not None
     return {
         "kind": kind,
         "plant": str(plant.get("name", "")) if isinstance(plant, dict) else "",
         "command": without_folders(str(marker.get("command") or "")),
         "title": str(study.get("title") or study.get("name") or ""),
-        "figures": _key_figures(run, kind),
+        "key_figures": _key_figures(run, kind),
         "is_finished": is_finished,
     }
 
 
+def _marker(run: Path) -> dict[str, object]:
+    """What says of which kind a run is: its `run.json`, or the sidecar of a record."""
+    if run.is_dir():
+        return _json(run, "run.json")
+    return _json(run.parent, run.with_suffix(".json").name)
+
+
 def _kind(run: Path) -> str:
-    """Identification, campaign, study, or that of a study that `excite train` made."""
-    marker = _json(run, "run.json")
+    """Experiment, identification, campaign, study, or training: what `excite train` made."""
+    marker = _marker(run)
+    if marker.get("kind") == RECORD_KIND:
+        return "experiment"
     is_training = str(marker.get("command", "")).startswith("excite train ")
     return "training" if is_training else str(marker.get("kind", "")).removeprefix("excite ")
 
@@ -178,6 +203,8 @@ def _kind(run: Path) -> str:
 def _key_figures(run: Path, kind: str) -> str:
     """What a run found, in one line; empty where it is not finished or damaged."""
     with contextlib.suppress(LookupError, TypeError, AttributeError, ArithmeticError, ValueError):
+        if kind == "experiment":
+            return of_experiment(_marker(run))
         if kind == "identification":
             return of_identification(EstimateSummary.of(_json(run, "estimate.json")))
         if kind == "campaign":
@@ -204,7 +231,7 @@ def estimate_of(run: Path) -> EstimateSummary | None:
 
 def plant_of_run(run: Path) -> PlantDescription | None:
     """The plant of a run; None where its description is missing or damaged."""
-    plant: Any = _json(run, "run.json").get("plant")
+    plant: Any = _marker(run).get("plant")
     with contextlib.suppress(LookupError, TypeError, AttributeError, ArithmeticError, ValueError):
         return PlantDescription.from_dict(plant)
     return None
@@ -213,7 +240,7 @@ def plant_of_run(run: Path) -> PlantDescription | None:
 def _changed(run: Path) -> str:
     """When the newest file of a run was written, in UTC; empty where there is none."""
     times = list[float]()
-    for path in run.glob("[!.]*"):
+    for path in run.glob("[!.]*") if run.is_dir() else [run]:
         with contextlib.suppress(OSError):  # removed in the meantime
             times.append(path.lstat().st_mtime)
     if not times:

@@ -1,10 +1,12 @@
-// Several runs beside each other: tables of what they found, and their signals in the same plots.
+// Runs beside each other: tables of what they found, and their signals in the same plots.
 
 import { el, get, say } from "./api.js";
 import { drawSignals, signalPlots } from "./overlay.js";
-import { clear, put, rows } from "./run.js";
+import { clear, isWanted, put, rows } from "./view.js";
 
-const section = document.getElementById("runs");
+const section = document.getElementById("runs"), view = document.getElementById("run-view");
+
+const asked = (names) => get(`api/runs/compared?${names.map((name) => `name=${encodeURIComponent(name)}`).join("&")}`);
 
 /** Compares runs; they are shown below the table. */
 export async function compare(names) {
@@ -12,17 +14,28 @@ export async function compare(names) {
   clear(key);
   say(section, "");
   try {
-    const { tables, notes, experiments } = await get(`api/runs/compared?${names.map((name) => `name=${encodeURIComponent(name)}`).join("&")}`);
+    const { tables, notes, experiments } = await asked(names);
+    if (!isWanted(key)) return;
     const card = el("section", { class: "card" }, el("h2", {}, `Comparison: ${names.join(", ")}`));
     for (const table of tables) card.append(el("h3", {}, table.title), rows(table, table.title));
     card.append(...notes.map((note) => el("p", { class: "hint below" }, note)));
-    const plots = el("div", { class: "plots" }), signals = el("section", { class: "card shared" }, el("h2", {}, "Input and output"), plots);
-    if (!put(key, card, ...(experiments ? [signals] : []))) return;
-    if (!experiments) return;
-    const { plant, runs, total } = experiments;
-    drawSignals(signalPlots(plots, plant, "of all runs over time", "measured "), plant, runs);
-    if (total > runs.length) plots.before(el("p", { class: "hint below" }, `The first ${runs.length} of ${total} experiments.`));
+    put(card);
+    draw(experiments, "of all runs over time");
   } catch (error) {
-    if (put(key)) say(section, error.message, true);
+    if (isWanted(key)) say(section, error.message, true);
   }
+}
+
+/** Adds the signals of a run to what is shown of it. */
+export async function signals(name) {
+  const { experiments } = await asked([name]);
+  if (isWanted(name)) draw(experiments, "over time");
+}
+
+function draw(experiments, all) {
+  if (!experiments) return;
+  const { plant, runs, total } = experiments, plots = el("div", { class: "plots" });
+  const left = total > runs.length ? el("p", { class: "hint below" }, `The first ${runs.length} of ${total} experiments.`) : null;
+  view.append(el("section", { class: "card shared" }, el("h2", {}, "Input and output"), left, plots));
+  drawSignals(signalPlots(plots, plant, all, "measured "), plant, runs);
 }

@@ -1,39 +1,26 @@
 // One run of the run folder: its tables, figures, learning curves and files.
 
 import { download, el, get, say } from "./api.js";
+import { signals } from "./compared.js";
 import { curves } from "./curves.js";
 import { table } from "./record.js";
 import { study } from "./study.js";
+import { clear, isWanted, put, rows } from "./view.js";
 
 const section = document.getElementById("runs"), view = document.getElementById("run-view");
-let shown = "", following = 0;
-
-/** Takes away what is shown below the table; what is asked for next has a name. */
-export function clear(next = "") {
-  shown = next;
-  clearTimeout(following);
-  view.replaceChildren();
-}
-
-/** Shows something under the name that it was asked for, unless something else was in the meantime. */
-export function put(name, ...parts) {
-  if (shown !== name) return false;
-  view.replaceChildren(...parts);
-  if (!section.hidden && view.getBoundingClientRect().top > innerHeight / 2) view.scrollIntoView();
-  return true;
-}
+let following = 0;
 
 /** Shows a run, and follows a campaign that goes on. */
 export async function show(run) {
-  const isNew = shown !== run.name;
-  shown = run.name;
+  if (!isWanted(run.name)) clear(run.name);
   clearTimeout(following);
   say(section, "");
   const name = encodeURIComponent(run.name), address = (file) => `api/run/file?name=${name}&file=${encodeURIComponent(file)}`;
   try {
     const content = await get(`api/run?name=${name}`);
-    if (shown !== run.name) return; // another was chosen while this one was loading
+    if (!isWanted(run.name)) return; // another was chosen while this one was loading
     const card = el("section", { class: "card" }, el("h2", {}, content.title || run.name));
+    if (content.kind === "experiment") card.append(el("p", {}, content.key_figures));
     if (content.estimate.params) {
       const estimate = el("table");
       table(estimate, content.estimate);
@@ -47,13 +34,14 @@ export async function show(run) {
     const link = (file) => download(address(file), file), isPolicy = (file) => file.endsWith(".safetensors");
     const policies = content.files.filter(isPolicy), others = content.files.filter((file) => !isPolicy(file));
     const report = content.is_finished ? [download(`api/run/report.html?name=${name}`, "Report")] : [];
-    if (!content.is_finished) card.append(el("p", {}, "Not finished. To resume it after an interruption, rerun the command in the folder where it was started: ", el("code", {}, content.command || "the same command")));
+    if (!content.is_finished && content.kind === "experiment") card.append(el("p", {}, "It is still being recorded, or its process was killed."));
+    else if (!content.is_finished) card.append(el("p", {}, "Not finished. To resume it after an interruption, rerun the command in the folder where it was started: ", el("code", {}, content.command || "the same command")));
     card.append(el("p", { class: "row downloads" }, ...report, ...others.map(link)));
     if (policies.length) card.append(el("details", { open: policies.length < 4 }, el("summary", {}, `Policies (${policies.length})`), el("p", { class: "row downloads" }, ...policies.map(link))));
     const isFollowed = content.kind === "campaign" && !content.is_finished && !content.campaign.interrupted;
-    if (isFollowed) following = setTimeout(() => shown === run.name && !section.hidden && show(run), 2000);
-    view.replaceChildren(card, ...(told?.card ? [told.card] : []));
-    if (isNew && !section.hidden && view.getBoundingClientRect().top > innerHeight / 2) view.scrollIntoView();
+    if (isFollowed) following = setTimeout(() => isWanted(run.name) && !section.hidden && show(run), 2000);
+    put(card, ...(told?.card ? [told.card] : []));
+    if (["experiment", "identification"].includes(content.kind)) await signals(run.name);
     if (content.curves.length) {
       const learnt = el("section", { class: "card" }, el("h2", {}, "Learning curves"), el("div", { class: "plots small" }));
       view.append(learnt);
@@ -63,12 +51,6 @@ export async function show(run) {
       view.append(el("section", { class: "card" }, el("h2", {}, figure.replace(/\.png$/, "")), el("img", { src: address(figure), alt: `figure ${figure} of ${run.name}`, loading: "lazy" })));
     }
   } catch (error) {
-    if (shown === run.name) say(section, error.message, true);
+    if (isWanted(run.name)) say(section, error.message, true);
   }
 }
-
-/** A table of texts. */
-export const rows = ({ header, rows: cells }, name) => el("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": name },
-  el("table", {},
-    el("thead", {}, el("tr", {}, ...header.map((text) => (text ? el("th", { scope: "col" }, text) : el("td"))))),
-    el("tbody", {}, ...cells.map((row) => el("tr", {}, ...row.map((text, i) => (i ? el("td", {}, text) : el("th", { scope: "row" }, text))))))));

@@ -2,7 +2,8 @@
 
 import { el, get, post, remove, say } from "./api.js";
 import { compare } from "./compared.js";
-import { clear, show } from "./run.js";
+import { show } from "./run.js";
+import { clear } from "./view.js";
 
 const section = document.getElementById("runs"), table = document.getElementById("run-list");
 const filter = document.getElementById("run-filter"), body = table.querySelector("tbody");
@@ -31,7 +32,7 @@ table.querySelector("thead").append(el("tr", {}, labelled(everyBox, "Select all 
   } }, column)))));
 
 function figures(run) {
-  return run.is_finished ? run.figures : ["not finished", run.figures].filter(Boolean).join(": ");
+  return run.is_finished ? run.key_figures : ["not finished", run.key_figures].filter(Boolean).join(": ");
 }
 
 /** The address of a run, or of a comparison of several: "#runs/frontier", "#runs/chirp,prbs". */
@@ -47,7 +48,7 @@ export async function open(place) {
   try {
     all = (await get("api/runs")).runs;
     if (asked !== own) return; // the address changed while the list was loading
-    say(section, all.length ? "" : "The run folder is empty; studies and identifications appear here.");
+    say(section, all.length ? "" : "The run folder is empty; studies, identifications and records appear here.");
     const runs = names.map((name) => all.find((run) => run.name === name)), isThere = !runs.includes(undefined);
     chosen = isThere ? names : [];
     if (names.length > 1 && isThere) selected = new Set(names);
