@@ -66,12 +66,14 @@ def _delete(folder: Path, names: Iterable[object], trainings: Sequence[Training]
         trash = _trash(folder)
         trash.mkdir(exist_ok=True)
         place = Path(tempfile.mkdtemp(prefix=now, dir=trash))
+        place.chmod(0o755)  # mkdtemp makes folders that other users cannot read
     except OSError as error:
         raise RefusedError(409, f"{FOLDER}: cannot be written ({error.strerror})") from None
     try:
         _move(runs, place)
-    finally:
+    except RefusedError:
         _remove_empty(place)
+        raise
     return place.name
 
 
@@ -103,7 +105,7 @@ def _move(runs: Mapping[str, Path], folder: Path) -> None:
     done = list[tuple[Path, Path]]()
     try:
         for name, run in runs.items():
-            for here in [run] if run.is_dir() else files_of(run).values():
+            for here in files_of(run).values() if run.is_file() else [run]:
                 there = (folder / name).with_name(here.name)
                 if os.path.lexists(there):
                     raise RefusedError(409, f"{name} exists already; nothing was moved")

@@ -111,10 +111,8 @@ class CampaignRun(Run):
 
 def outcome(content: Mapping[str, Any]) -> str:
     """How a campaign ended, and after how many samples."""
-    ended, count = (
-        content["reason"] or content["interrupted"] or "not ended",
-        len(content["rounds"]),
-    )
+    ended = content["reason"] or content["interrupted"] or "not ended"
+    count = len(content["rounds"])
     return f"{ended} ({content['num_samples']} samples in {count} round{'s' * (count != 1)})"
 
 

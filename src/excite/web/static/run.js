@@ -41,7 +41,6 @@ export async function show(run) {
     const isFollowed = content.kind === "campaign" && !content.is_finished && !content.campaign.interrupted;
     if (isFollowed) following = setTimeout(() => isWanted(run.name) && !section.hidden && show(run), 2000);
     put(card, ...(told?.card ? [told.card] : []));
-    if (["experiment", "identification"].includes(content.kind)) await signals(run.name);
     if (content.curves.length) {
       const learnt = el("section", { class: "card" }, el("h2", {}, "Learning curves"), el("div", { class: "plots small" }));
       view.append(learnt);
@@ -50,6 +49,7 @@ export async function show(run) {
     for (const figure of content.figures) {
       view.append(el("section", { class: "card" }, el("h2", {}, figure.replace(/\.png$/, "")), el("img", { src: address(figure), alt: `figure ${figure} of ${run.name}`, loading: "lazy" })));
     }
+    if (["experiment", "identification"].includes(content.kind)) await signals(run.name);
   } catch (error) {
     if (isWanted(run.name)) say(section, error.message, true);
   }
