@@ -34,6 +34,7 @@ from starlette.requests import Request
 from starlette.testclient import TestClient
 
 import excite as ex
+from excite import web
 from excite.files import write_json
 from excite.plant import Aero2
 from excite.record import READ_ENDINGS
@@ -678,6 +679,11 @@ def test_the_page_comes_with_its_headers_and_its_door_with_a_secret(page: TestCl
     text = answer.text + page.get("/static/bench.js").text
     assert "http://" not in text.replace("http://www.w3.org", "")
     assert "https://" not in text
+
+
+def test_the_page_is_small():
+    static = Path(web.__file__).with_name("static")
+    assert sum(path.stat().st_size for path in static.rglob("*") if path.is_file()) < 300_000
 
 
 def contrast(first: str, second: str) -> float:
