@@ -31,6 +31,7 @@ def main() -> None:
         page = browser.new_page(viewport={"width": 1280, "height": 900})
         experiment(page, json.loads(told)["address"], Path(folder))
         record(page, Path(folder))
+        runs(page)
         dark = browser.new_page(viewport={"width": 1000, "height": 900}, color_scheme="dark")
         dark.goto((Path(folder) / "report.html").as_uri())
         dark.screenshot(path=FIGURES / "report.png")
@@ -56,6 +57,17 @@ def record(page: Page, folder: Path) -> None:
     page.get_by_role("button", name="Identify").click()
     expect(page.locator("#record .status")).to_have_text("Done: successful.", timeout=PATIENCE)
     page.screenshot(path=FIGURES / "bench-page-record.png", full_page=True)
+
+
+def runs(page: Page) -> None:
+    page.set_viewport_size({"width": 1280, "height": 1585})
+    page.evaluate("location.hash = 'runs/frontier'")
+    chart = page.locator(".frontier")
+    expect(chart.locator(".method")).to_have_count(17)
+    chart.press("End")
+    chart.blur()
+    page.locator("#run-view").evaluate("(view) => view.scrollIntoView()")
+    page.screenshot(path=FIGURES / "bench-page-study.png")
 
 
 if __name__ == "__main__":

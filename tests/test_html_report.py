@@ -19,12 +19,13 @@ import pytest
 from excite.cli import main
 from excite.policy import read_policy
 from excite.report import html as html_report
-from excite.report.answer import answered
+from excite.report.answer import answered, best_columns
 from excite.report.estimates import parameter_cells, residual_cells, residual_in_words
+from excite.report.frontier import frontier
 from excite.report.html import report_html
 from excite.report.numbers import number
 from excite.report.rows import EstimateSummary, Row, StudyFacts
-from excite.report.study_table import difference_cells, footnotes
+from excite.report.study_table import StudyTable, difference_cells, footnotes
 from excite.report.svg import inline_svg
 from excite.study.table import finished_table
 
@@ -276,6 +277,39 @@ def test_an_answer_keeps_its_sense_at_the_edges():
     assert answered([*failing, ROWS[0]], FACTS, {}).rows[0].estimator == "arx"
     reference = answered([ROWS[4]], FACTS, {})
     assert (reference.best, reference.sentences) == (None, ())
+
+
+def test_the_best_of_a_column_is_safe_and_knows_nothing():
+    """Neither loud, clairvoyant, nor one that often fails; equal ones are both the best."""
+    failing = row("failing", "nls", 80.0, 0.01).model_copy(update={"failed": 6})
+    unknown = row("drifting", "nls", math.nan, math.nan)
+    own = [r for r in ROWS if r.estimator == "nls"]
+    table = StudyTable(rows=(unknown, failing, *own), study=FACTS)
+    header = table.cells()[0]
+    every = {header.index("k error %"), header.index("bound %"), header.index("log det")}
+    best = best_columns(table)
+    assert best == {r.method: every if r.method == "learned" else set() for r in table.rows}
+    twin = row("twin", "nls", 40.0, 0.1)
+    best = best_columns(StudyTable(rows=(*own, twin), study=FACTS))
+    assert best["twin"] == every - {header.index("log det")}
+    assert best["learned"] == every
+    assert not any(best_columns(StudyTable(rows=(ROWS[2],), study=FACTS)).values())
+
+
+def test_the_frontier_is_what_no_other_method_beats():
+    drawn = np.random.default_rng(0).integers(0, 12, (40, 2))
+    rows = [row(f"m{i}", "nls", float(a), 0.1, violations=int(b)) for i, (a, b) in enumerate(drawn)]
+    reference, unknown = row("clairvoyant", "nls", 99.0, 0.1), row("none", "nls", math.nan, 0.1)
+    best = frontier([*rows, reference, unknown])
+    assert 1 < len(best) < len(rows)
+    for own in rows:
+        beaten = any(
+            (r.log_det_information, -r.violations) > (own.log_det_information, -own.violations)
+            and r.violations <= own.violations
+            for r in rows
+        )
+        assert (own.method in best) is not beaten
+    assert frontier([reference]) == []
 
 
 @pytest.mark.parametrize("name", ["frontier", "table1"])

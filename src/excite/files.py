@@ -195,9 +195,15 @@ def require_new_file(path: Path, overwrite: bool) -> None:
 
 def require_unlocked(path: Path) -> None:
     """Raises ValueError where another process records into a file."""
+    if is_locked(path):
+        raise ValueError(f"{path}: another process records into this file")
+
+
+def is_locked(path: Path) -> bool:
+    """Whether another process holds the lock of a file; not where there is no file."""
     with contextlib.suppress(OSError), path.open("rb") as file:
-        if not took_lock(file):
-            raise ValueError(f"{path}: another process records into this file")
+        return not took_lock(file)
+    return False
 
 
 def require_free_run_folder(path: Path, overwrite: bool) -> None:

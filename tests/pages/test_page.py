@@ -2,9 +2,7 @@
 
 import itertools
 import json
-import os
 import re
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,6 +10,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from chromium import require_chromium
 from cluster import wait_for
 from commands import PATIENCE
 from served import MAX_GAP, TRIES, served
@@ -23,32 +22,13 @@ from excite.plant.catalogue import plant_in_file
 from excite.plant.contract import with_nominal
 from excite.policy import read_policy
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-if CHROMIUM is None and os.environ.get("EXCITE_BROWSER_TESTS") != "1":
-    pytest.skip("no chromium on this computer (apt-get install chromium)", allow_module_level=True)
+require_chromium()
 
 from axe_playwright_python.sync_playwright import Axe  # noqa: E402
-from playwright.sync_api import Browser, Page, Route, expect, sync_playwright  # noqa: E402
+from playwright.sync_api import Browser, Page, Route, expect  # noqa: E402
 
-ARGUMENTS = [
-    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
-    "--disable-background-networking", "--disable-component-update", "--disable-sync",
-]  # fmt: skip
 WAIT = 1000 * PATIENCE  # milliseconds
 WIDTHS = (360, 1440)
-WATCH = """
-addEventListener("DOMContentLoaded", () => {
-  const times = (window.frames_seen = []);
-  const said = (window.sentences_said = []);
-  const status = document.querySelector("#experiment .status");
-  const progress = document.querySelector("#experiment .progress");
-  if (!status) return; // another page
-  new MutationObserver(() => said.push(status.textContent)).observe(status, { childList: true });
-  new MutationObserver(() => {
-    if (progress.textContent) times.push(performance.now());
-  }).observe(progress, { childList: true });
-});
-"""
 
 
 def write_campaign(run: Path, decisions: list[str], reason: str = "") -> None:
@@ -87,30 +67,6 @@ def address(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
     write_json(own, plant_in_file(with_nominal(Aero2(), {"J_p": 0.017})))
     with served(folder, "--workers", "1", "--plant", str(own)) as where:
         yield where
-
-
-@pytest.fixture(scope="module")
-def chromium() -> Iterator[Browser]:
-    assert CHROMIUM, "EXCITE_BROWSER_TESTS=1 asks for a browser, and there is no chromium"
-    with sync_playwright() as playwright:
-        opened = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
-        yield opened
-        opened.close()
-
-
-@pytest.fixture
-def page(chromium: Browser) -> Iterator[Page]:
-    """A browser of its own; whatever its console says is an error."""
-    context = chromium.new_context(viewport={"width": 1440, "height": 1000})
-    opened, said = context.new_page(), list[Any]()
-    opened.on("console", lambda message: said.append(message.text))
-    opened.on("pageerror", lambda error: said.append(str(error)))
-    opened.on("dialog", lambda dialog: said.append(dialog.message))
-    opened.add_init_script(WATCH)
-    yield opened
-    context.close()
-    # A refused request is told to the user; the browser itself notes it, too.
-    assert [text for text in said if "Failed to load resource" not in text] == []
 
 
 def ready(page: Page, address: str, part: str = "experiment") -> Page:
@@ -294,13 +250,13 @@ def test_it_is_used_by_the_keyboard_alone(address: str, page: Page):
 
 def test_the_header_is_skipped_to_the_part_that_is_shown(address: str, page: Page):
     page.goto(f"{address}/#runs")
-    expect(page.get_by_role("button", name="a_study")).to_be_visible()
+    expect(page.get_by_role("link", name="a_study")).to_be_visible()
     page.locator(".skip").focus()
     page.keyboard.press("Enter")
     expect(page).to_have_url(f"{address}/#main")
     expect(page.locator("#runs")).to_be_visible()
     page.keyboard.press("Tab")
-    expect(page.get_by_label("Name, kind, plant or date")).to_be_focused()
+    expect(page.get_by_label("Words of name, date, plant, kind or figures")).to_be_focused()
 
 
 def test_columns_are_chosen_before_anything_is_identified(address: str, page: Page):
@@ -720,7 +676,7 @@ def test_what_the_plant_leaves_out_is_estimated_by_one_click(
     assert command is not None
     assert "--plant aero2+bias_pitch+delay_voltage" in command
     page.get_by_text("Correlation of the estimates").click()
-    cells = page.locator("#correlations td")
+    cells = page.locator("#correlations tbody td")
     expect(cells).to_have_count(25)
     expect(cells.first).to_have_text("1.00")
     # The residual is white now: about 95 % of 30 correlations within the band.
@@ -750,9 +706,9 @@ def test_nothing_hinders_people_who_do_not_see_or_point(
 def test_a_run_has_an_address_and_is_found_by_words(address: str, page: Page):
     page.goto(f"{address}/#runs/a_study")
     expect(page.locator("#run-view td").first).to_have_text("1")
-    names = page.locator("#run-list button")
+    names = page.locator("#run-list a")
     expect(names).to_have_count(3)  # one damaged run hides no other
-    page.get_by_label("Name, kind, plant or date").fill("campaign aero2")
+    page.get_by_label("Words of name, date, plant, kind or figures").fill("campaign aero2")
     expect(names).to_have_count(1)
     names.first.click()
     expect(page).to_have_url(f"{address}/#runs/the_campaign")
@@ -782,7 +738,7 @@ def test_a_slow_list_of_runs_does_not_undo_a_later_address(address: str, page: P
 
 def test_runs_are_looked_at(address: str, page: Page):
     page.goto(f"{address}/#runs")
-    page.get_by_role("button", name="a_study").click()
+    page.get_by_role("link", name="a_study").click()
     expect(page.locator("#run-view td").first).to_have_text("1")
     assert page.locator("#run-view img").count() == 0  # what looks like a picture is text
     assert page.locator("#run-view canvas").count() == 3
@@ -793,7 +749,7 @@ def test_a_campaign_is_followed_while_it_runs(address: str, folder: Path, page: 
     write_campaign(folder / "the_campaign", ["go on: D_p is 3 times as uncertain as asked"])
     page.clock.install()
     page.goto(f"{address}/#runs")
-    page.get_by_role("button", name="the_campaign").click()
+    page.get_by_role("link", name="the_campaign").click()
     shown = page.get_by_role("region", name="Rounds").locator("tbody tr")
     expect(shown).to_have_count(1)
     expect(page.locator("#run-view")).to_contain_text("Not finished")
@@ -839,7 +795,7 @@ def test_a_link_in_a_foreign_page_leaves_the_browser_its_own(address: str, page:
 
 def test_a_download_that_is_refused_says_why(address: str, page: Page):
     page.goto(f"{address}/#runs")
-    page.get_by_role("button", name="a_study").click()
+    page.get_by_role("link", name="a_study").click()
     refusal: Any = {"status": 429, "json": {"sentence": "4 jobs already running"}}
     page.route("**/report.html*", lambda route: route.fulfill(**refusal))
     page.locator("#run-view .downloads a").first.click()

@@ -34,6 +34,7 @@ from starlette.requests import Request
 from starlette.testclient import TestClient
 
 import excite as ex
+from excite import web
 from excite.files import write_json
 from excite.plant import Aero2
 from excite.record import READ_ENDINGS
@@ -680,6 +681,11 @@ def test_the_page_comes_with_its_headers_and_its_door_with_a_secret(page: TestCl
     assert "https://" not in text
 
 
+def test_the_page_is_small():
+    static = Path(web.__file__).with_name("static")
+    assert sum(path.stat().st_size for path in static.rglob("*") if path.is_file()) < 300_000
+
+
 def contrast(first: str, second: str) -> float:
     """Of two colours, as the Web Content Accessibility Guidelines count it."""
 
@@ -737,6 +743,8 @@ def test_a_request_from_elsewhere_changes_nothing(headers: dict[str, str], page:
         ("POST", "/api/session"),
         ("DELETE", "/api/jobs/x"),
         ("DELETE", "/api/trainings/x"),
+        ("POST", "/api/deletions"),
+        ("DELETE", "/api/deletions/x"),
     ):
         assert page.request(method, path, headers=headers, json={}).status_code == 403
     if "sec-fetch-site" in headers:

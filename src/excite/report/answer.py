@@ -17,7 +17,7 @@ from ..description import RARE, Output, PlantDescription, display_unit, listed
 from ..record import Record
 from .numbers import digits_for, number
 from .rows import EstimatedParameter, EstimateSummary, Row, StudyFacts
-from .study_table import violations_cell
+from .study_table import NUM_LABELS, StudyTable, violations_cell
 from .tables import Table
 
 KNOWS_THE_PLANT = "clairvoyant"  # a reference, and no excitation that could be played
@@ -102,6 +102,41 @@ def _rank(row: Row) -> tuple[bool, float]:
     """Excitations without a violation first, then by information; what is not finite is last."""
     worth = row.log_det_information
     return row.violations > 0, -worth if math.isfinite(worth) else math.inf
+
+
+def best_columns(table: StudyTable) -> dict[str, set[int]]:
+    """The columns of `cells` in which a method is the best of those that are safe, by method.
+
+    Columns are those of errors, bounds and information, of a table of one estimator. Safe is a
+    method without a violation whose estimates fail in at most 5 % of the experiments; one that
+    knows the plant is left out.
+    """
+    rows, header = table.rows, table.cells()[0]
+    smaller = dict[int, list[float]]()  # is better
+    for i, name in enumerate(rows[0].parameters):
+        column = NUM_LABELS + 2 * i
+        smaller[column] = [row.relative_error_percent[name].mean for row in rows]
+        smaller[column + 1] = [row.cramer_rao_percent[name] for row in rows]
+    smaller[header.index("log det")] = [-row.log_det_information for row in rows]
+    if "gain nats" in header:
+        gains = (math.nan if (g := row.expected_gain) is None else g.lower.mean for row in rows)
+        smaller[header.index("gain nats")] = [-value for value in gains]
+    if "D-efficiency" in header:
+        known = (math.nan if row.d_efficiency is None else row.d_efficiency for row in rows)
+        smaller[header.index("D-efficiency")] = [-value for value in known]
+    found: dict[str, set[int]] = {row.method: set() for row in rows}
+    for column, values in smaller.items():
+        safe = [(v, r.method) for v, r in zip(values, rows, strict=True) if _is_safe(r)]
+        least = min((value for value, _ in safe if math.isfinite(value)), default=math.nan)
+        for value, method in safe:
+            if value == least:
+                found[method].add(column)
+    return found
+
+
+def _is_safe(row: Row) -> bool:
+    often = row.failed > _OFTEN * row.evaluations
+    return row.violations == 0 and not often and row.method != KNOWS_THE_PLANT
 
 
 def _excess(rows: Sequence[Row], estimator: str) -> tuple[bool, float]:

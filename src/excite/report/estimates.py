@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 
 from ..description import RARE
 from .numbers import digits_for, number
 from .rows import EstimatedParameter, EstimateSummary
+from .tables import Table
 
 
 def parameter_header() -> list[str]:
@@ -69,3 +71,25 @@ def largest_correlation(result: EstimateSummary) -> str:
     table = np.nan_to_num(np.triu(table, 1))
     i, j = np.unravel_index(np.argmax(np.abs(table)), table.shape)
     return f"{table[i, j]:+.3f} between {names[i]} and {names[j]}"
+
+
+def beside(results: Mapping[str, EstimateSummary]) -> Table:
+    """Column titles and rows: estimates with intervals, and fits, side by side, by title."""
+    header, every = ["", "unit", *results], list(results.values())
+    names = {n: p.unit for result in every for n, p in result.params.items()}
+    outputs = list(dict.fromkeys(n for result in every for n in result.fit_percent))
+    rows = [["status", "", *(result.status for result in every)]]
+    rows.append(["estimator", "", *(result.estimator for result in every)])
+    for name, unit in names.items():
+        rows.append([name, unit, *(_with_interval(name, result.params) for result in every)])
+    for output in outputs:
+        fits = [number(result.fit_percent.get(output), 4) for result in every]
+        rows.append([f"fit of {output}", "%", *fits])
+    return header, rows
+
+
+def _with_interval(name: str, params: Mapping[str, EstimatedParameter]) -> str:
+    if name not in params:
+        return "–"
+    _, _, estimate, _, interval, _ = parameter_cells(name, params[name])
+    return estimate if interval == "–" else f"{estimate} ({interval})"

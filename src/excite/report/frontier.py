@@ -8,9 +8,29 @@ from collections.abc import Sequence
 import matplotlib.figure
 
 from ..record.figure import add_legend, add_title, colour_of, new_figure
+from .answer import KNOWS_THE_PLANT
 from .rows import Row
 
 _MARKERS = "osD^vP*X<>hpd"  # as many as share no factor with the colours
+
+
+def frontier(rows: Sequence[Row]) -> list[str]:
+    """Methods that no other beats: none tells as much with fewer violations, or more with as few.
+
+    One that knows the plant is a reference, and neither on the frontier nor before it.
+    """
+    own = [row for row in rows if row.estimator == rows[0].estimator]
+    own = [row for row in own if row.method != KNOWS_THE_PLANT]
+    points = {
+        row.method: (row.log_det_information, -row.violation_rate.estimate)
+        for row in own
+        if math.isfinite(row.log_det_information)
+    }
+    return [
+        method
+        for method, (told, safe) in points.items()
+        if not any(t >= told and s >= safe and (t, s) != (told, safe) for t, s in points.values())
+    ]
 
 
 def frontier_figure(rows: Sequence[Row], title: str) -> matplotlib.figure.Figure:

@@ -3,7 +3,7 @@
 The server does not compute: it loads neither JAX nor a plant, so that the page opens fast.
 Worker processes run `jobs` and send `events`. `requests` checks the content of a request,
 `security` its origin and session, `sessions` stores the data of each browser. `streams`,
-`places`, `runs` and `trainings` answer.
+`places`, `runs`, `compared`, `deletions` and `trainings` answer.
 """
 
 from __future__ import annotations
@@ -27,7 +27,9 @@ from starlette.responses import FileResponse, JSONResponse
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
+from .compared import routes as comparison_routes
 from .connections import Connection
+from .deletions import routes as deletion_routes
 from .events import Catalogue
 from .places import routes as place_routes
 from .requests import MAX_BODY, RefusedError, parts
@@ -87,6 +89,8 @@ def application(
         *stream_routes(workers, settings.plants, _body),
         *place_routes(workers, partial(run_of, settings.runs)),
         *run_routes(settings.runs),
+        *comparison_routes(settings.runs),
+        *deletion_routes(settings.runs, _body, trainings),
         *training_routes(settings.runs, settings.plants, _body, trainings),
         Mount("/static", StaticFiles(directory=_STATIC)),
     ]

@@ -28,7 +28,6 @@ from ..description import (
     Output,
     Parameter,
     PlantDescription,
-    display_unit,
     names_of,
     unknown,
 )
@@ -54,12 +53,12 @@ from ..record import column_lengths
 from ..record.bags import is_bag
 from ..record.figure import kept_samples
 from ..record.formats import columns_in
-from ..record.units import known_units
 from ..report.html import report_html
 from ..safety import critical_levels, is_violation, max_abs_output
 from ..simulation import Experiment, Trajectory
 from .events import ExperimentRequest, IdentificationRequest, ParameterRow, Preview, Row, Traces
 from .events import JobEvent as Event
+from .plants import shown_plant
 
 NUM_ESTIMATES = 20
 _FIRST = 40  # samples before the first estimate
@@ -90,7 +89,7 @@ def catalogue(plants: Mapping[str, str]) -> Iterator[Event]:
             if _fits(p, description)
         }
         effects = list(extensions_of(plant))
-        shown[name] = {**_shown(description), "policies": fitting, "effects": effects}
+        shown[name] = {**shown_plant(description), "policies": fitting, "effects": effects}
     yield {
         "kind": "catalogue",
         "version": __version__,
@@ -121,15 +120,6 @@ def _fits(policy: Policy, description: PlantDescription) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _shown(description: PlantDescription) -> dict[str, object]:
-    """A description, with the display unit of each quantity and its factor."""
-    data = description.to_dict()
-    for part in (*data["inputs"], *data["outputs"]):
-        part["shown_unit"], part["factor"] = display_unit(part["unit"])
-        part["units"] = known_units(part["unit"])
-    return {**data, "units_of_time": known_units("s")}
 
 
 # --------------------------------------------------------------------------- experiments
@@ -175,7 +165,7 @@ def episode(asked: ExperimentRequest) -> Iterator[Event]:
     run, d = own.run(), own.plant.description
     yield {
         "kind": "episode",
-        "plant": _shown(d),
+        "plant": shown_plant(d),
         "excitation": own.name,
         "warning": own.origin.get("warning"),
         "params": _by_name(d.parameters, own.params),
@@ -396,7 +386,7 @@ def identified(
     yield {
         "kind": "identified",
         "command": command,
-        "plant": _shown(result.plant),
+        "plant": shown_plant(result.plant),
         "identification": result.to_dict(),
         "time": record.time[kept].tolist(),
         "inputs": record.inputs[kept].tolist(),

@@ -11,8 +11,9 @@ import csv
 import json
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping
 from datetime import UTC, datetime
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +22,14 @@ from starlette.responses import FileResponse, JSONResponse
 from starlette.routing import Route
 
 from ..description import PlantDescription
-from ..files import folder_word
-from ..report.sections.campaign import known_table, rounds_table
+from ..files import folder_word, json_ready
+from ..record import RECORD_KIND
+from ..report.answer import answered, best_columns
+from ..report.frontier import frontier
+from ..report.key_figures import of_experiment, of_identification, of_study, of_training
+from ..report.rows import EstimateSummary, StudyFacts
+from ..report.sections.campaign import known_table, outcome, rounds_table
+from ..report.study_table import NUM_LABELS, StudyTable, footnotes, violations_cell
 from .requests import RefusedError, without_folders
 
 _TYPES = {
@@ -34,6 +41,7 @@ _TYPES = {
     ".safetensors": "application/octet-stream",
 }
 _DEPTH, _MAX_RUNS, _MAX_CURVES, _MAX_TEXT = 4, 500, 256, 4 * 2**20
+_RESULTS = ("run.json", "study.json", "table.json", "estimate.json", "campaign.json")
 
 
 def routes(folder: Path) -> list[Route]:
@@ -47,7 +55,7 @@ def routes(folder: Path) -> list[Route]:
         return JSONResponse(_content(run_of(folder, request)))
 
     def file(request: Request) -> FileResponse:
-        path = _files(run_of(folder, request)).get(request.query_params.get("file", ""))
+        path = files_of(run_of(folder, request)).get(request.query_params.get("file", ""))
         if path is None:
             raise RefusedError(404, "this run has no such file")
         return FileResponse(path, media_type=_TYPES[path.suffix], filename=path.name)
@@ -60,18 +68,29 @@ def routes(folder: Path) -> list[Route]:
 
 
 def found(folder: Path) -> dict[str, Path]:
-    """Every run below the run folder, by its path in it."""
+    """Every run below the run folder, by its path in it: folders, and records outside of them."""
     runs: dict[str, Path] = {}
     for place, folders, files in os.walk(folder, followlinks=False):
         path = Path(place)
-        name = path.relative_to(folder).as_posix()
-        if "run.json" in files and _is_text(name) and len(runs) < _MAX_RUNS:
-            runs[name] = path
+        if "run.json" in files:
+            own = [path]
             folders.clear()
+        else:
+            own = [path / file for file in sorted(files) if _is_record(path / file, files)]
+        for run in own:
+            name = run.relative_to(folder).as_posix()
+            if _is_text(name) and len(runs) < _MAX_RUNS:
+                runs[name] = run
         folders[:] = [f for f in sorted(folders) if f[0] != "." and not (path / f).is_symlink()]
         if len(path.relative_to(folder).parts) >= _DEPTH:
             folders.clear()
     return runs
+
+
+def _is_record(path: Path, beside: Collection[str]) -> bool:
+    """Whether a file is a record with its sidecar, and neither is a link."""
+    is_named = path.suffix == ".csv" and path.with_suffix(".json").name in beside
+    return is_named and not path.is_symlink() and _marker(path).get("kind") == RECORD_KIND
 
 
 def _is_text(name: str) -> bool:
@@ -81,15 +100,20 @@ def _is_text(name: str) -> bool:
 
 def run_of(folder: Path, request: Request) -> Path:
     """The run that a request names."""
-    runs = found(folder)
-    name = request.query_params.get("name", "")
-    if name not in runs:
+    return run_named(found(folder), request.query_params.get("name"))
+
+
+def run_named(runs: Mapping[str, Path], name: object) -> Path:
+    """The run of a name from a browser among those that were found."""
+    if not isinstance(name, str) or name not in runs:
         raise RefusedError(404, "the run folder has no such run")
     return runs[name]
 
 
-def _files(run: Path) -> dict[str, Path]:
+def files_of(run: Path) -> dict[str, Path]:
     """Files of a run that are served, by name, also those of finished seeds."""
+    if run.is_file():
+        return {path.name: path for path in (run.with_suffix(".json"), run)}
 
     def each() -> Iterator[Path]:
         yield from run.iterdir()
@@ -131,24 +155,92 @@ def _json(run: Path, name: str) -> dict[str, object]:
 
 
 def _summary(name: str, run: Path) -> dict[str, object]:
-    marker, study = _json(run, "run.json"), _json(run, "study.json")
+    written = list[tuple[int, ...]]()
+    for path in (run.with_suffix(".json"), *(run / file for file in _RESULTS)):
+        with contextlib.suppress(OSError):  # there is none, or it was removed in the meantime
+            seen = path.lstat()
+            written.append((seen.st_mtime_ns, seen.st_size, seen.st_ino))
+    return {"name": name, "changed": _changed(run), **_found_in(run, tuple(written))}
+
+
+@lru_cache(2 * _MAX_RUNS)
+def _found_in(run: Path, written: object) -> dict[str, object]:
+    """What the result files of a run say, read again when one was written."""
+    del written
+    marker, study, kind = _marker(run), _json(run, "study.json"), _kind(run)
     plant = marker.get("plant")
+    is_finished = bool(_json(run, "campaign.json").get("reason")) or any(
+        _is_inside(run / f, run) for f in ("table.json", "estimate.json")
+    )
+    if kind == "experiment":
+        is_finished = marker.get("ended", "simulated") is not None
     return {
-        "name": name,
-        "kind": str(marker.get("kind", "")).removeprefix("excite "),
+        "kind": kind,
         "plant": str(plant.get("name", "")) if isinstance(plant, dict) else "",
         "command": without_folders(str(marker.get("command") or "")),
         "title": str(study.get("title") or study.get("name") or ""),
-        "changed": _changed(run),
-        "is_finished": bool(_json(run, "campaign.json").get("reason"))
-        or any(_is_inside(run / f, run) for f in ("table.json", "estimate.json")),
+        "key_figures": _key_figures(run, kind),
+        "is_finished": is_finished,
     }
+
+
+def _marker(run: Path) -> dict[str, object]:
+    """What says of which kind a run is: its `run.json`, or the sidecar of a record."""
+    if run.is_dir():
+        return _json(run, "run.json")
+    return _json(run.parent, run.with_suffix(".json").name)
+
+
+def _kind(run: Path) -> str:
+    """Experiment, identification, campaign, study, or training: what `excite train` made."""
+    marker = _marker(run)
+    if marker.get("kind") == RECORD_KIND:
+        return "experiment"
+    is_training = str(marker.get("command", "")).startswith("excite train ")
+    return "training" if is_training else str(marker.get("kind", "")).removeprefix("excite ")
+
+
+def _key_figures(run: Path, kind: str) -> str:
+    """What a run found, in one line; empty where it is not finished or damaged."""
+    with contextlib.suppress(LookupError, TypeError, AttributeError, ArithmeticError, ValueError):
+        if kind == "experiment":
+            return of_experiment(_marker(run))
+        if kind == "identification":
+            return of_identification(EstimateSummary.of(_json(run, "estimate.json")))
+        if kind == "campaign":
+            return outcome(_json(run, "campaign.json"))
+        if kind in ("study", "training"):
+            table = table_of(run)
+            return of_training(table) if kind == "training" else of_study(table)
+    return ""
+
+
+def table_of(run: Path) -> StudyTable:
+    """The table of a finished study; ValueError where there is none, or it is damaged."""
+    study = StudyFacts.model_validate(_json(run, "study.json"))
+    return StudyTable.model_validate({**_json(run, "table.json"), "study": study})
+
+
+def estimate_of(run: Path) -> EstimateSummary | None:
+    """What an identification found, or the last one of a campaign; None where there is none."""
+    for file in ("estimate.json", "estimate/estimate.json"):
+        with contextlib.suppress(ValueError):
+            return EstimateSummary.of(_json(run, file))
+    return None
+
+
+def plant_of_run(run: Path) -> PlantDescription | None:
+    """The plant of a run; None where its description is missing or damaged."""
+    plant: Any = _marker(run).get("plant")
+    with contextlib.suppress(LookupError, TypeError, AttributeError, ArithmeticError, ValueError):
+        return PlantDescription.from_dict(plant)
+    return None
 
 
 def _changed(run: Path) -> str:
     """When the newest file of a run was written, in UTC; empty where there is none."""
     times = list[float]()
-    for path in run.glob("[!.]*"):
+    for path in run.glob("[!.]*") if run.is_dir() else [run]:
         with contextlib.suppress(OSError):  # removed in the meantime
             times.append(path.lstat().st_mtime)
     if not times:
@@ -158,16 +250,58 @@ def _changed(run: Path) -> str:
 
 def _content(run: Path) -> dict[str, object]:
     """Content of a run for the page: its table or estimate, and its files."""
-    files = _files(run)
+    files = files_of(run)
     return {
         **_summary(run.name, run),
         **_table(_text(run, "table.md")),
+        "study": _study(run),
         "estimate": _json(run, "estimate.json"),
         "campaign": _campaign(run),
         "curves": _curves(run),
         "figures": [name for name in files if name.endswith(".png")],
         "files": [name for name in files if not name.endswith(".png")],
     }
+
+
+def _study(run: Path) -> dict[str, object]:
+    """Answer, frontier and table by estimator of a study; empty where it is not finished."""
+    try:
+        table = table_of(run)
+    except ValueError:
+        return {}
+    answer, first = answered(table.rows, table.study, {}), table.only(table.rows[0].estimator)
+    best = frontier(table.rows)
+    points = [
+        {
+            "method": row.method,
+            "log_det": row.log_det_information,
+            "rate": row.violation_rate.estimate,
+            "interval": row.violation_rate.ci95,
+            "violations": violations_cell(row),
+            "is_best": row.method in best,
+        }
+        for row in first.rows
+    ]
+    estimators = dict.fromkeys(row.estimator for row in table.rows)
+    return {
+        "sentences": answer.sentences[:2],  # the third, on a search, is in the report
+        "estimator": answer.rows[0].estimator,
+        "tables": {name: _methods(table.only(name)) for name in estimators},
+        "points": json_ready(points),
+        "notes": footnotes(table.study),
+    }
+
+
+def _methods(table: StudyTable) -> dict[str, object]:
+    """The table of one estimator: a row a method, with the columns in which it is best."""
+    (header, cells), best = table.cells(), best_columns(table)
+    rows = []
+    for method, estimator, *numbers in cells:
+        is_own = estimator == table.rows[0].estimator  # or it is as published
+        columns = sorted(best[method]) if is_own else []
+        name = method if is_own else f"{method}, {estimator}"
+        rows.append({"cells": [name, *numbers], "best": [i - 1 for i in columns]})
+    return {"header": [header[0], *header[NUM_LABELS:]], "rows": rows}
 
 
 def _campaign(run: Path) -> dict[str, object]:

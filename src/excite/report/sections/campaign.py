@@ -58,7 +58,7 @@ class CampaignRun(Run):
         """The section of a campaign."""
         d, c = self.marker.plant, self.content
         with understood(self.marker.folder / "campaign.json", _ADVICE):
-            ended = str(c["reason"] or c["interrupted"] or "not ended")
+            title = f"{d.name}: {outcome(c)}"
             expected = f"Expected before the first round: {c['expected']}."
             parts = [
                 *([Paragraph(expected)] if c["expected"] else []),
@@ -90,9 +90,6 @@ class CampaignRun(Run):
                 *(again(self.marker.command, "") if self.marker.command else []),
                 Folded("The plant", [plant_facts(d)]),
             ]
-        count = len(c["rounds"])
-        played = f"{c['num_samples']} samples in {count} round{'s' * (count != 1)}"
-        title = f"{d.name}: {ended} ({played})"
         return Section(title, self.marker.folder, parts, _CODE)
 
     def _knowledge(self, name: str) -> list[Element]:
@@ -109,6 +106,13 @@ class CampaignRun(Run):
             "the records. Rounds end at the dotted lines."
         )
         return [Figure(drawn, f"{name}-known", caption, _KNOWLEDGE)]
+
+
+def outcome(content: Mapping[str, Any]) -> str:
+    """How a campaign ended, and after how many samples."""
+    ended = content["reason"] or content["interrupted"] or "not ended"
+    count = len(content["rounds"])
+    return f"{ended} ({content['num_samples']} samples in {count} round{'s' * (count != 1)})"
 
 
 def read_campaign(marker: Marker) -> CampaignRun:

@@ -16,14 +16,20 @@ from ...record import Record
 from ...record.figure import episode_figure
 from ..answer import told_of_identification
 from ..content import Answer, Bullets, Element, Figure, Folded, Heading, Paragraph, Section, Table
-from ..estimates import largest_correlation, parameter_cells, parameter_header, residual_cells
+from ..estimates import (
+    beside,
+    largest_correlation,
+    parameter_cells,
+    parameter_header,
+    residual_cells,
+)
 from ..figures import (
     autocorrelation_figure,
     correlation_figure,
     identification_figure,
 )
 from ..numbers import number
-from ..rows import EstimatedParameter, EstimateSummary
+from ..rows import EstimateSummary
 from .elements import (
     Marker,
     Run,
@@ -264,21 +270,5 @@ def _likely_command(result: EstimateSummary) -> str:
 
 def comparison(numbered: Mapping[str, Experiment]) -> list[Element]:
     """Estimates with intervals, and fits, of several experiments side by side, by title."""
-    header, experiments = ["", "unit", *numbered], list(numbered.values())
-    names = {n: p.unit for e in experiments for n, p in e.result.params.items()}
-    outputs = list(dict.fromkeys(n for e in experiments for n in e.result.fit_percent))
-    rows = [["status", "", *(e.result.status for e in experiments)]]
-    rows.append(["estimator", "", *(e.result.estimator for e in experiments)])
-    for name, unit in names.items():
-        rows.append([name, unit, *(_interval(name, e.result.params) for e in experiments)])
-    for output in outputs:
-        fits = [number(e.result.fit_percent.get(output), 4) for e in experiments]
-        rows.append([f"fit of {output}", "%", *fits])
+    header, rows = beside({title: experiment.result for title, experiment in numbered.items()})
     return [Table(header, rows, name="Experiments side by side")]
-
-
-def _interval(name: str, params: Mapping[str, EstimatedParameter]) -> str:
-    if name not in params:
-        return "–"
-    _, _, estimate, _, interval, _ = parameter_cells(name, params[name])
-    return estimate if interval == "–" else f"{estimate} ({interval})"

@@ -41,7 +41,7 @@ async function answered(address, request) {
   let response;
   try { response = await fetch(address, request); }
   catch { throw new Error("the server does not answer; is excite serve still running?"); }
-  if (!response.ok) throw new Error(await sentenceOf(response));
+  if (!response.ok) throw Object.assign(new Error(await sentenceOf(response)), { status: response.status });
   return response;
 }
 

@@ -8,10 +8,10 @@ import * as training from "./training.js";
 
 const parts = { experiment: null, record: null, runs, training };
 const isPart = (word) => Object.hasOwn(parts, word);
-/** The part of the page that the address names, and what in it: "#runs/frontier". */
+/** The part of the page that the address names, and what in it, as it is encoded there: "#runs/frontier". */
 function place() {
   const [word, what = ""] = location.hash.slice(1).split(/\/(.*)/s);
-  try { return [word, decodeURIComponent(what)]; } catch { return [word, what]; }
+  return [word, what];
 }
 const door = document.getElementById("door");
 

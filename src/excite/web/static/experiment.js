@@ -1,7 +1,7 @@
 // Choose a plant and an excitation, run the experiment, watch the estimates.
 
 import { command, download, el, get, options, say, symbol, Task, tell } from "./api.js";
-import { COLOURS } from "./curves.js";
+import { drawSignals, levelsOf, linesOf, passed, reach, signalPlots } from "./overlay.js";
 import { digits, empty, Plot, range, shown } from "./plot.js";
 
 const section = document.getElementById("experiment"), form = section.querySelector("form");
@@ -264,53 +264,19 @@ class Live {
   }
 }
 
-/** Both safety levels of an output, as bands with a name, in its shown unit. */
-function levelsOf({ warning_level: warning, critical_level: critical, factor }) {
-  const found = [["warning", warning, critical], ["critical", critical, null]].filter(([, level]) => level !== null);
-  return found.flatMap(([word, level, next]) => [1, -1].map((sign) => ({
-    y: sign * level * factor, until: next === null ? undefined : sign * next * factor, color: word, word: sign > 0 ? `${word} level` : "",
-  })));
-}
-
-/** The first time at which an output passed its critical level, or else its warning level. */
-function passed({ warning_level: warning, critical_level: critical, factor }, time, values, who = "") {
-  for (const [word, level] of [["critical", critical], ["warning", warning]]) {
-    const k = level === null ? -1 : values.findIndex((value) => Math.abs(value) >= level * factor);
-    if (k >= 0) return [{ x: time[k], color: word, word: `${who}${word} level passed at ${shown(time[k])} s` }];
-  }
-  return [];
-}
-
-function reach(part, values) {
-  const always = levelsOf(part).map(({ y }) => 1.1 * y), usual = 0.1 * part.scale * part.factor;
-  return range(values, ...(always.length ? always : [-usual, usual]));
-}
-
 /** All excitations in the same plots: inputs, true outputs, information and bounds over time. */
 function overlay({ plant, num_samples: count }, compared) {
   const parent = at("overlays"), x = [0, (count - 1) * plant.dt], unit = "s";
   if (!compared.length) return;
-  const title = (part) => el("span", {}, part.name, " ", el("span", { class: "unit" }, part.shown_unit));
-  const bound = (name) => el("span", {}, "bound of ", symbol(name), " ", el("span", { class: "unit" }, "%"));
-  parent.plots ??= [];
+  const bound = (name) => el("span", {}, "bound of ", symbol(name), " ", el("span", { class: "unit" }, "%")), all = "of all excitations over time";
   if (!parent.children.length) parent.plots = [
-    ...plant.inputs.map((part) => new Plot(parent, title(part), `${part.name} of all excitations over time`)),
-    ...plant.outputs.map((part) => new Plot(parent, title(part), `true ${part.name} of all excitations over time`)),
-    new Plot(parent, "information, log det M", "information of all excitations over time"),
-    ...plant.parameters.map(({ name }) => new Plot(parent, bound(name), `Cramér-Rao bound of ${name} of all excitations over time`)),
+    ...signalPlots(parent, plant, all, "true "),
+    new Plot(parent, "information, log det M", `information ${all}`),
+    ...plant.parameters.map(({ name }) => new Plot(parent, bound(name), `Cramér-Rao bound of ${name} ${all}`)),
   ];
-  const plots = [...parent.plots], lines = (more, pick) => compared.map((own, i) => ({ x: own.time, name: own.name, color: COLOURS[i % COLOURS.length], ...more, y: pick(own) }));
+  const plots = [...parent.plots], lines = (more, pick) => linesOf(compared, more, pick);
   const after = (values) => [null, ...values]; // there is nothing before the first input
-  plant.inputs.forEach((part, i) => {
-    const found = lines({ step: true, width: 1.2 }, (own) => [...own.inputs.map((row) => row[i]), null]);
-    plots.shift().show({ x, unit, y: range(found.flatMap(({ y }) => y), -part.amplitude, part.amplitude), lines: found });
-  });
-  plant.outputs.forEach((part, i) => {
-    const found = lines({}, (own) => own.outputs.map((row) => row[i] * part.factor)), plot = plots.shift();
-    const marks = found.flatMap(({ name, y }, k) => passed(part, compared[k].time, y, `${name}: `).filter(({ color }) => color === "critical"));
-    plot.show({ x, unit, y: reach(part, found.flatMap(({ y }) => y)), levels: levelsOf(part), marks, lines: found });
-    plot.note.textContent = marks.map(({ word }) => word).join("; ");
-  });
+  drawSignals(plots.splice(0, plant.inputs.length + plant.outputs.length), plant, compared);
   const gained = lines({}, (own) => after(own.log_det)), seen = gained.flatMap(({ y }) => y.slice(Math.ceil(y.length / 10))).filter(Number.isFinite);
   plots.shift().show({ x, unit, y: range(seen), lines: gained });
   for (const { name } of plant.parameters) {

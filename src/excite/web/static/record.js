@@ -197,7 +197,7 @@ function correlations(names, rows) {
     return shade;
   };
   at("correlations").querySelector("table").replaceChildren(
-    el("thead", {}, el("tr", {}, el("th"), ...names.map((name) => el("th", { scope: "col" }, symbol(name))))),
+    el("thead", {}, el("tr", {}, el("td"), ...names.map((name) => el("th", { scope: "col" }, symbol(name))))),
     el("tbody", {}, ...rows.map((row, i) => el("tr", {}, el("th", { scope: "row" }, symbol(names[i])), ...row.map(cell)))));
 }
 
@@ -221,7 +221,7 @@ const interval = ({ estimate, std_error: sd, ci95 }) => (Number.isFinite(ci95?.[
 /** The parameters of an identification as a table. */
 export function table(element, { params }) {
   element.replaceChildren(
-    el("thead", {}, el("tr", {}, ...["", "estimate", "95 % interval", "standard error", "unit"].map((text) => el("th", { scope: "col" }, text)))),
+    el("thead", {}, el("tr", {}, ...["parameter", "estimate", "95 % interval", "standard error", "unit"].map((text) => el("th", { scope: "col" }, text)))),
     el("tbody", {}, ...Object.entries(params).map(([name, p]) => el("tr", {},
       el("th", { scope: "row" }, symbol(name)),
       el("td", {}, shown(p.estimate, digits(p.estimate, p.std_error)) + (p.held ? " (held)" : "")),
