@@ -79,6 +79,7 @@ def test_the_evidence_is_the_likelihood_averaged_over_the_box():
     np.testing.assert_allclose(probabilities(found), np.exp(own) / np.sum(np.exp(own)))
 
 
+@pytest.mark.science
 def test_before_an_experiment_all_rivals_are_as_probable():
     found = ex.discriminate(RIVALS, steps=STEPS, coast=COAST)
     assert [r.probability for r in found.rivals] == [0.5, 0.5]
@@ -129,6 +130,7 @@ def test_the_bound_of_two_known_plants_is_that_of_kailath_and_holds():
         assert float(np.sum((one - other) ** 2)) / sd**2 < D
 
 
+@pytest.mark.science
 @pytest.mark.parametrize(
     ("plant", "own", "chosen"),
     [("aero2", {"J_p": 0.02}, "aero2"), ("aero2_lag", {"tau": 0.07}, LAG)],
@@ -150,6 +152,7 @@ def test_the_true_plant_is_chosen(designed, plant, own, chosen):
         assert abs(estimate - value) < 2 * half
 
 
+@pytest.mark.science
 def test_where_no_plant_explains_the_records_none_is_chosen():
     record = ex.simulate("aero2+drag", "prbs", params={"drag_pitch_rate": 3.0}, steps=60, seed=1)
     found = ex.discriminate(RIVALS, record)
@@ -204,6 +207,7 @@ def test_a_rival_with_another_level_is_refused():
         ex.discriminate([Weaker, "aero2"])
 
 
+@pytest.mark.science
 def test_of_a_record_with_a_gap_the_part_before_it_counts():
     record = ex.simulate("aero2_lag", "prbs", steps=60, params={"tau": 0.1}, seed=1)
     rows = np.r_[:30, 36:61]
@@ -265,6 +269,7 @@ def test_the_command_writes_the_signal_and_says_what_python_says(tmp_path):
 # -------------------------------------------------------------------------------- campaign
 
 
+@pytest.mark.science
 def test_a_campaign_tells_rivals_apart_before_it_identifies():
     campaign = ex.Campaign("aero2", {"J_p": "2%"}, rivals=[LAG], spread=0.3, coast=COAST)
     truth = {"J_p": 0.025, "tau": 0.15}

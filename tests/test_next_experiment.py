@@ -93,6 +93,7 @@ def test_a_redesign_is_safe_on_every_plant_that_is_possible_after_its_end_too(fo
     assert np.all(np.abs(made.inputs) <= plant.definition.inputs[0].upper)
 
 
+@pytest.mark.science
 def test_what_a_candidate_brings_is_the_cramer_rao_bound_with_what_was_known():
     record = ex.simulate("aero2", "chirp", steps=60, seed=1)
     result = ex.identify(record)

@@ -85,6 +85,7 @@ def test_the_prior_is_part_of_what_identifies_a_training():
     assert marks[0] == marks[1] != marks[2]
 
 
+@pytest.mark.science
 def test_a_study_has_the_gain_that_information_gain_computes(tmp_path):
     table = ex.run_study(study(), tmp_path / "run", workers=1)
     of_prbs, of_agent = (row.expected_gain for row in table.rows)
