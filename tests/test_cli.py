@@ -728,7 +728,7 @@ def test_a_benchmark_leaves_table_and_study(run, here):
     assert [(r["method"], r["estimator"]) for r in rows] == [
         ("random", "arx-rls"), ("prbs", "arx-rls"),
     ]  # fmt: skip
-    elsewhere = {"bound_by_length", "on_rig"}
+    elsewhere = {"bound_by_length", "on_rig", "expected_gain"}
     assert all(set(r) | elsewhere == documented("evaluate") for r in rows)
     assert "| prbs | as published |" in (folder / "table.md").read_text()
     table = list(csv.DictReader((folder / "table.csv").read_text().splitlines()))
