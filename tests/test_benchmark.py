@@ -442,7 +442,7 @@ def test_bounds_of_shorter_experiments_are_of_plants_of_the_declared_uncertainty
 def test_a_table_says_what_its_plants_differ_in():
     box = {"d_S": "10%", "initial_pitch": [-0.1, 0.1]}
     study = tiny(uncertainty=box, clairvoyant={"plants": 2, "starts": 1})
-    notes = " ".join(footnotes(benchmark.facts(study)))
+    notes = " ".join(footnotes(benchmark.facts(study), ()))
     assert "in addition d_S ± 10 %, initial_pitch -0.1 to 0.1" in notes
     assert "clairvoyant signals are for plants of the spread alone" in notes
-    assert "in addition" not in " ".join(footnotes(benchmark.facts(tiny())))
+    assert "in addition" not in " ".join(footnotes(benchmark.facts(tiny()), ()))

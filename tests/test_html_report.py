@@ -373,7 +373,7 @@ def assert_has_the_table_of_the_command_line(page: Page, folder: Path, capsys) -
     assert page.table_with("method", "estimator") == [table.cells()[0], *table.cells()[1]]
     for row in table.cells()[1]:
         assert all(cell in shown for cell in row)
-    for note in footnotes(table.study):
+    for note in footnotes(table.study, table.rows):
         assert note in page.words
         assert note in shown
     assert page.text.count('class="published"') + page.text.count('class="first published"') == len(

@@ -65,7 +65,7 @@ def test_more_noise_tells_less_and_a_policy_may_react():
     [
         ({"plants": 1}, "plants must be a whole number from 2"),
         ({"samples": 0}, "samples must be a whole number from 1"),
-        ({"prior": {"J_p": "uniform:0.01:0.03"}}, "a uniform prior is given as the spread"),
+        ({"prior": {"J_p": "uniform:-1:0.03"}}, "'J_p' is -1 to 0.03, and it must lie between 0"),
         ({"prior": {"M": "normal:1:1%"}}, "unknown aero2 parameter 'M'"),
         ({"spread": 1.5}, "such as factor:3: got 1.5"),
         ({"noise": {"pitch": 0.0}}, "a sensor without noise"),
@@ -84,5 +84,5 @@ def test_the_command_prints_bounds():
     assert run.returncode == 0, run.stderr
     told = json.loads(run.stdout)
     assert told["lower"]["nats"] <= told["upper"]["nats"] + 1e-9
-    assert told["prior"] == "normal in J_p, others 0.3"
+    assert told["prior"] == "lognormal in J_p, others 0.3"
     assert excite("gain", "aero2", "--params", "J_p=1").returncode == 2

@@ -222,6 +222,38 @@ def test_a_sample_that_is_missing_costs_the_two_steps_beside_it():
     y = (x[1:, 1] - (1 - DT) * x[:-1, 1])[kept]
     expected = np.linalg.lstsq(B, y)[0]
     np.testing.assert_allclose(list(found.params.values()), expected, rtol=1e-6)
+    told = found.fitted[0].computed["predicted"]
+    assert np.isnan(told[[0, 21]]).all()  # no step leads there
+    assert np.isfinite(np.delete(told, [0, 20, 21], axis=0)).all()
+
+
+def test_the_step_across_a_gap_is_left_out():
+    record = ex.simulate(Pushed, "prbs", steps=60, seed=4)
+    time = record.time + np.where(np.arange(61) > 30, 5.0, 0.0)
+    found = ex.identify(dataclasses.replace(record, time=time), Pushed)
+    x, u, kept = record.outputs, record.inputs[:-1], np.setdiff1d(np.arange(60), [30])
+    B = DT * np.column_stack([-x[:-1, 0], u[:, 0]])[kept]
+    expected = np.linalg.lstsq(B, (x[1:, 1] - (1 - DT) * x[:-1, 1])[kept])[0]
+    np.testing.assert_allclose(list(found.params.values()), expected, rtol=1e-6)
+
+
+def test_a_held_out_record_is_judged_by_the_noise_of_the_estimation():
+    record, same = (ex.simulate(Pushed, "prbs", steps=200, seed=seed) for seed in (5, 6))
+    loud = ex.simulate(Loud, "prbs", steps=200, seed=7)
+    found = ex.identify(record, Pushed, validate=[same, loud])
+    told = found.summary().validation
+    inside, outside = ((held.inside_band_percent or {})["v"] for held in told)
+    assert 90 < inside < 99
+    assert outside < 50  # five times the noise
+
+
+def test_a_fit_by_steps_has_no_initial_state_among_its_unknowns():
+    record = ex.simulate(Pushed, "prbs", steps=60, seed=4)
+    counts = [
+        ex.compare_plants(record, [Pushed, Loud], initial_state=state).plants[0].num_unknowns
+        for state in ("known", "free")
+    ]
+    assert counts == [4, 4]  # two parameters, and the noise of two outputs
 
 
 def test_the_bound_of_an_episode_is_that_of_its_steps():
@@ -235,6 +267,18 @@ def test_the_bound_of_an_episode_is_that_of_its_steps():
         scale = np.diag([p.scale for p in plant.definition.parameters])
         expected = scale @ (B.T @ B / SD[1] ** 2) @ scale
         np.testing.assert_allclose(found.information[i], expected, rtol=1e-9)
+
+
+class Loud(Pushed):
+    """The same with five times the noise."""
+
+    definition = dataclasses.replace(
+        Pushed.definition,
+        states=tuple(
+            dataclasses.replace(state, noise_sd=5 * state.noise_sd)
+            for state in Pushed.definition.states
+        ),
+    )
 
 
 class Hidden(Pushed):
@@ -271,7 +315,7 @@ def uneven(record):
         ),
         (
             lambda: ex.identify(uneven(ex.simulate(Pushed, "prbs")), Pushed),
-            "has process noise, and uneven times: use the estimator pem",
+            "times are uneven, and plant 'pushed' has process noise",
         ),
         (lambda: ex.Campaign(Pushed, {"a": "1%"}), "its information differs from record to record"),
         (lambda: State("x", "m", noise_sd=-1.0), "noise_sd of state 'x' must not be negative"),

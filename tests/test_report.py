@@ -229,7 +229,7 @@ def test_a_table_in_a_notebook_shows_signs_of_markup_as_they_are():
 
 def test_footnotes_tell_what_was_inferred_and_where_rows_were_published():
     table = table_of()
-    notes = footnotes(table.study)
+    notes = footnotes(table.study, table.rows)
     assert "Published rows: Table 9 of somebody." in notes
     assert notes[-1].startswith("Inferred")
     assert "the first thing; the second thing" in notes[-1]
@@ -237,7 +237,7 @@ def test_footnotes_tell_what_was_inferred_and_where_rows_were_published():
     assert text.startswith("# A title\n")
     assert all(f"\n{note}\n" in text for note in notes)
     bare = StudyTable(rows=ROWS, study=StudyFacts.model_validate(BARE))
-    assert len(footnotes(bare.study)) == 2
+    assert len(footnotes(bare.study, bare.rows)) == 2
     assert bare.markdown().startswith("# bare\n")
 
 
@@ -254,7 +254,7 @@ def test_footnotes_tell_what_was_inferred_and_where_rows_were_published():
     ],
 )  # fmt: skip
 def test_a_count_of_violations_comes_with_its_conditions(settings, words):
-    notes = footnotes(StudyFacts.model_validate({**STUDY, "note": "First.", **settings}))
+    notes = footnotes(StudyFacts.model_validate({**STUDY, "note": "First.", **settings}), ())
     assert notes[0] == "First."
     (note,) = (note for note in notes if note.startswith("Violations"))
     assert words in note

@@ -56,7 +56,13 @@ def study(**changes):
 
 def test_plants_of_a_study_are_drawn_from_its_prior():
     plant, keys = Aero2(), jax.random.split(jax.random.key(0), 2000)
+    uniform = plants_of(plant, {"K_pu": "uniform:0.01:0.02"}, 0.3)
+    values = np.asarray(run_episodes(plant, PRBS(), 2, 0.3, keys, prior=uniform).params.K_pu)
+    assert 0.01 < values.min() < 0.0101 < 0.0199 < values.max() < 0.02
+    assert abs(values.std() / (0.01 / math.sqrt(12)) - 1) < 0.03
+    assert str(uniform) == "uniform in K_pu, others 0.3"
     prior = plants_of(plant, PRIOR, 0.3)
+    assert str(prior) == "lognormal in J_p, normal in D_p, others 0.3"
     drawn = run_episodes(plant, PRBS(), 2, 0.3, keys, prior=prior).params
     assert abs(np.log(drawn.J_p / 0.02).std() - 0.1) < 0.006
     assert abs(drawn.D_p.mean() / 0.007 - 1) < 0.005
@@ -86,6 +92,21 @@ def test_the_prior_is_part_of_what_identifies_a_training():
 
 
 @pytest.mark.science
+def test_trainings_of_earlier_versions_keep_what_identifies_them():
+    """The fingerprint of several rewards, as it was before information had a price of changes."""
+    terms = [{"reward": "information"}, {"reward": "log", "weight": 0.5}]
+    agents = {"a": {"method": "gradient", "decision": {"terms": terms}}}
+    old = study(prior={}, gain=None, agents=agents)
+    mark = "541fbdfe34d5b5344d56731e16031d914917632a787c369b12ee43b9a1db2248"
+    assert fingerprint(old, old.build_plant(), "a") == mark
+
+
+@pytest.mark.parametrize("objective", ["log", ["relative", "goals"]])
+def test_a_price_of_changes_needs_information(objective):
+    with pytest.raises(ValueError, match="it needs the objective D, A or E, got"):
+        ex.train("aero2", objective=objective, change_price=0.1)
+
+
 def test_a_study_has_the_gain_that_information_gain_computes(tmp_path):
     table = ex.run_study(study(), tmp_path / "run", workers=1)
     of_prbs, of_agent = (row.expected_gain for row in table.rows)
@@ -191,12 +212,23 @@ def test_train_and_evaluate_take_a_prior(tmp_path):
     ("changes", "words"),
     [
         ({"rig": {}}, "rig is for plants of the spread: leave it or the prior out"),
-        ({"prior": {}, "gain": {}, "rig": {}, "agents": {}}, "leave gain or the rig out"),
+        ({"prior": {}, "gain": {}, "rig": {}, "agents": {}}, "leave it or rig out"),
         ({"uncertainty": {"d_S": "10%"}}, "uncertainty is for plants of the spread"),
         ({"clairvoyant": {}, "agents": {}}, "clairvoyant is for plants of the spread"),
         ({"prior": {"J_q": "normal:1:1"}}, "did you mean 'J_p'"),
-        ({"prior": {"J_p": "uniform:0.01:0.03"}}, "a uniform prior is given as the spread"),
+        ({"prior": {"J_p": "uniform:-1:0.03"}}, "'J_p' is -1 to 0.03, and it must lie between 0"),
+        ({"prior": {"J_p": "normal:0.02:30%"}}, "'J_p' reaches below zero"),
+        ({"prior": {"J_p": "normal:0.02:-1"}}, "needs finite numbers, SD and"),
         ({"prior": {"J_p": "normal:0.02"}}, "prior of 'J_p' must be normal:MEAN:SD"),
+        ({"prior": {}, "uncertainty": {"d_S": "10%"}}, "leave it or uncertainty out"),
+        (
+            {"agents": {"a": {"method": "gradient", "decision": {"uncertainty": {"d_S": "10%"}}}}},
+            "uncertainty is for plants of the spread",
+        ),
+        (
+            {"agents": {"a": {"decision": {"reward": "relative", "estimator": "nls"}}}},
+            "the reward 'relative' of nls is for plants of the spread",
+        ),
         ({"gain": {"plants": 1}}, "gain.plants"),
         ({"gain": {"sample": 9}}, "did you mean 'samples'"),
         (

@@ -345,11 +345,14 @@ def function_at(path: Path, word: str) -> Callable[..., Any]:
 def module_at(path: Path) -> Any:
     """The module in a user's file, whose code is run; ValueError where it cannot be imported.
 
-    It is run again when the file has changed: programs that were compiled for its classes serve as
-    long as these are the same. No compiled code is written beside the file.
+    It is run again when the file itself has changed, not what it reads: programs compiled for its
+    classes serve as long as these are the same. No compiled code is written beside the file.
     """
     name, place = f"excite_file_{path.stem}", path.resolve()
-    source = place.read_bytes() if place.is_file() else b""
+    try:
+        source = place.read_bytes()
+    except OSError:
+        source = b""  # the import says why
     known = sys.modules.get(name)
     if known is not None and getattr(known, _SOURCE, None) == (place, source):
         return known

@@ -29,12 +29,12 @@ def report(
     FILE.md and FILE.tex have their figures in the folder FILE_files beside them. FILE.ipynb reads
     the runs in Python, draws their figures, and is not executed yet.
     """
-    from ..report.report import figures_of
+    from ..report.report import figures_of, format_of
     from ..report.report import report as verb
 
     with progress_bar("report") as progress:
         page = verb(runs, out, format=format, overwrite=overwrite, progress=progress).encode()
-    figures, size = figures_of(out), f"{len(page) / 1e6:.2g} MB"
+    figures, size = figures_of(out, format_of(out, format)), f"{len(page) / 1e6:.2g} MB"
     if as_json:
         content = {"file": str(out), "runs": [str(run) for run in runs], "bytes": len(page)}
         show_json({**content, "figures": None if figures is None else str(figures)})

@@ -132,9 +132,10 @@ def transitions(
     """
     e = experiments
     if e.dt is not None or plant.delay(plant.nominal) is not None:
-        what = "uneven times" if e.dt is not None else "an input delay"
+        what = "times are uneven" if e.dt is not None else "an input is delayed"
         raise ValueError(
-            f"plant {plant.definition.name!r} has process noise, and {what}: use the estimator pem"
+            f"{what}, and plant {plant.definition.name!r} has process noise in every step: use the "
+            "estimator pem"
         )
 
     def steps(rows: Array) -> Array:

@@ -139,7 +139,7 @@ def sampled_as(records: Sequence[Record], plant: AbstractPlant) -> AbstractPlant
     It is rounded, because it enters the plant's hash. Where the steps differ, the longest
     is integrated no more coarsely than in the definition.
     """
-    first, own = records[0].dt, float(plant.dt)
+    first, own = _mean_step(records[0].time[parts_of(records[0])[0]]), float(plant.dt)
     usual = own if abs(first - own) < 1e-6 * own else float(f"{first:.6g}")
     sampled = plant.changed(dt=usual)
     if _are_even(records, usual):
@@ -149,10 +149,14 @@ def sampled_as(records: Sequence[Record], plant: AbstractPlant) -> AbstractPlant
     return eqx.tree_at(lambda p: p.dt, longest, sampled.dt)
 
 
+def _mean_step(time: Float[np.ndarray, " sample"]) -> float:
+    return float((time[-1] - time[0]) / (time.size - 1))
+
+
 def _are_even(records: Sequence[Record], dt: float) -> bool:
     """Whether all parts of the records are sampled with this time."""
     parts = [record.time[part] for record in records for part in parts_of(record)]
-    own = [(time[-1] - time[0]) / (time.size - 1) for time in parts]
+    own = list(map(_mean_step, parts))
     return all(map(is_even, parts)) and bool(np.allclose(own, dt, rtol=1e-3, atol=0))
 
 

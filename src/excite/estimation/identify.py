@@ -225,7 +225,7 @@ def identify(
         initial_state == "auto" and all(starts_at(record, plant) for record in records)
     )
     num_free, num_priors = int(np.sum(~known_parameters(plant, estimator))), _priors(estimator)
-    require_enough(plant, records, num_free, known, num_priors)
+    require_enough(plant, records, num_free, known or by_steps, num_priors)
     way = way_to_state(validate_state)
     shares = [state_from(record, plant, way) for record in validation]
     for record in validation:
@@ -247,8 +247,7 @@ def identify(
         raise _with_causes(str(refusal) + too, find(refusal.fit, False)[0]) from None
     params, prediction = fit.estimate.params, fit.estimate.prediction
     if by_steps:
-        own = seen, whole, experiments, params, np.asarray(fit.estimate.residual)
-        error, prediction = predicted_in_steps(*own)
+        error, prediction = predicted_in_steps(seen, whole, experiments, params)
         residual = by_record(records, error)
     else:
         residual = _residuals(plant, records, experiments, estimator, fit)
@@ -322,10 +321,10 @@ def identify(
         suspects=found,
         fitted=fitted,
         validation=tuple(
-            validated(plant, record, linear, estimator, fit.estimate, share)
+            validated(plant, record, linear, estimator, fit.estimate, prediction, share)
             for record, share in zip(validation, shares, strict=True)
         ),
-        initial_state_known=known,
+        initial_state_known=known or by_steps,
         noise=_noise(plant.definition, prediction),
         starts=tuple(float(end.cost) for end in (fit.estimate, *fit.others)) if fit.others else (),
         profiles=profiles,

@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, PRNGKeyArray
 
-from ..description import LARGEST_SEED, SpreadLike, names_of, require_whole
+from ..description import LARGEST_SEED, SpreadLike, require_whole
 from ..excitation import AbstractExcitation
 from ..excitation.catalogue import ExcitationLike
 from ..information import require_bound
@@ -287,8 +287,7 @@ def information_gain(
     Args:
         plant: as for `simulate`, and so are `excitation`, `options`, `steps`, `noise` and
             `resolution`. An encoder's step counts as noise of its own standard deviation.
-        prior: normal and lognormal distributions of parameters, as for `identify`, or an earlier
-            run.
+        prior: distributions of parameters, as for `identify`, or an earlier run.
         spread: of parameters without such a distribution: uniform, in the logarithm for a factor
             (`factor:3`).
         plants: that are drawn, each with a record.
@@ -303,7 +302,7 @@ def information_gain(
 
     Raises:
         ValueError: as `simulate`, for a sensor without noise, for process noise of a state that is
-            not observed, and for a uniform prior: give its range as the spread.
+            not observed.
         TypeError: for an argument of another type.
     """
     require_whole("plants", plants, 2, 1_000_000)
@@ -315,12 +314,6 @@ def information_gain(
     )  # fmt: skip
     require_bound(e.plant)
     population = plants_of(e.plant, prior, spread)
-    reach, normal = population.spread, population.normal
-    words = str(reach)
-    if prior is not None:
-        names = () if normal is None else normal.names
-        rest = [n for n in names_of(e.plant.definition.parameters) if n not in names]
-        words = f"normal in {', '.join(names)}" + f", others {reach}" * bool(rest)
     keys = jax.random.split(jax.random.key(seed), plants)
     parts = []
     for first in range(0, plants, 4 * _CHUNK):
@@ -348,7 +341,7 @@ def information_gain(
         plant=e.plant.definition.name,
         excitation=e.name,
         num_steps=e.num_steps,
-        prior=words,
+        prior=str(population),
         lower=lower,
         upper=upper,
         laplace=laplace,

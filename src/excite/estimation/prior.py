@@ -139,6 +139,12 @@ class Prior(eqx.Module):
         parts = zip(self.names, self.logarithmic, np.asarray(self.mean).tolist(), strict=True)
         return {name: math.exp(mean) if is_log else mean for name, is_log, mean in parts}
 
+    def below_zero(self) -> list[str]:
+        """Names of parameters that are normal, and negative more often than once in 30,000."""
+        sd = np.linalg.norm(np.linalg.inv(np.asarray(self.root)), axis=1)
+        parts = zip(self.names, self.logarithmic, np.asarray(self.mean), sd, strict=True)
+        return [name for name, is_log, mean, own in parts if not is_log and mean < 4 * own]
+
     def contradicted(self, values: Mapping[str, float], sd: Mapping[str, float]) -> list[str]:
         """Names of parameters in which the data contradict the distribution; see `verdict`."""
         start = _CONTRADICTED.format("")
@@ -179,11 +185,26 @@ class PriorPlants(eqx.Module):
         plant: has the parameters.
         normal: distribution of some parameters, or of their logarithms; None for none.
         spread: of the others, which are uniform in their box.
+        ranges: name, lowest and highest value of parameters that are uniform between these.
     """
 
     plant: AbstractPlant
     normal: Prior | None
     spread: Spread = eqx.field(static=True)
+    ranges: tuple[tuple[str, float, float], ...] = eqx.field(static=True, default=())
+
+    def __str__(self) -> str:
+        """The distributions in words."""
+        given: dict[str, list[str]] = {}
+        if (normal := self.normal) is not None:
+            for name, is_log in zip(normal.names, normal.logarithmic, strict=True):
+                given.setdefault("lognormal" if is_log else "normal", []).append(name)
+        if self.ranges:
+            given["uniform"] = [name for name, *_ in self.ranges]
+        words = [f"{kind} in {', '.join(names)}" for kind, names in given.items()]
+        count = sum(map(len, given.values()))
+        others = "others " * bool(count) + str(self.spread)
+        return ", ".join([*words, *([others] if count < len(self.plant.nominal) else [])])
 
     def draw(self, key: PRNGKeyArray) -> Params:
         """The parameters of a plant drawn from the prior."""
@@ -197,6 +218,9 @@ class PriorPlants(eqx.Module):
         names = names_of(self.plant.definition.parameters)
         spread = jnp.eye(len(names)) * prior_sd_of(self.spread)
         changes = spread * relative_size(self.plant, params)[:, None]
+        for name, low, high in self.ranges:
+            i = names.index(name)
+            changes = changes.at[i, i].set((high - low) / math.sqrt(12))
         if (normal := self.normal) is not None:
             index = np.array([names.index(name) for name in normal.names])
             size = jnp.where(np.array(normal.logarithmic), jnp.stack(params)[index], 1.0)
@@ -213,6 +237,8 @@ class PriorPlants(eqx.Module):
             drawn = self.normal.mean + jnp.linalg.solve(self.normal.root, z[index])
             parts = zip(names, self.normal.logarithmic, drawn, strict=True)
             values = {n: jnp.exp(v) if is_log else v for n, is_log, v in parts}
+        for name, low, high in self.ranges:
+            values[name] = low + (high - low) * ndtr(z[names_of(d.parameters).index(name)])
         for i, parameter in enumerate(d.parameters):
             if parameter.name not in values:
                 unit, nominal = 2 * ndtr(z[i]) - 1, self.plant.nominal[i]

@@ -33,19 +33,32 @@ def plants_of(
 
     Args:
         plant: has the parameters.
-        prior: normal and lognormal distributions, see `identify`.
+        prior: distributions of parameters, see `identify`.
         spread: of parameters without one.
 
     Raises:
-        ValueError: as `with_prior`, and for a uniform prior.
+        ValueError: as `with_prior`, and for a uniform prior beyond a parameter's bounds.
         TypeError: for something else than a prior.
     """
-    reach, normal = Spread.of(spread), None
-    if prior is not None:
-        narrowed, normal, _ = with_prior(plant, prior, plant.nominal, {}, {})
-        if narrowed is not plant:
-            raise ValueError("a uniform prior is given as the spread")
-    return PriorPlants(plant, normal, reach)
+    reach = Spread.of(spread)
+    if prior is None:
+        return PriorPlants(plant, None, reach)
+    normal, bounds = _separated(plant, prior, {})
+    for name, low, high in bounds:
+        least, most = plant.definition.parameter(name).support
+        if not (least <= low and high <= most):
+            raise ValueError(
+                f"the prior of {name!r} is {low:g} to {high:g}, and it must lie between {least:g} "
+                f"and {most:g}"
+            )
+    joint = Prior.joined(normal) if normal else None
+    for name in () if joint is None else joint.below_zero():
+        if plant.definition.parameter(name).positive:
+            raise ValueError(
+                f"the normal prior of {name!r} reaches below zero, where there is no plant: take a "
+                "lognormal or a narrower one"
+            )
+    return PriorPlants(plant, joint, reach, tuple(bounds))
 
 
 def with_prior(
@@ -70,6 +83,22 @@ def with_prior(
         ValueError: for a prior that is none, or excludes the start.
         TypeError: for something else.
     """
+    normal, bounds = _separated(plant, given, hold)
+    joint = Prior.joined(normal) if normal else None
+    chosen = {*_names(start), *_names(hold)}
+    for name, mean in joint.center().items() if joint else ():
+        lower, upper = plant.definition.parameter(name).support
+        if name not in chosen and lower < mean < upper:
+            begin = begin._replace(**{name: floats(mean)})
+    return bounded(plant, bounds, begin), joint, begin
+
+
+def _separated(
+    plant: AbstractPlant,
+    given: PriorLike | Sequence[PriorLike],
+    hold: Mapping[str, float] | Params,
+) -> tuple[list[Prior], list[tuple[str, float, float]]]:
+    """Normal priors, and name, lowest and highest value of uniform ones."""
     is_one = isinstance(given, Mapping | str | Path | Identification | Prior)
     if not is_one and not isinstance(given, Sequence):
         raise wrong_type("prior", given, _ALLOWED)
@@ -98,13 +127,7 @@ def with_prior(
     for name in named:
         if named.count(name) > 1:
             raise ValueError(f"parameter {name!r} has two priors; give one")
-    joint = Prior.joined(normal) if normal else None
-    chosen = {*_names(start), *_names(hold)}
-    for name, mean in joint.center().items() if joint else ():
-        lower, upper = plant.definition.parameter(name).support
-        if name not in chosen and lower < mean < upper:
-            begin = begin._replace(**{name: floats(mean)})
-    return bounded(plant, bounds, begin), joint, begin
+    return normal, bounds
 
 
 def _names(values: Mapping[str, float] | Params) -> Sequence[str]:
@@ -136,7 +159,10 @@ def _parsed(name: str, text: object, plant: AbstractPlant) -> tuple[str, float, 
     is_ordered = first < second if kind == "uniform" else second > 0
     is_allowed = first > 0 if kind == "lognormal" else not (is_part and kind == "uniform")
     if not (math.isfinite(first) and math.isfinite(second) and is_ordered and is_allowed):
-        raise wrong
+        raise ValueError(
+            f"prior of {name!r} needs finite numbers, SD and a lognormal MEDIAN above 0, and "
+            f"LOWEST below HIGHEST: got {text!r}"
+        )
     if kind == "lognormal" and not plant.definition.parameter(name).positive:
         raise ValueError(f"{name!r} may be negative and has no lognormal prior; give a normal one")
     return kind, first, second

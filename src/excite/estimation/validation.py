@@ -28,7 +28,7 @@ from .contract import (
 from .diagnosis import fit_percent
 from .fit import with_initial_state
 from .from_records import by_record, experiments_of, parts_of, starts_at
-from .nls import NLS, Problem
+from .nls import Problem
 from .pem import PEM
 from .result import Fitted, Predicted
 
@@ -56,21 +56,29 @@ def predicted_in_steps(
     whole: Experiments,
     steps: Experiments,
     params: Params,
-    residual: Float[np.ndarray, "step 2 output"],
+    process_noise: Float[np.ndarray, " state"] | None = None,
 ) -> tuple[Float[np.ndarray, "experiment sample output"], Prediction]:
     """The residual of whole experiments, and their one-step prediction.
+
+    Both are NaN where no step from a measured state leads.
 
     Args:
         plant: whose sensor has the noise of the process.
         whole: the experiments.
         steps: their `transitions`.
-        residual: of these.
+        params: estimated from these, or from other experiments.
+        process_noise: diffusion of each state; default that of the residual.
     """
-    own, found = jax.device_put((params, residual))
-    sd = Problem(plant, steps, own, None).noise_sd(found)
-    error = of_transitions(whole, jnp.where(steps.valid, found, jnp.nan))
+    own = jax.device_put(params)
+    simulated = simulate_experiments(plant, own, steps, steps.initial_state)
+    residual = residual_of(steps, simulated)
+    if process_noise is None:
+        sd = Problem(plant, steps, own, None).noise_sd(residual)
+    else:
+        sd = jnp.asarray(process_noise) * jnp.sqrt(plant.dt)
+    error = of_transitions(whole, jnp.where(steps.valid, residual, jnp.nan))
     prediction = Prediction(
-        outputs=whole.measured - jnp.nan_to_num(error),  # without a step before: as measured
+        outputs=whole.measured - error,
         sd=jnp.broadcast_to(sd, error.shape),
         process_noise=sd / jnp.sqrt(plant.dt),
         noise_sd=jnp.zeros_like(sd),
@@ -196,18 +204,23 @@ def validated(
     linear: np.ndarray,
     estimator: AbstractEstimator,
     estimate: Estimate,
+    fitted: Prediction | None,
     share: float | None,
 ) -> Fitted:
-    """A held-out record with its simulation and prediction; `share`: see `state_from`."""
+    """A held-out record with its simulation and prediction.
+
+    Args:
+        fitted: prediction of the records of the estimation, whose noise this one has.
+        share: see `state_from`.
+    """
     experiments, prediction = experiments_of(plant, [record], False, linear), None
-    if isinstance(estimator, PEM) and estimate.prediction is not None:
-        found = jax.device_put((estimate.params, estimate.prediction))
-        prediction = jax.device_get(estimator.predict(plant, experiments, *found))
-    elif isinstance(estimator, NLS) and plant.definition.observes_state:
+    if isinstance(estimator, PEM) and fitted is not None:
+        own = jax.device_put((estimate.params, fitted))
+        prediction = jax.device_get(estimator.predict(plant, experiments, *own))
+    elif fitted is not None:
         seen, steps = transitions(plant, experiments)
-        own = jax.device_put(estimate.params)
-        error = residual_of(steps, simulate_experiments(seen, own, steps, steps.initial_state))
-        prediction = predicted_in_steps(seen, experiments, steps, own, np.asarray(error))[1]
+        own = estimate.params, np.asarray(fitted.process_noise)
+        prediction = predicted_in_steps(seen, experiments, steps, *own)[1]
     residual, fits = _begun(plant, record, experiments, estimator, estimate, share)
     if fits is None:
         raise ValueError(
@@ -220,8 +233,8 @@ def validated(
         if rest is not None:
             percent = " and ".join(f"{fit:.4g} %" for fit in rest.values())
             words += f" (from its first {100 * _SHARE:.0f} %, the rest fits {percent})"
-    fitted = _fitted(plant.definition, record, residual, *_predicted(plant, [record], prediction))
-    return dataclasses.replace(fitted, fit_percent=fits, initial_state=words)
+    found = _fitted(plant.definition, record, residual, *_predicted(plant, [record], prediction))
+    return dataclasses.replace(found, fit_percent=fits, initial_state=words)
 
 
 def _begun(

@@ -17,7 +17,7 @@ from ..description import RARE, Output, PlantDescription, display_unit, listed
 from ..record import Record
 from .numbers import digits_for, number
 from .rows import EstimatedParameter, EstimateSummary, Row, StudyFacts
-from .study_table import NUM_LABELS, StudyTable, violations_cell
+from .study_table import NUM_LABELS, StudyTable, gain_cell, violations_cell
 from .tables import Table
 
 KNOWS_THE_PLANT = "clairvoyant"  # a reference, and no excitation that could be played
@@ -26,6 +26,7 @@ _OFTEN = 0.05  # of the experiments: an estimator that fails more often is not c
 _NEARLY = 1.05  # a ratio of standard errors below it is no difference
 _MOST_ROWS = 14  # of a table that fits a screen
 _MOST_PARAMETERS = 6  # of a sentence
+_EVEN = 0.95  # an interval whose sides differ by more is no ± of the estimate
 
 
 @dataclass(frozen=True)
@@ -48,9 +49,11 @@ class Answer:
     def table(self) -> Table:
         """At most one screen: information, errors and violations of each excitation."""
         names = self.rows[0].parameters
-        header = ["excitation", "log det", *(f"{name} error %" for name in names), "violations"]
+        gains = ["gain nats"] * any(row.expected_gain is not None for row in self.rows)
+        header = ["excitation", *gains, "log det", *(f"{n} error %" for n in names), "violations"]
         return header, [
-            [row.method, f"{row.log_det_information:.2f}",
+            [row.method, *(gain_cell(row.expected_gain) for _ in gains),
+             f"{row.log_det_information:.2f}",
              *(number(row.relative_error_percent[name].mean, 3) for name in names),
              violations_cell(row)]
             for row in self.rows[:_MOST_ROWS]
@@ -249,10 +252,14 @@ def told_of_identification(result: EstimateSummary) -> tuple[str, ...]:
 
 def _in_words(p: EstimatedParameter) -> str:
     """An estimate with half of its interval."""
-    shown = f"{number(p.estimate, digits_for(p.estimate, p.std_error))} {p.unit}".strip()
-    half = max(abs(end - p.estimate) for end in p.ci95)
+    digits = digits_for(p.estimate, p.std_error)
+    shown = f"{number(p.estimate, digits)} {p.unit}".strip()
+    smaller, half = sorted(abs(end - p.estimate) for end in p.ci95)
     if not math.isfinite(half):
         return f"{shown} (its interval is open)"
+    if smaller < _EVEN * half:
+        low, high = (number(end, digits) for end in p.ci95)
+        return f"{shown} ({low} to {high})"
     relative = f"{100 * half / abs(p.estimate):.2g} %" if p.estimate else f"{half:.2g} {p.unit}"
     return f"{shown} ± {relative.strip()}"
 
@@ -280,7 +287,7 @@ def _believed(result: EstimateSummary) -> str:
             f"are to be doubted{wider}"
         )
     if coloured:
-        return f"the residual of {listed(coloured)} is not white, as noise of the sensor would be"
+        return f"the residual of {listed(coloured)} is not white, as noise would be"
     if not any(map(math.isfinite, tested)):
         return "the residual is too small or too short to be tested"
     more = ", but read what can be identified" * (len(result.verdict) > 1)

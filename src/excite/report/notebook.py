@@ -49,7 +49,7 @@ def _cells(document: Document, paths: Sequence[str]) -> Iterator[tuple[dict[str,
         answers = [markdown(part) for part in section.body if isinstance(part, content.Answer)]
         head = [f"## {text(title)}"] * several
         yield _TEXT, "\n\n".join([*head, source(section), *answers])
-        yield _CODE, f"run = Path({json.dumps(path)})\n\n{section.code}"
+        yield _CODE, f"run = Path({path!r})\n\n{section.code}"
         for part in section.body:
             if isinstance(part, content.Figure) and part.code:
                 yield _TEXT, text(part.caption)

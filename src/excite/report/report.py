@@ -67,7 +67,7 @@ def report(
             and a file or folder that exists, unless `overwrite`.
     """
     path = None if out is None else path_from("out", out)
-    kind = _format_of(path, format)
+    kind = format_of(path, format)
     if path is not None:
         _require_free(path, kind, overwrite)
     given = [runs] if isinstance(runs, str | Path) else runs
@@ -79,17 +79,16 @@ def report(
         page, files = report_html(paths, progress), {}
     else:
         page, files = _page(kind, paths, path, progress)
-    if path is not None and (folder := figures_of(path)):
+    if path is not None and (folder := figures_of(path, kind)):
         write_with_files(path, page.encode(), folder, files)
     elif path is not None:
         write_bytes(path, page.encode())
     return page
 
 
-def figures_of(out: Path) -> Path | None:
+def figures_of(out: Path, kind: str) -> Path | None:
     """The folder of a report's figures; None where they are in the report itself."""
-    has_files = out.suffix.lower()[1:] in _WITH_FIGURES
-    return out.with_name(f"{out.stem}_files") if has_files else None
+    return out.with_name(f"{out.stem}_files") if kind in _WITH_FIGURES else None
 
 
 def _page(
@@ -99,7 +98,7 @@ def _page(
     every, place = read_runs(paths), Path() if out is None else out.parent
     with drawing():
         document = described(every, paths, progress)
-        folder = None if out is None else figures_of(out)
+        folder = None if out is None else figures_of(out, kind)
         if folder is None:
             places = [Path(os.path.relpath(path, place)).as_posix() for path in paths]
             return notebook_page(document, places), {}
@@ -117,7 +116,7 @@ def _drawn(figure: Figure, ending: str) -> bytes:
         return image(figure.drawn, ending)
 
 
-def _format_of(out: Path | None, format: str | None) -> str:
+def format_of(out: Path | None, format: str | None) -> str:
     """The format that was asked for; ValueError where that is none, or two."""
     if format is not None and format not in FORMATS:
         raise unknown("format", str(format), FORMATS)
@@ -126,6 +125,8 @@ def _format_of(out: Path | None, format: str | None) -> str:
             raise ValueError(f"a report in the format {format} needs out: its figures are files")
         return format or "html"
     ending = out.suffix.lower()
+    if ending[1:] not in FORMATS and format is not None:
+        return format
     if ending[1:] not in FORMATS:
         raise ValueError(f"{out}: reports end in {', '.join(f'.{name}' for name in FORMATS)}")
     if format not in (None, ending[1:]):
@@ -136,15 +137,20 @@ def _format_of(out: Path | None, format: str | None) -> str:
 def _require_free(out: Path, kind: str, overwrite: bool) -> None:
     """Raises ValueError, before anything is drawn, where a report may not be written."""
     require_new_file(out, overwrite)
-    folder = figures_of(out)
+    folder = figures_of(out, kind)
     if folder is None:
         return
     if kind == "tex" and not _LATEX_NAME.fullmatch(out.name):
-        raise ValueError(f"{out}: LaTeX finds no figures of a file with such a name")
+        raise ValueError(
+            f"{out}: LaTeX finds no figures of a file with such a name; take letters, digits, "
+            "blanks and . + = , _ - alone"
+        )
     if not (folder.exists() or folder.is_symlink()):
         return
     is_own = folder.is_dir() and not folder.is_symlink()
-    if not is_own or not all(_OWN.fullmatch(file.name) for file in folder.iterdir()):
-        raise ValueError(f"{folder} is no folder of a report's figures; choose another name")
+    others = [f.name for f in folder.iterdir() if not _OWN.fullmatch(f.name)] if is_own else []
+    if not is_own or others:
+        what = f"has other files ({others[0]})" if others else "is no folder of a report's figures"
+        raise ValueError(f"{folder} {what}; choose another name")
     if any(folder.glob(f"*.{_WITH_FIGURES[kind][1]}")) and not overwrite:
         raise ValueError(f"{folder} has figures; choose another name or add --overwrite")

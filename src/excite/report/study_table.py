@@ -330,8 +330,8 @@ def _published_cells(rows: Sequence[Row], row: Row, published: PublishedRow) -> 
     return cells
 
 
-def footnotes(study: StudyFacts, rows: Sequence[Row] = ()) -> list[str]:
-    """The footnotes of the table; the rows are those whose warnings are told."""
+def footnotes(study: StudyFacts, rows: Sequence[Row]) -> list[str]:
+    """The footnotes of the table."""
     notes = [study.note] * bool(study.note) + [
         "Errors are relative errors in percent, mean ± standard deviation over the estimates "
         "that did not fail. The bound is the mean Cramér-Rao bound of the same data, a standard "
@@ -340,9 +340,10 @@ def footnotes(study: StudyFacts, rows: Sequence[Row] = ()) -> list[str]:
     if study.agents:
         notes.append(
             f"Agents: cross-seed mean ± standard deviation of the mean errors of {study.seeds} "
-            f"training seeds, {study.episodes} evaluation episodes each, over viable seeds (a "
-            "seed has collapsed where the RMS input is below 1 % of its limit); failures over "
-            "all evaluations of all seeds. The policy is evaluated without exploration noise."
+            f"training seed{'s' * (study.seeds > 1)}, {study.episodes} evaluation episodes each, "
+            "over viable seeds (a seed has collapsed where the RMS input is below 1 % of its "
+            "limit); failures over all evaluations of all seeds. The policy is evaluated without "
+            "exploration noise."
         )
     notes.append(violations_note(study))
     if study.clairvoyant:
@@ -353,22 +354,17 @@ def footnotes(study: StudyFacts, rows: Sequence[Row] = ()) -> list[str]:
             f"as if its parameters were known ({study.clairvoyant.starts} starts, "
             f"{study.clairvoyant.updates:,} updates); it is no upper limit."
         )
-    if study.gain is not None:
-        samples = f"{study.gain['samples']:,} samples"
-        kind = f"{samples} of the prior: figures of other numbers cannot be compared"
-        kind = kind if study.gain["from_prior"] else f"{samples} near the posterior"
+    gains = {row.method: row.expected_gain for row in rows if row.expected_gain is not None}
+    for gain in list(gains.values())[:1]:  # alike in all rows
+        kind = "near the posterior"
+        if gain.from_prior:
+            kind = "of the prior: figures of other numbers cannot be compared"
         notes.append(
             "gain is the expected information gain: mean and standard error over "
-            f"{study.gain['plants']:,} plants, its evidence from {kind}. Two figures are a lower "
-            "and an upper bound."
+            f"{gain.plants:,} plants, its evidence from {gain.samples:,} samples {kind}. "
+            "Two figures are a lower and an upper bound."
         )
-        told = {
-            f"{row.method}: {warning}."
-            for row in rows
-            if row.expected_gain is not None
-            for warning in row.expected_gain.warnings
-        }
-        notes += sorted(told)
+    notes += [f"{method}: {told}." for method, gain in gains.items() for told in gain.warnings]
     if study.uncertainty:
         signals = "; the clairvoyant signals are for plants of the spread alone"
         notes.append(

@@ -188,7 +188,7 @@ class Agent:
             num_steps: of an experiment.
             ranges: declared uncertainty of the study.
             coast: of the study.
-            prior: of the study, in place of the spread; information is then rewarded in nats.
+            prior: of the study, in place of the spread; the criterion D is then rewarded in nats.
 
         Raises:
             ValueError: for a target, output or input that does not exist, an amplitude
@@ -204,6 +204,8 @@ class Agent:
             )
         if prior is not None and decision.spread is not None:
             raise ValueError("an agent of a study with a prior has that prior: leave spread out")
+        if prior is not None and ranges:
+            raise ValueError("uncertainty is for plants of the spread: leave it or the prior out")
         if coast and self.method == "ppo":
             raise ValueError("ppo does not train on the coast: take the method gradient")
         return Env.of(
@@ -262,10 +264,11 @@ class Agent:
             _require_used(_kind(form, chosen, self.estimators), chosen.model_fields_set)
         targets = target_mask(plant.definition, self.targets)
         if form == "information":
+            in_nats = prior is not None and chosen.criterion == "D"  # half of log det
             return InformationGain(
                 targets,
                 prior_sd_of(spread),
-                chosen.weight if prior is None else chosen.weight / 2,  # log det to nats
+                chosen.weight / 2 if in_nats else chosen.weight,
                 criterion=chosen.criterion,
                 max_sensitivity=chosen.max_sensitivity,
                 # A gradient needs no reward before the last step.
@@ -278,6 +281,11 @@ class Agent:
         target_mask(plant.definition, list(chosen.goals) or None)  # checks the names
         goals = [chosen.goals.get(p.name, 1.0) for p in plant.definition.parameters]
         common = targets, goals, form, chosen.weight
+        if isinstance(estimator, NLS) and prior is not None:
+            raise ValueError(
+                f"the reward {form!r} of nls is for plants of the spread: leave the prior out, or "
+                "take the reward 'information'"
+            )
         if isinstance(estimator, NLS):
             bound = {"max_sensitivity": chosen.max_sensitivity}
             return OutputError(*common, prior_sd=prior_sd_of(spread), **bound)
@@ -320,10 +328,14 @@ class Agent:
         # fingerprints of earlier trainings stay valid.
         later = {"clocks", "criterion", "max_sensitivity", "input_amplitude", "spread", "dense"}
         later |= {"constants", "terms", "uncertainty", "memory", "change_price"}
+        process = self.decision.model_dump(exclude=later - self.decision.model_fields_set)
+        for term, own in zip(process.get("terms", ()), self.decision.terms, strict=False):
+            if "change_price" not in own.model_fields_set:
+                del term["change_price"]
         return {
             "method": self.method,
             "targets": [name for name, chosen in zip(names, mask, strict=True) if chosen],
-            "decision": self.decision.model_dump(exclude=later - self.decision.model_fields_set),
+            "decision": process,
             "training": {
                 name: value
                 for name, value in dataclasses.asdict(self.training).items()

@@ -225,8 +225,9 @@ class Study(Settings):
         for name, other in others.items():
             if self.prior and other:
                 raise ValueError(f"{name} is for plants of the spread: leave it or the prior out")
-        if self.gain is not None and self.rig is not None:
-            raise ValueError("the expected gain is that of the plant: leave gain or the rig out")
+        for name in ("rig", "uncertainty"):
+            if self.gain is not None and others[name]:
+                raise ValueError(f"gain is that of the plant and its prior: leave it or {name} out")
         return plants_of(plant, self.prior, self.spread) if self.prior else None
 
     def build_methods(self, plant: AbstractPlant) -> dict[str, AbstractExcitation]:

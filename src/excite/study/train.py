@@ -14,7 +14,7 @@ from ..plant.uncertainty import Range
 from ..policy import Policy, read_policy
 from ..progress import SHOWN, Progress
 from .folder import seed_folder
-from .objectives import decision_of, rewards_of
+from .objectives import decision_of, is_information, rewards_of
 from .run import run_study
 from .spec import Study, of_prior, plant_tables, study_from
 from .table import best_seeds
@@ -79,7 +79,7 @@ def train(
         spread: plants are drawn from nominal values ± this fraction, or within a factor
             (`factor:3`).
         prior: distributions of parameters, as for `information_gain`; the others have the spread.
-            Information is then rewarded in nats, and the comparison has the expected gain.
+            The objective D is then rewarded in nats, and the comparison has the expected gain.
         uncertainty: what else may differ, as in `falsify`: the policy is trained to be safe
             there too (by gradient), and its file says what a search found.
         coast: samples after an experiment, under the input that ends it, in which it must be safe
@@ -109,13 +109,20 @@ def train(
             raise ValueError("updates and num_updates are the same: give one of the two")
         own["num_updates"] = updates
     rewards = rewards_of(objective, by_name("goal", goal, "a dict by parameter"))
+    if change_price:
+        priced = next((name for name in rewards if is_information(name)), None)
+        if priced is None:
+            raise ValueError(
+                "change_price is subtracted from information: it needs the objective D, A or E, "
+                f"got {', '.join(rewards)}"
+            )
+        rewards[priced]["change_price"] = change_price
     decision = {
         **decision_of(rewards.values()),
         "output_scale": by_name("output_scale", output_scale, "a dict by output"),
         "window": window,
         "memory": memory,
         "clocks": _several("clock", clock, Real, "a frequency in Hz, or several"),
-        "change_price": change_price or None,
         "uncertainty": by_name("uncertainty", uncertainty, "a dict of ranges by name"),
     }
     agent = {

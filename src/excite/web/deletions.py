@@ -89,6 +89,8 @@ def _restore(folder: Path, deletion: str) -> list[str]:
         for parent in (folder / inside for inside in list(Path(name).parents)[:-1]):
             if parent.is_symlink() or (parent / "run.json").exists():
                 raise RefusedError(409, f"{name} cannot be restored: its folder is a link or a run")
+    if (folder / "run.json").exists():
+        raise RefusedError(409, "the run folder itself is a run; nothing can be restored into it")
     _move(runs, folder)
     _remove_empty(place)
     return list(runs)
@@ -108,7 +110,8 @@ def _move(runs: Mapping[str, Path], folder: Path) -> None:
             for here in files_of(run).values() if run.is_file() else [run]:
                 there = (folder / name).with_name(here.name)
                 if os.path.lexists(there):
-                    raise RefusedError(409, f"{name} exists already; nothing was moved")
+                    where = there.relative_to(folder).as_posix()
+                    raise RefusedError(409, f"{where} exists already; nothing was moved")
                 try:
                     there.parent.mkdir(parents=True, exist_ok=True)
                     os.replace(here, there)  # refuses a folder that is not empty

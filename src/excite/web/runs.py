@@ -288,7 +288,7 @@ def _study(run: Path) -> dict[str, object]:
         "estimator": answer.rows[0].estimator,
         "tables": {name: _methods(table.only(name)) for name in estimators},
         "points": json_ready(points),
-        "notes": footnotes(table.study),
+        "notes": footnotes(table.study, table.rows),
     }
 
 

@@ -15,8 +15,7 @@ function svg(name, attributes, ...children) {
 
 /** A plot of points {method, log_det, rate, interval, violations, is_best} in `parent`. */
 export function drawFrontier(parent, every) {
-  const points = every.filter(({ log_det: told }) => told !== null)
-    .map((point) => ({ ...point, percent: 100 * point.rate, ends: point.interval.map((end) => 100 * end) }))
+  const points = every.map((point) => ({ ...point, percent: 100 * point.rate, ends: point.interval.map((end) => 100 * end) }))
     .sort((a, b) => a.percent - b.percent || a.log_det - b.log_det);
   const read = el("p", { role: "status" }, "Point at a method, or move from one to the next with the arrow keys.");
   const chart = el("div", {

@@ -27,8 +27,9 @@ export function study({ sentences, estimator, tables, points, notes }) {
     el("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Table of the study" }, shown), marked,
     el("details", {}, el("summary", {}, "What the columns say"), ...notes.map((text) => el("p", { class: "hint below" }, text))),
   ];
-  if (points.length < 2) return { parts, card: null };
+  const drawn = points.filter(({ log_det: told }) => told !== null);
+  if (drawn.length < 2) return { parts, card: null };
   const card = el("section", { class: "card" }, el("h2", {}, "Information against violations"));
-  drawFrontier(card, points);
+  drawFrontier(card, drawn);
   return { parts, card };
 }
