@@ -308,7 +308,7 @@ def test_a_document_can_be_compiled(here):
         ("--out r.md --format word", "unknown format 'word' (there is html, md, tex, ipynb)"),
         ("--out old.md", "old.md exists"),
         ("--out kept.md", "kept_files has figures; choose another name or add --overwrite"),
-        ("--out mine.md --overwrite", "mine_files is no folder of a report's figures"),
+        ("--out mine.md --overwrite", "mine_files has other files (notes.txt)"),
         ("--out file.tex --overwrite", "file_files is no folder of a report's figures"),
         ("--out a%.tex", "LaTeX finds no figures"),
     ],
