@@ -1,32 +1,101 @@
-"""Policies for four plants of Inside-Out SMC², by gradient, and what they are expected to tell.
+"""Policies for published tasks of adaptive experiment design, by gradient, and what they tell.
 
-    python results/oed/compute.py [--seeds 3] [--published FOLDER] [TASK ...]
+    python results/oed/compute.py [--seeds N] [--published FOLDER] [TASK ...]
 
 Trains one policy for each task, price of the squared input changes and seed, and evaluates it, the
-published policies (archives in FOLDER) and random inputs on other plants. Rows that are in a task's
-table already are not computed again.
+published policies (archives in FOLDER), a designed signal and simple inputs on other plants. Rows
+that are in a task's table already are not computed again.
 """
 
 import argparse
 import json
 import time
+from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
 
 import excite as ex
 from excite.environment import Env, InformationGain
 from excite.estimation.prior_knowledge import plants_of
-from excite.excitation import Random
+from excite.excitation import PRBS, Random, Replay
 from excite.files import module_at
 from excite.plant.catalogue import plant_named
 from excite.policy import Layout, Policy
-from excite.training.gradient import train
+from excite.training.gradient import rank, train
 from excite.training.settings import GradientSettings
+from excite.training.signals import ROBUST, robust_signal
 
 HERE = Path(__file__).parent
 EXAMPLES = HERE.parent.parent / "examples"
-STEPS = 50
-EVALUATED = {"plants": 2048, "samples": 400, "seed": 1}
+NEAR_THE_POSTERIOR = {"plants": 2048, "samples": 100, "seed": 1}
+FROM_THE_PRIOR = {"plants": 256, "samples": 100_000, "from_prior": True, "seed": 1}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """A published task.
+
+    Attributes:
+        plant: its file and class.
+        prior: of its parameters.
+        trainings: settings by the price of squared input changes, in the order in which they are
+            made: each begins with the policy of the one before. The last price is the authors'.
+        archive: of their policy.
+        steps: of an experiment.
+        memory: of the policies.
+        seeds: of trainings.
+        chains: trainings side by side of a seed; for each price the best on validation is kept.
+        evaluation: of every row.
+    """
+
+    plant: str
+    prior: Mapping[str, str]
+    trainings: Mapping[float, GradientSettings]
+    archive: str = ""
+    steps: int = 50
+    memory: int = 0
+    seeds: int = 10
+    chains: int = 1
+    evaluation: Mapping[str, object]
+
+    @property
+    def word(self):
+        """The name of the plant."""
+        return str(EXAMPLES / self.plant)
+
+    def env(self, price):
+        """The decision process whose total reward is the gain in nats less the price of changes."""
+        plant = plant_named(self.word)
+        prior, count = plants_of(plant, self.prior), len(plant.nominal)
+        objective = InformationGain(
+            (True,) * count, 1.0, 0.5, dense=False, prior=prior, change_price=price
+        )
+        layout = Layout.of(plant.description, 1, self.steps, self.memory)
+        return Env.of(plant, objective=objective, layout=layout, prior=prior)
+
+
+def pendulum(name, prior, small, price, archive, chains=1):
+    """A plant of Inside-Out SMC², with a smaller price between none and the authors'."""
+
+    def settings(num_updates):
+        return GradientSettings(
+            starts=96, num_updates=num_updates, num_plants=64, learning_rate=1e-3,
+            watch_every=num_updates // 10, watch_episodes=256,
+        )  # fmt: skip
+
+    return Task(
+        plant=f"smc_pendulums.py:{name}",
+        prior=prior,
+        trainings={0.0: settings(1200), small: settings(1200), price: settings(3600)},
+        archive=archive,
+        chains=chains,
+        evaluation=NEAR_THE_POSTERIOR,
+    )
 
 
 def lognormal(*names):
@@ -34,34 +103,37 @@ def lognormal(*names):
     return dict.fromkeys(names, "lognormal:1:0.1")
 
 
-# Class, prior, the authors' price of squared input changes, another price, archive of their policy.
+LINEAR = {"a": "normal:14.7:0.316228", "b": "normal:0:0.1", "c": "normal:3:0.316228"}
 TASKS = {
-    "linear pendulum": (
-        "LinearPendulum",
-        {"a": "normal:14.7:0.316228", "b": "normal:0:0.1", "c": "normal:3:0.316228"},
-        (0.1, 0.03), "linear_pendulum_rb_csmc_ctl.npz",
+    "linear pendulum": pendulum(
+        "LinearPendulum", LINEAR, 0.03, 0.1, "linear_pendulum_rb_csmc_ctl.npz"
     ),
-    "nonlinear pendulum": (
-        "NonlinearPendulum", lognormal("m", "l"), (0.2, 0.05),
-        "nonlinear_pendulum_ibis_csmc_ctl.npz",
+    "nonlinear pendulum": pendulum(
+        "NonlinearPendulum", lognormal("m", "l"), 0.05, 0.2,
+        "nonlinear_pendulum_ibis_csmc_ctl.npz", chains=2,
     ),
-    "cart-pole": (
-        "CartPole", lognormal("l", "m_p", "m_c"), (0.1, 0.01), "cartpole_ibis_csmc_ctl.npz",
+    "cart-pole": pendulum(
+        "CartPole", lognormal("l", "m_p", "m_c"), 0.01, 0.1, "cartpole_ibis_csmc_ctl.npz"
     ),
-    "double pendulum": (
-        "DoublePendulum", lognormal("m_1", "m_2", "l_1", "l_2"), (0.1, 0.01),
+    "double pendulum": pendulum(
+        "DoublePendulum", lognormal("m_1", "m_2", "l_1", "l_2"), 0.01, 0.1,
         "double_pendulum_ibis_csmc_ctl.npz",
     ),
+    "location finding": Task(
+        plant="location_finding.py:TwoSources",
+        prior=dict.fromkeys(("x_1", "y_1", "x_2", "y_2"), "normal:0:1"),
+        trainings={
+            0.0: GradientSettings(
+                num_updates=7000, num_plants=256, learning_rate=2e-3, hidden=(128,), last_gain=0.3,
+                watch_every=700, watch_episodes=512, through_measurements=False,
+            )
+        },
+        steps=30,
+        memory=64,
+        seeds=3,
+        evaluation=FROM_THE_PRIOR,
+    ),
 }  # fmt: skip
-SETTINGS = GradientSettings(
-    starts=96, num_updates=600, num_plants=64, learning_rate=1e-3, watch_every=60,
-    watch_episodes=256,
-)  # fmt: skip
-
-
-def word_of(task):
-    """The name of a task's plant."""
-    return f"{EXAMPLES / 'smc_pendulums.py'}:{TASKS[task][0]}"
 
 
 def path_of(task, rest):
@@ -74,64 +146,111 @@ def policy_path(task, price, seed):
     return path_of(task, f"-{price:g}-{seed}.safetensors")
 
 
-def env_of(task, price):
-    """The decision process whose total reward is the gain in nats less the price of changes."""
-    plant, given = plant_named(word_of(task)), TASKS[task][1]
-    prior, count = plants_of(plant, given), len(plant.nominal)
-    objective = InformationGain(
-        (True,) * count, 1.0, 0.5, dense=False, prior=prior, change_price=price
-    )
-    layout = Layout.of(plant.description, window=1, num_steps=STEPS)
-    return Env.of(plant, objective=objective, layout=layout, prior=prior)
-
-
 def row(task, method, excitation, **about):
     """What an excitation is expected to tell, on plants that no training has seen."""
-    _, prior, (price, _), _ = TASKS[task]
-    found = ex.information_gain(word_of(task), excitation, steps=STEPS, prior=prior, **EVALUATED)
+    own = TASKS[task]
+    found = ex.information_gain(
+        own.word, excitation, steps=own.steps, prior=own.prior, **own.evaluation
+    )
     content = {"task": task, "method": method, **about, **found.to_dict()}
-    content["gain_less_changes"] = found.lower.value - price * found.changes.value
+    content["gain_less_changes"] = found.lower.value - max(own.trainings) * found.changes.value
     return {k: v for k, v in content.items() if k not in ("plant", "excitation")}
 
 
-def trained_row(task, price, seed):
-    """Of a policy trained for this price; the policy is written beside the table."""
-    env, start = env_of(task, price), time.process_time()
-    trained = train(env, SETTINGS, seed)
-    seconds = time.process_time() - start
-    policy = Policy(
-        env.plant.description, env.layout, trained.weights,
-        {"excite": ex.__version__, "task": task, "change_price": price, "seed": seed},
-    )  # fmt: skip
-    policy.save(policy_path(task, price, seed), overwrite=True)
-    return row(task, "gradient", policy, price=price, seed=seed, train_cpu_seconds=seconds)
+def trained(task, seed):
+    """By price, the best of some chains of trainings; and the seconds of them all."""
+    own, start, found = TASKS[task], time.process_time(), {}
+    for chain in range(own.chains):
+        first = None
+        for price, settings in own.trainings.items():
+            made = train(own.env(price), settings, seed + 100 * chain, first=first)
+            first = jax.tree.map(jnp.asarray, made.weights)
+            found.setdefault(price, []).append(made)
+    best = {
+        price: max(
+            several, key=lambda made, price=price: rank(own.trainings[price], made.validation)
+        )
+        for price, several in found.items()
+    }
+    return best, time.process_time() - start
+
+
+def trained_rows(task, seed):
+    """A row for each price; the policies are written beside the table."""
+    best, seconds = trained(task, seed)
+    for price, made in best.items():
+        env = TASKS[task].env(price)
+        about = {"excite": ex.__version__, "task": task, "change_price": price, "seed": seed}
+        policy = Policy(env.plant.description, env.layout, made.weights, about)
+        policy.save(policy_path(task, price, seed), overwrite=True)
+        told = {"price": price, "seed": seed, "train_cpu_seconds": seconds / len(best)}
+        yield row(task, "gradient", policy, **told)
+
+
+def open_loop_row(task):
+    """Of the signal designed for the prior, which does not use the measurements."""
+    found = robust_signal(TASKS[task].env(0.0), seed=0, settings=ROBUST)
+    return row(task, "open loop", Replay(found.inputs[0]))
+
+
+def rows_of(task):
+    """The rows that are computed."""
+    path = path_of(task, ".json")
+    return json.loads(path.read_text())["rows"] if path.is_file() else []
+
+
+def lines(task):
+    """The lines of a task in docs/explanation/expected-information.md; ranges are over seeds."""
+    rows, told = rows_of(task), []
+    for method in dict.fromkeys((r["method"], r.get("price")) for r in rows):
+        own = [r for r in rows if (r["method"], r.get("price")) == method]
+        gains = [r["lower"]["nats"] for r in own]
+        less = [r["gain_less_changes"] for r in own]
+        changes = np.mean([r["input_changes"]["value"] for r in own])
+        cells = [task, method[0] if len(own) == 1 else f"gradient, price {method[1]:g}"]
+        if len(own) == 1:
+            cells += [f"{gains[0]:.2f} ± {own[0]['lower']['std_error']:.2f}", f"{changes:.1f}"]
+            cells += [f"{less[0]:.2f}"]
+        else:
+            cells += [_range(gains), f"{changes:.1f}", _range(less)]
+        told.append(f"| {' | '.join(cells)} |")
+    return told
+
+
+def _range(values):
+    return f"{np.mean(values):.2f} ({min(values):.2f} to {max(values):.2f})"
 
 
 def main():
-    """Computes what is missing in the table."""
+    """Computes what is missing in the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--seeds", type=int)
     parser.add_argument("--published", type=Path)
     parser.add_argument("tasks", nargs="*", default=list(TASKS))
     asked = parser.parse_args()
     for task in asked.tasks:
-        path = path_of(task, ".json")
-        rows = json.loads(path.read_text())["rows"] if path.is_file() else []
-        done = {(r["method"], r.get("price"), r.get("seed")) for r in rows}
+        own, path, rows = TASKS[task], path_of(task, ".json"), rows_of(task)
 
-        def keep(key, made, path=path, rows=rows, done=done):
-            if key not in done:
-                rows.append(made())
+        def keep(method, made, seed=None, path=path, rows=rows):
+            if (method, seed) not in {(r["method"], r.get("seed")) for r in rows}:
+                rows += made()
                 path.write_text(json.dumps({"rows": rows}, indent=1) + "\n")
 
-        keep(("random", None, None), partial(row, task, "random", Random(hold=1)))
-        if asked.published is not None:
-            own = module_at(EXAMPLES / "smc_policies.py")
-            kept = own.RecurrentPolicy.read(asked.published / TASKS[task][3])
-            keep(("published", None, None), partial(row, task, "published", kept))
-        for seed in range(asked.seeds):
-            for price in (0.0, *TASKS[task][2]):
-                keep(("gradient", price, seed), partial(trained_row, task, price, seed))
+        def keep_input(method, excitation, task=task, keep=keep):
+            keep(method, lambda: [row(task, method, excitation)])
+
+        keep_input("random", Random(hold=1))
+        if own.archive:
+            limit = np.array([i.upper for i in plant_named(own.word).description.inputs])
+            keep_input("PRBS", PRBS(clock=1))
+            keep_input("constant", Replay(np.tile(limit, (own.steps, 1))))
+            keep("open loop", lambda task=task: [open_loop_row(task)])
+        if own.archive and asked.published is not None:
+            module = module_at(EXAMPLES / "smc_policies.py")
+            keep_input("published", module.RecurrentPolicy.read(asked.published / own.archive))
+        for seed in range(own.seeds if asked.seeds is None else asked.seeds):
+            keep("gradient", partial(trained_rows, task, seed), seed)
+        print("\n".join(lines(task)))
 
 
 if __name__ == "__main__":

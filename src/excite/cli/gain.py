@@ -28,8 +28,7 @@ from .simulate import excitation_options, given_experiment, show_warnings
     "--prior",
     multiple=True,
     metavar="NAME=DISTRIBUTION|PATH",
-    help="Normal or lognormal distributions of parameters, as for excite identify, or an earlier "
-    "run.",
+    help="Distributions of parameters, as for excite identify, or an earlier run.",
 )
 @click.option(
     "--spread",

@@ -193,7 +193,8 @@ def uncertainty_option(help: str) -> Callable[[Callback], Callback]:
 prior_option = click.option(
     "--prior", type=NAMES, multiple=True, metavar="NAME=DISTRIBUTION,...",
     help="Plants are drawn from these distributions of parameters (normal:MEAN:SD, "
-    "lognormal:MEDIAN:SD), others within the spread; the table has the expected gain.",
+    "lognormal:MEDIAN:SD, uniform:LOWEST:HIGHEST), others within the spread; the table has the "
+    "expected gain.",
 )  # fmt: skip
 
 

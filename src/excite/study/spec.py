@@ -135,7 +135,8 @@ class Study(Settings):
         spread: parameters are uniform in nominal value ± spread times their scale (by
             default the nominal value itself), or within a factor such as "factor:3".
         prior: distributions of parameters ("normal:MEAN:SD", "lognormal:MEDIAN:SD", with SD in
-            percent or not); the others have the spread. Plants are drawn from it.
+            percent or not, "uniform:LOWEST:HIGHEST"); the others have the spread. Plants are drawn
+            from it.
         gain: where every method's expected information gain is computed.
         uncertainty: what else may differ, see `Uncertainty`: all are evaluated on plants drawn
             from it; agents by gradient are trained to be safe in it, and falsified.
