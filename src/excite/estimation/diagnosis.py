@@ -27,8 +27,8 @@ _CORRECTIONS = 3  # of the autocovariances for what the fit took along
 def fit_percent(
     measured: Float[np.ndarray, " sample"], simulated: Float[np.ndarray, " sample"]
 ) -> float:
-    """100 (1 - |y - y_s| / |y - mean y|) of samples that have both; NaN for a constant output."""
-    seen = np.isfinite(measured) & np.isfinite(simulated)
+    """100 (1 - |y - y_s| / |y - mean y|) of measured samples; NaN for a constant output."""
+    seen = np.isfinite(measured)
     measured, simulated = measured[seen], simulated[seen]
     spread = np.linalg.norm(measured - measured.mean())
     if spread == 0:

@@ -172,15 +172,22 @@ class Identification:
 
     def prediction_fit(self) -> dict[str, float] | None:
         """The same of the one-step prediction, with `pem`."""
-        return None if self.noise is None else self._fit_of([f.model for f in self.fitted])
+        if self.noise is None:
+            return None
+        predicted = [f.model for f in self.fitted]
+        return self._fit_of(predicted, [np.isnan(values) for values in predicted])
 
-    def _fit_of(self, values: Sequence[np.ndarray]) -> dict[str, float]:
-        """Fit of some outputs of all records."""
+    def _fit_of(
+        self, values: Sequence[np.ndarray], without: Sequence[np.ndarray] | None = None
+    ) -> dict[str, float]:
+        """Fit of some outputs of all records, but of samples that are left out."""
         means = [np.nanmean(f.record.outputs, axis=0) for f in self.fitted]
         measured = np.concatenate(
             [f.record.outputs - mean for f, mean in zip(self.fitted, means, strict=True)]
         )
         own = np.concatenate([v - mean for v, mean in zip(values, means, strict=True)])
+        if without is not None:
+            measured = np.where(np.concatenate(without), np.nan, measured)
         names = names_of(self.plant.outputs)
         return {n: fit_percent(measured[:, i], own[:, i]) for i, n in enumerate(names)}
 

@@ -129,11 +129,17 @@ def _predicted(
         Predicted(
             values,
             sd,
-            _fits(plant.definition, record, values),
+            _fits(plant.definition, _where_predicted(record, values), values),
             dict(zip(names_of(plant.definition.outputs), _inside(record, values, sd), strict=True)),
         )
         for record, values, sd in zip(records, outputs, sds, strict=True)
     ]
+
+
+def _where_predicted(record: Record, predicted: np.ndarray) -> Record:
+    """The record without the samples that have no prediction."""
+    seen = np.where(np.isnan(predicted), np.nan, record.outputs)
+    return dataclasses.replace(record, outputs=seen)
 
 
 def _inside(record: Record, predicted: np.ndarray, sd: np.ndarray) -> list[float]:
