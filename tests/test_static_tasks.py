@@ -1,6 +1,7 @@
 """Tasks without memory: simulation, likelihood, expected gain."""
 
 import dataclasses
+import math
 from pathlib import Path
 
 import jax
@@ -130,3 +131,39 @@ def test_random_designs_tell_of_two_sources_what_an_independent_computation_says
     # More samples only raise the lower bound, here by less than a third of a nat.
     difference = found.lower.value - np.mean(gains)
     assert -3 * np.hypot(error, found.lower.std_error) < difference < 0.35 + 3 * error
+
+
+class Even(AbstractStaticTask):
+    """The outcome does not tell the sign of the parameter: a posterior has two modes."""
+
+    definition = static_description(
+        "even",
+        designs=(ex.Input("place", "m", -1.0, 1.0),),
+        outcomes=(ex.Output("height", "m", scale=1.0, noise_sd=0.1),),
+        parameters=(ex.Parameter("root", "", 0.5, scale=1.0, positive=False),),
+    )
+
+    def outcome(self, design, params):
+        return design * params.root**2
+
+
+def test_of_a_posterior_with_two_modes_both_are_found():
+    found = ex.information_gain(
+        Even, "random", options={"hold": 1}, steps=8, prior={"root": "normal:0:1"}, plants=512,
+        samples=300,
+    )  # fmt: skip
+    assert found.few == 0
+    assert 0 <= found.upper.value - found.lower.value < 0.03
+    rng, grid = np.random.default_rng(0), np.linspace(-6, 6, 2401)
+    true, designs = rng.normal(size=500), rng.uniform(-1, 1, (500, 8))
+    measured = designs * true[:, None] ** 2 + 0.1 * rng.normal(size=(500, 8))
+
+    def log_likelihood(values: np.ndarray) -> np.ndarray:
+        left = measured[:, None] - designs[:, None] * values[..., None] ** 2
+        return -0.5 * (left**2).sum(axis=-1) / 0.1**2
+
+    prior = np.exp(-0.5 * grid**2) / np.sqrt(2 * np.pi) * (grid[1] - grid[0])
+    evidence = np.log(np.exp(log_likelihood(grid[None])) @ prior)
+    gains = log_likelihood(true[:, None])[:, 0] - evidence
+    error = math.hypot(gains.std() / math.sqrt(500), found.lower.std_error)
+    assert abs(found.lower.value - gains.mean()) < 4 * error

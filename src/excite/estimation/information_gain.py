@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -40,7 +41,7 @@ from .evidence import Fit, nearest
 from .prior import PriorPlants
 from .prior_knowledge import PriorLike, plants_of
 
-_STEPS, _STARTS = 30, 8  # of the search for the most probable parameters
+_STEPS, _STARTS, _SIDE_BY_SIDE = 30, 16, 8  # of the searches for probable parameters
 _WIDE, _SHARES = 2.0, (0.5, 0.375, 0.125)  # of the proposal: normal, a wider one, the prior
 _CHUNK = 16  # records at a time
 _BLOCK = 1000  # samples at a time
@@ -90,6 +91,7 @@ def gains(
     plant = prior.plant
     count = len(plant.nominal)
     unknown = Fit(jnp.zeros(count), jnp.eye(count), jnp.zeros(()), jnp.zeros(()))
+    size = min(num_samples, _BLOCK)
 
     def of(key: PRNGKeyArray) -> Gains:
         true_key, run_key, start_key, sample_key = jax.random.split(key, 4)
@@ -104,25 +106,31 @@ def gains(
             found = -0.5 * jnp.sum(residual(z) ** 2)
             return jnp.where(jnp.isfinite(found), found, -jnp.inf)
 
-        drawn = jax.random.normal(start_key, (_STARTS - 1, count), float)
-        starts = jnp.concatenate([unknown.z[None], drawn])
-        ends, costs = jax.vmap(lambda z: nearest(residual, unknown, z, _STEPS))(starts)
-        center = ends[jnp.argmin(costs)]
-        S = jax.jacfwd(residual)(center)
-        information = S.T @ S + unknown.information
-        log_det = jnp.linalg.slogdet(information)[1]
-        trace = jnp.trace(jnp.linalg.inv(information))
-        laplace = 0.5 * (trace + center @ center - count + log_det)
-        root = jnp.linalg.cholesky(jnp.linalg.inv(information))
+        drawn = jax.random.normal(start_key, (max(size, _STARTS), count), float)
+        likely = jax.lax.top_k(jax.lax.map(log_likelihood, drawn, batch_size=64), _STARTS - 1)[1]
+        starts = jnp.concatenate([unknown.z[None], drawn[likely]])
+        search = partial(nearest, residual, unknown, num_steps=_STEPS)
+        ends, costs = jax.lax.map(search, starts, batch_size=_SIDE_BY_SIDE)
+        best = jnp.argmin(costs)
+        S = jax.vmap(jax.jacfwd(residual))(ends)
+        information = jnp.einsum("eoi,eoj->eij", S, S) + unknown.information[None]
+        log_dets = jnp.linalg.slogdet(information)[1]
+        inverse = jnp.linalg.inv(information)
+        trace, center = jnp.trace(inverse[best]), ends[best]
+        laplace = 0.5 * (trace + center @ center - count + log_dets[best])
+        roots = jnp.linalg.cholesky(inverse)
+        # Flatter than the posterior's shares: a small mode costs few samples, a missed one the sum.
+        modes = jax.nn.log_softmax(-0.25 * (costs + log_dets))
         shares = (0.0, 0.0, 1.0) if from_prior else _SHARES
 
         def log_proposal(z: Array) -> Array:
-            change = z - center
-            form, log_size = change @ information @ change, 0.5 * log_det
+            change = z[None] - ends
+            forms, sizes = jnp.einsum("ei,eij,ej->e", change, information, change), 0.5 * log_dets
             parts = jnp.stack(
                 [
-                    -0.5 * form + log_size,
-                    -0.5 * form / _WIDE**2 + log_size - count * math.log(_WIDE),
+                    jax.nn.logsumexp(modes + sizes - 0.5 * forms),
+                    jax.nn.logsumexp(modes + sizes - 0.5 * forms / _WIDE**2)
+                    - count * math.log(_WIDE),
                     -0.5 * z @ z,
                 ]
             )
@@ -135,13 +143,14 @@ def gains(
             kind_key, value_key = jax.random.split(key)
             z = jax.random.normal(value_key, (size, count), float)
             kind = jax.random.choice(kind_key, 3, (size,), p=jnp.array(shares))
-            near = center[None] + jnp.where(kind == 1, _WIDE, 1.0)[:, None] * (z @ root.T)
+            mode = jax.random.categorical(jax.random.fold_in(kind_key, 1), modes, shape=(size,))
+            far = jnp.where(kind == 1, _WIDE, 1.0)[:, None]
+            near = ends[mode] + far * jnp.einsum("sij,sj->si", roots[mode], z)
             weights = jax.vmap(log_weight)(jnp.where((kind == 2)[:, None], z, near))
             total = jnp.logaddexp(carry[0], jax.nn.logsumexp(weights))
             squares = jnp.logaddexp(carry[1], jax.nn.logsumexp(2 * weights))
             return (total, squares), None
 
-        size = min(num_samples, _BLOCK)
         blocks = jax.random.split(sample_key, -(-num_samples // size))
         nothing = jnp.asarray(-jnp.inf)
         (total, squares), _ = jax.lax.scan(block, (nothing, nothing), blocks)
