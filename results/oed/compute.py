@@ -51,6 +51,7 @@ class Task:
         seeds: of trainings.
         chains: trainings side by side of a seed; for each price the best on validation is kept.
         evaluation: of every row.
+        also: another evaluation of every row, near the posterior.
     """
 
     plant: str
@@ -62,6 +63,7 @@ class Task:
     seeds: int = 10
     chains: int = 1
     evaluation: Mapping[str, object]
+    also: Mapping[str, object] | None = None
 
     @property
     def word(self):
@@ -132,6 +134,7 @@ TASKS = {
         memory=64,
         seeds=3,
         evaluation=FROM_THE_PRIOR,
+        also={"plants": 256, "samples": 5000, "seed": 1},
     ),
 }  # fmt: skip
 
@@ -149,11 +152,14 @@ def policy_path(task, price, seed):
 def row(task, method, excitation, **about):
     """What an excitation is expected to tell, on plants that no training has seen."""
     own = TASKS[task]
-    found = ex.information_gain(
-        own.word, excitation, steps=own.steps, prior=own.prior, **own.evaluation
-    )
+    gain = partial(ex.information_gain, own.word, excitation, steps=own.steps, prior=own.prior)
+    found = gain(**own.evaluation)
     content = {"task": task, "method": method, **about, **found.to_dict()}
     content["gain_less_changes"] = found.lower.value - max(own.trainings) * found.changes.value
+    if own.also is not None:
+        near = gain(**own.also).to_dict()
+        kept = ("lower", "upper", "num_samples", "few_effective_samples")
+        content["near_posterior"] = {name: near[name] for name in kept}
     return {k: v for k, v in content.items() if k not in ("plant", "excitation")}
 
 

@@ -72,10 +72,16 @@ def test_the_policy_that_finds_sources_tells_again_what_its_row_says():
     for row in rows:
         is_trained = row["method"] == "gradient"
         name = f"trained by gradient, seed {row['seed']}" if is_trained else row["method"]
-        means = [row[kind] for kind in ("lower", "upper", "laplace")]
+        near = row["near_posterior"]
+        means = [row["lower"], row["upper"], near["lower"], near["upper"], row["laplace"]]
         cells = " | ".join(f"{m['nats']:.2f} ± {m['std_error']:.2f}" for m in means)
         assert f"| {name} | {cells} |" in PAGE
         assert (row["num_plants"], row["num_samples"]) == (256, 100_000)
+        assert near["num_samples"] == 5000
+        # All bounds hold at once: no lower one lies above an upper one by more than their errors.
+        for lower in (row["lower"], near["lower"]):
+            for upper in (row["upper"], near["upper"]):
+                assert lower["nats"] < upper["nats"] + 3 * upper["std_error"]
     row = rows[-1]
     policy = COMPUTED.policy_path(task, 0.0, row["seed"])
     found = ex.information_gain(
