@@ -340,7 +340,7 @@ def footnotes(study: StudyFacts, rows: Sequence[Row]) -> list[str]:
     if study.agents:
         notes.append(
             f"Agents: cross-seed mean ± standard deviation of the mean errors of {study.seeds} "
-            f"training seed{'s' * (study.seeds > 1)}, {study.episodes} evaluation episodes each, "
+            f"training seeds, {study.episodes} evaluation episodes each, "
             "over viable seeds (a seed has collapsed where the RMS input is below 1 % of its "
             "limit); failures over all evaluations of all seeds. The policy is evaluated without "
             "exploration noise."
