@@ -142,15 +142,24 @@ def excite(*words: object) -> int:
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with records and runs of every kind; no test writes to it."""
-    folder = tmp_path_factory.mktemp("made")
-    (folder / "two.toml").write_text(STUDY)
+    return with_runs(tmp_path_factory.mktemp("made"), STUDY, BOTH)
+
+
+def with_runs(folder: Path, study: str, both: str) -> Path:
+    """The folder with records, identifications, a study and a run on the simulated rig.
+
+    Args:
+        study: its file.
+        both: the command that identifies both records.
+    """
+    (folder / "two.toml").write_text(study)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         for line in (
             "simulate aero2 --excitation chirp --steps 200 --out chirp.csv",
             "simulate aero2 --excitation prbs --steps 200 --noise pitch=0.002 --out prbs.csv",
             "identify chirp.csv --plant aero2 --out one",
-            f"{BOTH} --out both",
+            f"{both} --out both",
             "study run two.toml --out bench",
             "run --rig simulated --fast --steps 100 --input chirp.csv --out rig.csv",
         ):

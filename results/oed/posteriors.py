@@ -13,7 +13,6 @@ import json
 
 import compute
 import jax
-import numpy as np
 
 import excite as ex
 from excite.estimation import NLS
@@ -49,7 +48,7 @@ def main():
         for way, ends in found.items():
             counts = inside.setdefault(way, dict.fromkeys(true, 0))
             for name, (low, high) in ends.items():
-                counts[name] += bool(np.logical_and(low <= true[name], true[name] <= high))
+                counts[name] += bool(low <= true[name] <= high)
         if (number + 1) % 25 == 0 or number + 1 == asked.experiments:
             about = {"task": TASK, "experiments": number + 1, "inside": inside}
             TABLE.write_text(json.dumps(about, indent=1) + "\n")

@@ -12,7 +12,7 @@ import nbformat
 import numpy as np
 import pytest
 from markdown_it import MarkdownIt
-from test_html_report import Page, contents, estimate, excite, read, refused, renamed
+from test_html_report import Page, contents, estimate, excite, read, refused, renamed, with_runs
 
 import excite as ex
 from excite.description import PlantDescription
@@ -45,6 +45,7 @@ num_steps = 60
 methods = { random = { excitation = "random" }, chirp = { excitation = "chirp" } }
 estimators = { nls = { kind = "nls" } }
 """
+BOTH = "identify chirp.csv prbs.csv --validate prbs.csv --plant aero2"
 HOSTILE = [
     "<script>alert(1)</script>", r"$\frac{$", "a|b_c%&#~^{}", r"\input{/etc/passwd}", "[x](y)![z]",
     "# 1. `x` *y* _z_", "½ ≤ Ω² µ – „ß“",
@@ -55,20 +56,7 @@ SPECIAL = re.compile(r"[^\x00-\u017f\u2018-\u201d]|[#~^|<>`]|(?<!\\)_(?!\{)")
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a run of every kind; no test writes to it."""
-    folder = tmp_path_factory.mktemp("made")
-    (folder / "two.toml").write_text(STUDY)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        for line in (
-            "simulate aero2 --excitation chirp --steps 200 --out chirp.csv",
-            "simulate aero2 --excitation prbs --steps 200 --noise pitch=0.002 --out prbs.csv",
-            "identify chirp.csv --plant aero2 --out one",
-            "identify chirp.csv prbs.csv --validate prbs.csv --plant aero2 --out both",
-            "study run two.toml --out bench",
-            "run --rig simulated --fast --steps 100 --input chirp.csv --out rig.csv",
-        ):
-            assert excite(*line.split()) == 0
-    return folder
+    return with_runs(tmp_path_factory.mktemp("made"), STUDY, BOTH)
 
 
 @pytest.fixture

@@ -114,18 +114,24 @@ def experiment_information(
     theta = jnp.stack([jnp.asarray(p, float) for p in params])
     size, num_params = relative_size(plant, params), len(theta)
     num_states = 0 if initial_state_known else len(plant.initial_state)
-    is_observed = measured is not None and plant.definition.observes_state
+
+    def changed(change: Array) -> Params:
+        return plant.Params(*(theta + size * change[:num_params]))
+
+    if measured is not None and plant.definition.observes_state:
+        S = sensitivity(
+            lambda change: predicted(plant, changed(change), inputs, measured)[0],
+            jnp.zeros(num_params),
+        )
+        return fisher_information(S, plant.process_noise_sd)
 
     def outputs(change: Array) -> Array:
-        own = plant.Params(*(theta + size * change[:num_params]))
-        if measured is not None and is_observed:
-            return predicted(plant, own, inputs, measured)[0]
         moved = change[num_params:] if num_states else 0.0
-        return response(plant, own, inputs, plant.initial_state + moved)
+        return response(plant, changed(change), inputs, plant.initial_state + moved)
 
     S = sensitivity(outputs, jnp.zeros(num_params + num_states))
-    if is_observed or initial_state_known:
-        return fisher_information(S, plant.process_noise_sd if is_observed else plant.sensor.sd)
+    if initial_state_known:
+        return fisher_information(S, plant.sensor.sd)
     return marginal_information(S, plant.sensor.sd, num_params)
 
 

@@ -17,7 +17,7 @@ from ..description import RARE, Output, PlantDescription, display_unit, listed
 from ..record import Record
 from .numbers import digits_for, number
 from .rows import EstimatedParameter, EstimateSummary, Row, StudyFacts
-from .study_table import NUM_LABELS, StudyTable, gain_cell, violations_cell
+from .study_table import NUM_LABELS, StudyTable, gain_cell, has_gain, violations_cell
 from .tables import Table
 
 KNOWS_THE_PLANT = "clairvoyant"  # a reference, and no excitation that could be played
@@ -49,10 +49,11 @@ class Answer:
     def table(self) -> Table:
         """At most one screen: information, errors and violations of each excitation."""
         names = self.rows[0].parameters
-        gains = ["gain nats"] * any(row.expected_gain is not None for row in self.rows)
-        header = ["excitation", *gains, "log det", *(f"{n} error %" for n in names), "violations"]
+        with_gain = has_gain(self.rows)
+        gain = ["gain nats"] * with_gain
+        header = ["excitation", *gain, "log det", *(f"{n} error %" for n in names), "violations"]
         return header, [
-            [row.method, *(gain_cell(row.expected_gain) for _ in gains),
+            [row.method, *[gain_cell(row.expected_gain)] * with_gain,
              f"{row.log_det_information:.2f}",
              *(number(row.relative_error_percent[name].mean, 3) for name in names),
              violations_cell(row)]

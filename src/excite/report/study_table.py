@@ -172,7 +172,7 @@ class StudyTable(Saved):
                 columns[key] = [_known(getattr(row.on_rig, key, None)) for row in rows]
         columns["log_det_information"] = [row.log_det_information for row in rows]
         columns["log_det_information_sd"] = [row.log_det_information_sd for row in rows]
-        if any(row.expected_gain is not None for row in rows):
+        if has_gain(rows):
             columns |= _columns_of_gain(rows)
         if any(row.d_efficiency is not None for row in rows):
             columns["d_efficiency"] = [_known(row.d_efficiency) for row in rows]
@@ -235,6 +235,11 @@ def _csv(lines: Iterable[Sequence[object]]) -> str:
     return buffer.getvalue()
 
 
+def has_gain(rows: Sequence[Row]) -> bool:
+    """Whether any of the rows has an expected gain."""
+    return any(row.expected_gain is not None for row in rows)
+
+
 def _is_trained(rows: Sequence[Row]) -> bool:
     """Whether any of the rows is that of an agent."""
     return any(row.seeds is not None for row in rows)
@@ -248,7 +253,7 @@ def _header(rows: Sequence[Row]) -> list[str]:
         header += [f"{name} error %", "bound %"]
     header += [f"max {largest.output} {largest.unit}", "violations (95 %)", "failed"]
     header += [*_rig_cells(rows[0].on_rig, rows[0].evaluations), "log det"]
-    header += ["gain nats"] * any(row.expected_gain is not None for row in rows)
+    header += ["gain nats"] * has_gain(rows)
     header += ["D-efficiency"] * any(row.d_efficiency is not None for row in rows)
     return header + ["viable seeds", "training"] * _is_trained(rows)
 
@@ -268,7 +273,7 @@ def _cells(rows: Sequence[Row], row: Row) -> list[str]:
         *_rig_cells(row.on_rig, row.evaluations).values(),
         number(row.log_det_information, 4),
     ]
-    if any(other.expected_gain is not None for other in rows):
+    if has_gain(rows):
         cells.append(gain_cell(row.expected_gain))
     if any(other.d_efficiency is not None for other in rows):
         cells.append(number(row.d_efficiency, 2))
