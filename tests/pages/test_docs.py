@@ -108,8 +108,9 @@ def test_a_rig_of_ones_own_is_short_and_runs_as_documented(tmp_path: Path):
         assert told["missed_deadlines"] > 0
     else:
         assert (run.returncode, told["reason"], told["num_samples"]) == (0, "complete", 10)
-    record = read_record(tmp_path / "r.csv", plant_named("aero2").description)
-    assert set(record.outputs[:, 0]) <= {0.0, *answers}
+    if told["num_samples"] > 1:  # what has fewer is no record
+        record = read_record(tmp_path / "r.csv", plant_named("aero2").description)
+        assert set(record.outputs[:, 0]) <= {0.0, *answers}
 
 
 def test_a_rigs_computer_needs_little_and_in_the_tested_versions():

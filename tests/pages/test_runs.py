@@ -374,6 +374,7 @@ def test_a_deletion_that_is_refused_says_why(address: str, page: Page, runs: Pat
     expect(names(page)).to_have_count(5)
     page.get_by_role("button", name="Delete").click()
     undo = page.get_by_role("button", name="Undo deletion of frontier")
+    expect(undo).to_be_visible()
     shutil.rmtree(runs / ".deleted")  # emptied by the user
     undo.click()
     expect(page.locator("#runs .status").first).to_contain_text("no such deletion")
