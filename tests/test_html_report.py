@@ -19,10 +19,11 @@ import pytest
 from excite.cli import main
 from excite.policy import read_policy
 from excite.report import html as html_report
-from excite.report.answer import answered, best_columns
+from excite.report.answer import answered, best_columns, told_of_campaign
 from excite.report.estimates import parameter_cells, residual_cells, residual_in_words
 from excite.report.frontier import frontier
 from excite.report.html import report_html
+from excite.report.key_figures import of_study
 from excite.report.numbers import number
 from excite.report.rows import EstimateSummary, Row, StudyFacts
 from excite.report.study_table import StudyTable, difference_cells, footnotes
@@ -269,6 +270,51 @@ def test_a_study_is_answered_by_the_most_informative_excitation_without_a_violat
     assert none.sentences == (
         "No excitation was without a violation: loud had the fewest, 3 of 100.",
     )
+
+
+def with_gain(row: Row, nats: float) -> Row:
+    bound = {"mean": nats, "std_error": 0.05}
+    gain = {"lower": bound, "upper": bound, "plants": 9, "samples": 9, "from_prior": True}
+    return Row.model_validate({**row.data(), "expected_gain": gain})
+
+
+def test_a_study_with_expected_gains_is_answered_in_nats():
+    """Also where the order by log det is another one: a row without a gain comes last."""
+    chirp, loud, learned = (with_gain(ROWS[i], nats) for i, nats in ((1, 9.0), (2, 12.0), (3, 7.5)))
+    found = answered([chirp, loud, learned, ROWS[4]], FACTS, {})
+    assert [row.method for row in found.rows] == ["chirp", "learned", "loud"]
+    told = found.sentences[0]
+    assert "chirp tells most about the plant: an expected information gain of 9.00 ± 0.05" in told
+    assert "log det" not in told
+    other = answered([chirp, with_gain(ROWS[3], 10.5)], FACTS, {})
+    assert "10.50 ± 0.05 nats, 1.5 nats more than chirp." in other.sentences[0]
+    assert frontier([chirp, loud, learned]) == ["chirp", "loud"]
+    table = StudyTable(rows=(chirp, learned), study=FACTS)
+    assert of_study(table) == "chirp: 9.00 ± 0.05 nats, violations 0/100 (0.0–3.7 %)"
+
+
+def test_a_campaign_is_answered_by_its_targets_and_its_nearness():
+    known = {
+        "J_p": {"estimate": 0.02, "ci95_half": 0.0004},
+        "D_p": {"estimate": 1.0, "ci95_half": None},
+    }
+    told = {
+        "rounds": [{"nearness": 0.5}, {"nearness": 0.72}, {"nearness": None}], "num_samples": 90,
+        "reason": "every target is reached", "interrupted": "", "estimate": known,
+        "targets": {"J_p": "2 %", "D_p": "1 %", "K_pu": "1 %"},
+    }  # fmt: skip
+    assert told_of_campaign(told) == (
+        "After 90 samples in 3 rounds, every target is reached: J_p = 0.02000 ± 2.0 % (asked: "
+        "2 %), D_p = 1.00, its interval open (asked: 1 %) and K_pu not known (asked: 1 %), with "
+        "95 % intervals.",
+        "The measured outputs reached no critical level: the nearest came to 72 % of it.",
+    )
+    early = {**told, "rounds": [{"nearness": 1.1}], "reason": "", "estimate": {}, "targets": {}}
+    assert told_of_campaign(early) == (
+        "After 90 samples in 1 round, not ended.",
+        "Round 1 reached its critical level: the nearest came to 110 % of it.",
+    )
+    assert "Nothing was measured" in told_of_campaign({**early, "rounds": []})[1]
 
 
 def test_an_answer_keeps_its_sense_at_the_edges():

@@ -575,7 +575,7 @@ def test_a_study_is_shown_as_its_table(client: TestClient):
             assert len({row["cells"][0] for row in shown["rows"]}) == len(shown["rows"])
         first = [row for row in table.rows if row.estimator == table.rows[0].estimator]
         for row, point in zip(first, study["points"], strict=True):
-            assert (row.method, row.log_det_information) == (point["method"], point["log_det"])
+            assert (row.method, row.log_det_information) == (point["method"], point["told"])
             assert (row.violation_rate.estimate, list(row.violation_rate.ci95)) == (
                 point["rate"], point["interval"]
             )  # fmt: skip

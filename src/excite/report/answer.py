@@ -1,7 +1,8 @@
 """What a run answers, in a few sentences.
 
 A study: which excitation tells most and stays safe, and by how much. A record: whether it reached
-a safety level, and when. An identification: the parameters, and whether to believe them.
+a safety level, and when. An identification: the parameters, and whether to believe them. A
+campaign: whether its targets are reached, and how near it came to a level.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import math
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +19,14 @@ from ..description import RARE, Output, PlantDescription, display_unit, listed
 from ..record import Record
 from .numbers import digits_for, number
 from .rows import EstimatedParameter, EstimateSummary, Row, StudyFacts
-from .study_table import NUM_LABELS, StudyTable, gain_cell, has_gain, violations_cell
+from .study_table import (
+    NUM_LABELS,
+    StudyTable,
+    gain_cell,
+    has_gain,
+    information_of,
+    violations_cell,
+)
 from .tables import Table
 
 KNOWS_THE_PLANT = "clairvoyant"  # a reference, and no excitation that could be played
@@ -65,8 +74,13 @@ class Answer:
         """Of the table and the figure, to be copied."""
         row, left = self.rows[0], len(self.rows) - _MOST_ROWS
         more = f" {left} more are in the table of all results." * (left > 0)
+        gain = (
+            "Expected information gain (nats), information"
+            if has_gain(self.rows)
+            else "Information"
+        )
         return (
-            "Information (log det of the Fisher information), mean relative error of "
+            f"{gain} (log det of the Fisher information), mean relative error of "
             f"{row.estimator}, and experiments that reached a critical level, with the 95 % "
             f"interval of their share.{more}"
         )
@@ -82,14 +96,16 @@ def answered(rows: Sequence[Row], study: StudyFacts, claims: Mapping[str, str]) 
     """
     estimator = min({row.estimator: None for row in rows}, key=lambda name: _excess(rows, name))
     own = [row for row in rows if row.estimator == estimator]
-    ranked = sorted([r for r in own if r.method != KNOWS_THE_PLANT], key=_rank)
+    in_nats = has_gain(own)
+    ranked = [row for row in own if row.method != KNOWS_THE_PLANT]
+    ranked.sort(key=lambda row: _rank(row, in_nats))
     if not ranked:
         return Answer(tuple(own), None, None, ())
     safe = [row for row in ranked if row.violations == 0]
     best = safe[0] if safe else None
     classical = [row for row in ranked if row.method in study.methods and row is not best]
     usual = next((r for r in classical if r.method == _USUAL), classical[0] if classical else None)
-    told = _told(ranked, safe, best, usual)
+    told = _told(ranked, safe, best, usual, in_nats)
     if best is not None:
         found = claims.get(best.method, _UNSEARCHED)
         is_searched = not found.startswith(_UNSEARCHED)
@@ -102,9 +118,9 @@ _UNSEARCHED = "no certificate"
 _NOBODY = "it was not searched for violations (excite falsify)"
 
 
-def _rank(row: Row) -> tuple[bool, float]:
+def _rank(row: Row, in_nats: bool) -> tuple[bool, float]:
     """Excitations without a violation first, then by information; what is not finite is last."""
-    worth = row.log_det_information
+    worth = information_of(row, in_nats)
     return row.violations > 0, -worth if math.isfinite(worth) else math.inf
 
 
@@ -123,8 +139,7 @@ def best_columns(table: StudyTable) -> dict[str, set[int]]:
         smaller[column + 1] = [row.cramer_rao_percent[name] for row in rows]
     smaller[header.index("log det")] = [-row.log_det_information for row in rows]
     if "gain nats" in header:
-        gains = (math.nan if (g := row.expected_gain) is None else g.lower.mean for row in rows)
-        smaller[header.index("gain nats")] = [-value for value in gains]
+        smaller[header.index("gain nats")] = [-information_of(row, True) for row in rows]
     if "D-efficiency" in header:
         known = (math.nan if row.d_efficiency is None else row.d_efficiency for row in rows)
         smaller[header.index("D-efficiency")] = [-value for value in known]
@@ -161,7 +176,7 @@ def _excess(rows: Sequence[Row], estimator: str) -> tuple[bool, float]:
 
 
 def _told(
-    ranked: Sequence[Row], safe: Sequence[Row], best: Row | None, usual: Row | None
+    ranked: Sequence[Row], safe: Sequence[Row], best: Row | None, usual: Row | None, in_nats: bool
 ) -> tuple[str, ...]:
     """The answer in sentences."""
     if best is None:
@@ -174,7 +189,16 @@ def _told(
     told = f"{many} that reached no critical level in these experiments"
     told += f", {best.method} tells most about the plant" * (len(safe) > 1)
     told += f" is {best.method}" * (len(safe) == 1)
-    told += f": log det {best.log_det_information:.1f} of the Fisher information"
+    if in_nats:
+        told += f": an expected information gain of {gain_cell(best.expected_gain)} nats"
+        more = (
+            math.nan if usual is None else information_of(best, True) - information_of(usual, True)
+        )
+        if usual is not None and math.isfinite(more):
+            word = "more" if more >= 0 else "less"
+            told += f", {abs(more):.2g} nats {word} than {usual.method}"
+    else:
+        told += f": log det {best.log_det_information:.1f} of the Fisher information"
     if usual is not None and (gain := _gain(best, usual)) is not None:
         size = max(gain, 1 / gain)
         word = f"{size:.0f}" if size >= 10 else f"{size:.2g}"
@@ -233,6 +257,45 @@ def _reached(part: Output, time: np.ndarray, size: np.ndarray) -> str:
             return f"{first}{safe}: its largest value is {most}"
         below = named
     return f"{part.name} stayed below {below}: its largest value is {most}"
+
+
+def told_of_campaign(c: Mapping[str, Any]) -> tuple[str, ...]:
+    """How a campaign ended, what is known of its targets, and how near it came to a level.
+
+    Args:
+        c: content of `campaign.json`.
+    """
+    count, ended = len(c["rounds"]), c["reason"] or c["interrupted"] or "not ended"
+    told = f"After {c['num_samples']} samples in {count} round{'s' * (count != 1)}, {ended}"
+    found = [
+        f"{name} {_known(c['estimate'].get(name))} (asked: {target})"
+        for name, target in c["targets"].items()
+    ]
+    shown = found[:_MOST_PARAMETERS] + [f"{len(found) - _MOST_PARAMETERS} more"] * (
+        len(found) > _MOST_PARAMETERS
+    )
+    told = f"{told}: {listed(shown)}, with 95 % intervals." if shown else f"{told}."
+    nearest = max(
+        ((r["nearness"], i) for i, r in enumerate(c["rounds"], 1) if r["nearness"] is not None),
+        default=None,
+    )
+    if nearest is None:
+        return told, "Nothing was measured that says whether it was safe."
+    share, i = nearest
+    reached = "reached its critical level" if share >= 1 else "reached no critical level"
+    which = f"Round {i}" if share >= 1 else "The measured outputs"
+    return told, f"{which} {reached}: the nearest came to {100 * share:.0f} % of it."
+
+
+def _known(known: Mapping[str, Any] | None) -> str:
+    """A value with half of its interval, relative where it is not zero."""
+    if known is None:
+        return "not known"
+    value, half = known["estimate"], known["ci95_half"]
+    if half is None:
+        return f"= {number(value)}, its interval open"
+    size = f"{number(100 * half / abs(value), 2)} %" if value else f"{half:.2g}"
+    return f"= {number(value, digits_for(value, half))} ± {size}"
 
 
 def told_of_identification(result: EstimateSummary) -> tuple[str, ...]:

@@ -10,7 +10,13 @@ import matplotlib.figure
 from ..record.figure import add_legend, add_title, colour_of, new_figure
 from .answer import KNOWS_THE_PLANT
 from .rows import Row
+from .study_table import has_gain, information_of
 
+QUANTITY = {
+    False: "log det of the Fisher information",
+    True: "expected information gain [nats]",
+}
+"""What methods are compared by, by whether they have an expected gain."""
 _MARKERS = "osD^vP*X<>hpd"  # as many as share no factor with the colours
 
 
@@ -21,10 +27,11 @@ def frontier(rows: Sequence[Row]) -> list[str]:
     """
     own = [row for row in rows if row.estimator == rows[0].estimator]
     own = [row for row in own if row.method != KNOWS_THE_PLANT]
+    in_nats = has_gain(own)
     points = {
-        row.method: (row.log_det_information, -row.violation_rate.estimate)
+        row.method: (told, -row.violation_rate.estimate)
         for row in own
-        if math.isfinite(row.log_det_information)
+        if math.isfinite(told := information_of(row, in_nats))
     }
     return [
         method
@@ -37,13 +44,18 @@ def frontier_figure(rows: Sequence[Row], title: str) -> matplotlib.figure.Figure
     """Information of every method against its violation rate, with the rate's interval."""
     first = [row for row in rows if row.estimator == rows[0].estimator]
     figure, axes = new_figure(1, 1, height=4.6, width=7.6)
-    axis, below = axes[0, 0], -math.inf
-    values = [row.log_det_information for row in first]
+    axis, below, in_nats = axes[0, 0], -math.inf, has_gain(first)
+    drawn = [
+        (told, i, row)
+        for i, row in enumerate(first)
+        if math.isfinite(told := information_of(row, in_nats))
+    ]
+    values = [told for told, _, _ in drawn]
     gap = (max(values, default=0.0) - min(values, default=0.0)) / 26  # of two lines of text
-    for i, row in sorted(enumerate(first), key=lambda pair: pair[1].log_det_information):
+    for value, i, row in sorted(drawn, key=lambda own: own[:2]):
         rate, (low, high) = row.violation_rate.estimate, row.violation_rate.ci95
         bars = [[100 * max(0.0, rate - low)], [100 * max(0.0, high - rate)]]
-        value, style = row.log_det_information, {"color": colour_of(i)}
+        style = {"color": colour_of(i)}
         axis.errorbar(100 * rate, value, xerr=bars, marker="o", ms=5, capsize=2, **style)
         below = max(below + gap, value)
         axis.annotate(
@@ -52,7 +64,7 @@ def frontier_figure(rows: Sequence[Row], title: str) -> matplotlib.figure.Figure
         )  # fmt: skip
     axis.set_xscale("symlog", linthresh=0.1)
     axis.set(xlim=(-0.01, 110), xlabel="violations [% of experiments, 95 % interval]")
-    axis.set(ylabel="log det of the Fisher information")
+    axis.set(ylabel=QUANTITY[in_nats])
     add_title(figure, title)
     return figure
 

@@ -10,7 +10,7 @@ from .answer import answered
 from .estimates import parameter_cells
 from .numbers import number
 from .rows import EstimateSummary, Row
-from .study_table import StudyTable, violations_cell
+from .study_table import StudyTable, gain_cell, has_gain, violations_cell
 
 _MOST = 3  # parameters in a line
 
@@ -40,15 +40,22 @@ def of_identification(result: EstimateSummary) -> str:
 def of_study(table: StudyTable) -> str:
     """The most informative of its excitations without a violation."""
     answer = answered(table.rows, table.study, {})
-    return "no excitation without a violation" if answer.best is None else _line(answer.best)
+    if answer.best is None:
+        return "no excitation without a violation"
+    return _line(answer.best, has_gain(table.rows))
 
 
 def of_training(table: StudyTable) -> str:
     """What its agents reach."""
     rows = answered(table.rows, table.study, {}).rows
-    return "; ".join(_line(row) for row in rows if row.method in table.study.agents)
+    in_nats = has_gain(table.rows)
+    return "; ".join(_line(row, in_nats) for row in rows if row.method in table.study.agents)
 
 
-def _line(row: Row) -> str:
-    violations = violations_cell(row)
-    return f"{row.method}: log det {row.log_det_information:.2f}, violations {violations}"
+def _line(row: Row, in_nats: bool) -> str:
+    told = (
+        f"{gain_cell(row.expected_gain)} nats"
+        if in_nats
+        else f"log det {row.log_det_information:.2f}"
+    )
+    return f"{row.method}: {told}, violations {violations_cell(row)}"

@@ -240,6 +240,17 @@ def has_gain(rows: Sequence[Row]) -> bool:
     return any(row.expected_gain is not None for row in rows)
 
 
+def information_of(row: Row, in_nats: bool) -> float:
+    """What a method tells: the expected gain [nats] or log det of the Fisher information.
+
+    Args:
+        in_nats: whether it is compared with others that have an expected gain.
+    """
+    if not in_nats:
+        return row.log_det_information
+    return math.nan if row.expected_gain is None else row.expected_gain.lower.mean
+
+
 def _is_trained(rows: Sequence[Row]) -> bool:
     """Whether any of the rows is that of an agent."""
     return any(row.seeds is not None for row in rows)

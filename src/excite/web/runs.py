@@ -25,11 +25,18 @@ from ..description import PlantDescription
 from ..files import folder_word, json_ready
 from ..record import RECORD_KIND
 from ..report.answer import answered, best_columns
-from ..report.frontier import frontier
+from ..report.frontier import QUANTITY, frontier
 from ..report.key_figures import of_experiment, of_identification, of_study, of_training
 from ..report.rows import EstimateSummary, StudyFacts
 from ..report.sections.campaign import known_table, outcome, rounds_table
-from ..report.study_table import NUM_LABELS, StudyTable, footnotes, violations_cell
+from ..report.study_table import (
+    NUM_LABELS,
+    StudyTable,
+    footnotes,
+    has_gain,
+    information_of,
+    violations_cell,
+)
 from .requests import RefusedError, without_folders
 
 _TYPES = {
@@ -270,11 +277,11 @@ def _study(run: Path) -> dict[str, object]:
     except ValueError:
         return {}
     answer, first = answered(table.rows, table.study, {}), table.only(table.rows[0].estimator)
-    best = frontier(table.rows)
+    best, in_nats = frontier(table.rows), has_gain(table.rows)
     points = [
         {
             "method": row.method,
-            "log_det": row.log_det_information,
+            "told": information_of(row, in_nats),
             "rate": row.violation_rate.estimate,
             "interval": row.violation_rate.ci95,
             "violations": violations_cell(row),
@@ -288,6 +295,7 @@ def _study(run: Path) -> dict[str, object]:
         "estimator": answer.rows[0].estimator,
         "tables": {name: _methods(table.only(name)) for name in estimators},
         "points": json_ready(points),
+        "quantity": {"name": "gain in nats" if in_nats else "log det", "about": QUANTITY[in_nats]},
         "notes": footnotes(table.study, table.rows),
     }
 

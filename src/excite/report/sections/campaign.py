@@ -12,7 +12,8 @@ from ...description import PlantDescription, names_of
 from ...files import read_columns, read_json
 from ...record import Record
 from ...record.figure import episode_figure
-from ..content import Bullets, Element, Figure, Folded, Heading, Paragraph, Section, Table
+from ..answer import told_of_campaign
+from ..content import Answer, Bullets, Element, Figure, Folded, Heading, Paragraph, Section, Table
 from ..figures import knowledge_figure
 from ..numbers import digits_for, number
 from .elements import Marker, Run, again, facts, plant_facts, record_in, signals_table, understood
@@ -61,11 +62,12 @@ class CampaignRun(Run):
             title = f"{d.name}: {outcome(c)}"
             expected = f"Expected before the first round: {c['expected']}."
             parts = [
+                Answer(told_of_campaign(c)),
+                *self._knowledge(name),
                 *([Paragraph(expected)] if c["expected"] else []),
                 Bullets(list(map(str, c["warnings"]))),
                 Heading("What is known"),
                 Table(*known_table(d, c), name="What is known of each quantity"),
-                *self._knowledge(name),
                 Heading("Rounds"),
                 Table(*rounds_table(c["rounds"]), name="Rounds and their decisions"),
                 *_rivals(c["structure"]),

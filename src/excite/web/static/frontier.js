@@ -13,24 +13,24 @@ function svg(name, attributes, ...children) {
   return element;
 }
 
-/** A plot of points {method, log_det, rate, interval, violations, is_best} in `parent`. */
-export function drawFrontier(parent, every) {
+/** A plot of points {method, told, rate, interval, violations, is_best} in `parent`; what is told is a quantity {name, about}. */
+export function drawFrontier(parent, every, quantity) {
   const points = every.map((point) => ({ ...point, percent: 100 * point.rate, ends: point.interval.map((end) => 100 * end) }))
-    .sort((a, b) => a.percent - b.percent || a.log_det - b.log_det);
+    .sort((a, b) => a.percent - b.percent || a.told - b.told);
   const read = el("p", { role: "status" }, "Point at a method, or move from one to the next with the arrow keys.");
   const chart = el("div", {
     class: "frontier", tabindex: "0", role: "group", keydown: press, pointermove: point, pointerdown: point,
     "aria-label": "Information of each method over its share of violations. Arrow keys move from method to method.",
   });
   let active = -1, places = [];
-  parent.append(read, chart, el("p", { class: "hint below" }, "Vertical: log det of the Fisher information. Bars: 95 % intervals. Filled: no other method tells more with as few violations, or as much with fewer; one that knows the plant does not count."));
+  parent.append(read, chart, el("p", { class: "hint below" }, `Vertical: ${quantity.about}. Bars: 95 % intervals. Filled: no other method tells more with as few violations, or as much with fewer; one that knows the plant does not count.`));
 
   function mark(i) {
     active = i;
     [...chart.querySelectorAll(".method")].forEach((mark, k) => mark.classList.toggle("active", k === i));
     if (i < 0) return;
-    const { method, log_det: told, violations, is_best: isBest } = points[i];
-    const sentence = `${method}: log det ${shown(told, 4)}, violations ${violations}${isBest ? ", not beaten" : ""}`;
+    const { method, told, violations, is_best: isBest } = points[i];
+    const sentence = `${method}: ${quantity.name} ${shown(told, 4)}, violations ${violations}${isBest ? ", not beaten" : ""}`;
     if (read.textContent !== sentence) read.textContent = sentence;
   }
 
@@ -51,7 +51,7 @@ export function drawFrontier(parent, every) {
     const { clientWidth: width, clientHeight: height } = chart, right = width - RIGHT, bottom = height - BOTTOM;
     if (!chart.isConnected) resized.unobserve(chart);
     if (!width) return;
-    const decades = Math.log10(100 / LINEAR), [low, high] = range(points.map(({ log_det: told }) => told));
+    const decades = Math.log10(100 / LINEAR), [low, high] = range(points.map(({ told }) => told));
     const X = (percent) => LEFT + 12 + ((percent < LINEAR ? percent / LINEAR : 1 + Math.log10(percent / LINEAR)) / (1 + decades)) * (right - LEFT - 12);
     const Y = (told) => bottom - ((told - low) / (high - low)) * (bottom - TOP);
     const line = (x1, y1, x2, y2, name) => svg("line", { x1, y1, x2, y2, class: name });
@@ -61,7 +61,7 @@ export function drawFrontier(parent, every) {
       ...ticks(low, high, 5).flatMap((y) => [line(LEFT, Y(y), right, Y(y), "grid"), text(LEFT - 6, Y(y) + 4, "end", String(+y.toPrecision(4)))]),
       text((LEFT + right) / 2, height - 6, "middle", "violations, % of experiments"),
     ];
-    places = points.map((own) => ({ x: X(own.percent), y: Y(own.log_det) }));
+    places = points.map((own) => ({ x: X(own.percent), y: Y(own.told) }));
     const best = places.filter((_, i) => points[i].is_best), stairs = best.flatMap(({ x, y }, i) => [`${x},${i ? best[i - 1].y : bottom}`, `${x},${y}`]);
     const methods = points.map((own, i) => {
       const { x, y } = places[i], isLate = x > (LEFT + right) / 2;

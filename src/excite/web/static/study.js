@@ -6,7 +6,7 @@ import { drawFrontier } from "./frontier.js";
 let chosen = ""; // the estimator, also for the next study that has it
 
 /** Cards of a study, as the server tells it. */
-export function study({ sentences, estimator, tables, points, notes }) {
+export function study({ sentences, estimator, tables, points, quantity, notes }) {
   const names = Object.keys(tables), select = el("select", { id: "study-estimator", change: () => { chosen = select.value; fill(); } });
   const shown = el("table"), marked = el("p", { class: "hint below" });
   options(select, names, names.includes(chosen) ? chosen : estimator);
@@ -27,9 +27,9 @@ export function study({ sentences, estimator, tables, points, notes }) {
     el("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Table of the study" }, shown), marked,
     el("details", {}, el("summary", {}, "What the columns say"), ...notes.map((text) => el("p", { class: "hint below" }, text))),
   ];
-  const drawn = points.filter(({ log_det: told }) => told !== null);
+  const drawn = points.filter(({ told }) => told !== null);
   if (drawn.length < 2) return { parts, card: null };
   const card = el("section", { class: "card" }, el("h2", {}, "Information against violations"));
-  drawFrontier(card, drawn);
+  drawFrontier(card, drawn, quantity);
   return { parts, card };
 }
