@@ -247,6 +247,68 @@ def test_nothing_is_overwritten(client: TestClient, runs: Path):
     assert (runs / "some" / "chirp" / "run.json").is_file()
 
 
+def test_what_appears_at_the_instant_of_a_deletion_is_not_overwritten(
+    client: TestClient, runs: Path, record: Path, monkeypatch: pytest.MonkeyPatch
+):
+    deletion = delete(client, "some/rig.csv").json()["deletion"]
+    link = os.link
+
+    def late(here: Path, there: Path, **how: bool) -> None:
+        if there == record:
+            record.write_text("of another process")
+        link(here, there, **how)
+
+    with monkeypatch.context() as changed:
+        changed.setattr(os, "link", late)
+        answer = client.delete(f"/api/deletions/{deletion}")
+        assert answer.status_code == 409
+        assert answer.json()["sentence"] == "some/rig.csv exists already; nothing was moved"
+    assert record.read_text() == "of another process"
+    assert not record.with_suffix(".json").exists()  # it was moved back
+    record.unlink()
+    # Without links, too; and where nothing can be moved back, a sentence says what is where.
+    with monkeypatch.context() as changed:
+
+        def without(*_: object, **__: object) -> None:
+            raise PermissionError
+
+        rename, moved = os.rename, list[str]()
+
+        def once(here: Path, there: Path) -> None:
+            moved.append(Path(here).name)
+            if len(moved) > 1:
+                raise OSError(5, "Input/output error")
+            rename(here, there)
+
+        changed.setattr(os, "link", without)
+        changed.setattr(os, "rename", once)
+        answer = client.delete(f"/api/deletions/{deletion}")
+        assert (answer.status_code, moved) == (409, ["rig.json", "rig.csv", "rig.json"])
+        assert answer.json()["sentence"] == (
+            "some/rig.csv cannot be moved (Input/output error), but rig.json cannot be moved back "
+            "from runs"
+        )
+
+
+def test_a_sidecar_is_read_once_while_it_does_not_change(
+    client: TestClient, record: Path, monkeypatch: pytest.MonkeyPatch
+):
+    client.get("/api/runs")
+    read, read_text = list[str](), Path.read_text
+
+    def counted(path: Path, *given: str, **named: str) -> str:
+        read.append(path.name)
+        return read_text(path, *given, **named)
+
+    monkeypatch.setattr(Path, "read_text", counted)
+    assert client.get("/api/runs").is_success
+    assert read == []
+    write_json(record.with_suffix(".json"), read_json(record.with_suffix(".json")))
+    read.clear()
+    assert client.get("/api/runs").is_success
+    assert set(read) == {"rig.json"}
+
+
 def test_a_link_is_not_followed_by_a_deletion(client: TestClient, runs: Path, tmp_path: Path):
     deletion = delete(client, "some/chirp", "some/prbs").json()["deletion"]
     (tmp_path / "elsewhere").mkdir()

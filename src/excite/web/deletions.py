@@ -109,19 +109,60 @@ def _move(runs: Mapping[str, Path], folder: Path) -> None:
         for name, run in runs.items():
             for here in files_of(run).values() if run.is_file() else [run]:
                 there = (folder / name).with_name(here.name)
+                where = there.relative_to(folder).as_posix()
                 if os.path.lexists(there):
-                    where = there.relative_to(folder).as_posix()
                     raise RefusedError(409, f"{where} exists already; nothing was moved")
                 try:
                     there.parent.mkdir(parents=True, exist_ok=True)
-                    os.replace(here, there)  # refuses a folder that is not empty
+                    _rename(here, there)
+                except FileExistsError:
+                    raise RefusedError(409, f"{where} exists already; nothing was moved") from None
                 except OSError as error:
                     raise RefusedError(409, f"{name} cannot be moved ({error.strerror})") from None
                 done.append((here, there))
-    except RefusedError:
-        for here, there in reversed(done):
-            os.replace(there, here)
+    except RefusedError as refused:
+        left = [there for here, there in reversed(done) if not _is_renamed(there, here)]
+        if left:
+            names = ", ".join(sorted(there.name for there in left))
+            raise RefusedError(
+                409, f"{refused.sentence}, but {names} cannot be moved back from {folder.name}"
+            ) from None
         raise
+
+
+def _rename(here: Path, there: Path) -> None:
+    """Renames a file or a folder; FileExistsError where something is there by now.
+
+    A file gets its new name beside the old one, which fails where there is another. `os.rename`
+    of a folder replaces at most an empty one; a file on a file system without hard links is the
+    only one that could replace what appears between the look and the renaming.
+    """
+    if not here.is_dir():
+        try:
+            os.link(here, there, follow_symlinks=False)
+        except FileExistsError:
+            raise
+        except OSError:
+            pass  # no links here
+        else:
+            try:
+                os.unlink(here)
+            except OSError:
+                os.unlink(there)
+                raise
+            return
+    if os.path.lexists(there):
+        raise FileExistsError(str(there))
+    os.rename(here, there)
+
+
+def _is_renamed(here: Path, there: Path) -> bool:
+    """Renames back; whether that succeeded."""
+    try:
+        _rename(here, there)
+    except OSError:
+        return False
+    return True
 
 
 def _remove_empty(place: Path) -> None:

@@ -96,8 +96,26 @@ def found(folder: Path) -> dict[str, Path]:
 
 def _is_record(path: Path, beside: Collection[str]) -> bool:
     """Whether a file is a record with its sidecar, and neither is a link."""
-    is_named = path.suffix == ".csv" and path.with_suffix(".json").name in beside
-    return is_named and not path.is_symlink() and _marker(path).get("kind") == RECORD_KIND
+    sidecar = path.with_suffix(".json")
+    is_named = path.suffix == ".csv" and sidecar.name in beside
+    return is_named and not path.is_symlink() and _is_of_record(path, _written(sidecar))
+
+
+@lru_cache(8 * _MAX_RUNS)
+def _is_of_record(path: Path, written: object) -> bool:
+    """Whether the sidecar of a file is that of a record, read again when it was written."""
+    del written
+    return _marker(path).get("kind") == RECORD_KIND
+
+
+def _written(*paths: Path) -> tuple[tuple[int, ...], ...]:
+    """What changes when one of some files is written."""
+    found = list[tuple[int, ...]]()
+    for path in paths:
+        with contextlib.suppress(OSError):  # there is none, or it was removed in the meantime
+            seen = path.lstat()
+            found.append((seen.st_mtime_ns, seen.st_size, seen.st_ino))
+    return tuple(found)
 
 
 def _is_text(name: str) -> bool:
@@ -162,12 +180,8 @@ def _json(run: Path, name: str) -> dict[str, object]:
 
 
 def _summary(name: str, run: Path) -> dict[str, object]:
-    written = list[tuple[int, ...]]()
-    for path in (run.with_suffix(".json"), *(run / file for file in _RESULTS)):
-        with contextlib.suppress(OSError):  # there is none, or it was removed in the meantime
-            seen = path.lstat()
-            written.append((seen.st_mtime_ns, seen.st_size, seen.st_ino))
-    return {"name": name, "changed": _changed(run), **_found_in(run, tuple(written))}
+    written = _written(run.with_suffix(".json"), *(run / file for file in _RESULTS))
+    return {"name": name, "changed": _changed(run), **_found_in(run, written)}
 
 
 @lru_cache(2 * _MAX_RUNS)
