@@ -1,3 +1,4 @@
+import contextlib
 import json
 import math
 from pathlib import Path
@@ -18,7 +19,8 @@ from excite.information import best_possible
 from excite.plant import EMPS, Aero2, draw_params
 from excite.report.study_table import footnotes
 from excite.study import methods as benchmark
-from excite.study.run import opened, run_study
+from excite.study.progress import write_phase, write_progress
+from excite.study.run import _live, opened, run_study
 from excite.study.spec import Study, study_from
 from excite.study.statistics import wilson
 from excite.study.table import finished_table
@@ -446,3 +448,48 @@ def test_a_table_says_what_its_plants_differ_in():
     assert "in addition d_S ± 10 %, initial_pitch -0.1 to 0.1" in notes
     assert "clairvoyant signals are for plants of the spread alone" in notes
     assert "in addition" not in " ".join(footnotes(benchmark.facts(tiny()), ()))
+
+
+def test_a_start_that_fails_leaves_no_folder(tmp_path):
+    """But what was there before, and what was finished, stays."""
+    folder, markers = tmp_path / "new" / "run", ["run.json"]
+
+    def fail(*files: str) -> bool:
+        with contextlib.suppress(KeyError), locked_folder(folder, "this study", markers):
+            for file in files:
+                (folder / file).write_text("{}")
+            raise KeyError
+        return folder.exists()
+
+    assert not fail()
+    assert not fail("run.json")
+    assert fail("run.json", "methods.json")
+    (folder / "methods.json").unlink()
+    assert fail("run.json")
+
+
+def test_a_study_whose_tasks_all_fail_leaves_no_folder(tmp_path, monkeypatch):
+    study = tiny(agents={"a": {"method": "gradient"}})
+    error = ValueError("no memory")
+    failing = lambda _, tasks, *__, **___: dict.fromkeys(tasks, error)  # noqa: E731
+    monkeypatch.setattr("excite.study.run.run", failing)
+    with pytest.raises(ValueError, match=r"no memory\); nothing is finished$"):
+        run_study(study, tmp_path / "run", workers=1)
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_phase_of_a_training_is_told(tmp_path):
+    study, place = tiny(agents={"a": {"method": "gradient"}}), tmp_path / "seeds" / "a" / "0"
+    place.mkdir(parents=True)
+
+    def live() -> tuple[float, str]:
+        return _live(study, ("seed", "a", 0), tmp_path)
+
+    assert live() == (0.0, "")
+    write_phase(place, "compiling")
+    assert live() == (0.0, "a seed 0: compiling")
+    write_progress(place, {"steps": 250 * 64 * study.num_steps, "return": 3.0})
+    write_phase(place, "")
+    assert live() == (0.25, "a seed 0: updating 250 of 1,000; return 3")
+    write_phase(place, "evaluating")
+    assert live() == (0.25, "a seed 0: evaluating")

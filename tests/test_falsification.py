@@ -580,7 +580,7 @@ def test_a_policy_that_is_kept_although_a_search_broke_it_is_warned_of(tmp_path)
     assert policy.certificate["nearness"] > 1
     assert policy.certificate["num_steps"] == 5
     assert any("searching for violations" in text for text in told)
-    assert not list(tmp_path.rglob("search.json"))
+    assert not list(tmp_path.rglob("phase.json"))
 
 
 def test_ppo_takes_no_uncertainty():

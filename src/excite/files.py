@@ -20,7 +20,7 @@ import shutil
 import sys
 import tempfile
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any, TypeVar
 
@@ -262,8 +262,16 @@ def took_lock(file: IO[Any]) -> bool:
 
 
 @contextlib.contextmanager
-def locked_folder(folder: Path, what: str) -> Iterator[None]:
-    """The folder, created if missing, for one process at a time; ValueError otherwise."""
+def locked_folder(folder: Path, what: str, markers: Collection[str] = ()) -> Iterator[None]:
+    """The folder, created if missing, for one process at a time; ValueError otherwise.
+
+    Where that fails, a new folder that holds no file but the markers is removed.
+
+    Args:
+        what: is done in it.
+        markers: names of files that say what is done, and hold nothing of its result.
+    """
+    is_new = not folder.exists()
     if folder.is_file():
         raise ValueError(f"{folder} exists and is no run folder; choose another name")
     try:
@@ -274,7 +282,17 @@ def locked_folder(folder: Path, what: str) -> Iterator[None]:
     with lock:
         if not took_lock(lock):
             raise ValueError(f"{folder}: another process is working on {what}")
-        yield
+        try:
+            yield
+        except BaseException:
+            if is_new and holds_only(folder, markers):
+                shutil.rmtree(folder, ignore_errors=True)
+            raise
+
+
+def holds_only(folder: Path, names: Collection[str]) -> bool:
+    """Whether all files of a folder and those in it have one of these names, or are its lock."""
+    return {path.name for path in folder.rglob("*") if not path.is_dir()} <= {".lock", *names}
 
 
 def is_class_word(name: str) -> bool:

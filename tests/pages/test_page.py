@@ -768,16 +768,55 @@ def test_a_training_is_started_and_stopped(address: str, page: Page):
     ready(page, address, "training")
     page.get_by_label("Updates").fill("50000")
     page.locator("#training-steps").fill("50")
+    page.get_by_label("Seeds").fill("2")
+    expect(page.locator("#resources")).to_contain_text("64 plants an update, 320 million samples")
     page.get_by_role("button", name="Start").click()
     card = page.locator("#trainings section")
     expect(card.get_by_role("status")).to_contain_text("starting", timeout=WAIT)
     expect(card.locator("code")).to_contain_text("excite train aero2 --objective D")
-    expect(card.get_by_role("status")).to_have_text("training", timeout=3 * WAIT)
+    expect(card.locator(".progress")).to_contain_text(re.compile("seed [01]: "), timeout=WAIT)
+    expect(card.get_by_role("status")).to_have_text("training", timeout=WAIT)
+    expect(card.locator(".progress")).to_contain_text("of 50,000", timeout=WAIT)
     expect(card.locator("canvas")).to_have_count(5)  # what the curve is drawn on
-    expect(card.locator("figcaption").nth(2)).to_have_text(re.compile(r"^bound of Jp %[\d.]+PNG"))
+    expect(card.locator("figcaption").nth(2)).to_have_text(re.compile(r"^bound of Jp %"))
+    card.get_by_role("button", name="Stop").click()
+    expect(card.get_by_role("status")).to_contain_text("stopped", timeout=WAIT)
+    card.get_by_role("button", name="Resume").click()
+    expect(card.get_by_role("status")).to_contain_text("starting", timeout=WAIT)
     card.get_by_role("button", name="Stop").click()
     expect(card.get_by_role("status")).to_contain_text("stopped", timeout=WAIT)
     require_no_sideways_scroll(page)
+
+
+def test_learning_curves_are_smoothed_on_scales_without_outliers(address: str, page: Page):
+    """Two seeds of thin lines; one value far from the others is told, and shown on request."""
+    page.goto(f"{address}/#runs/a_study")
+    expect(page.locator("#run-view canvas")).to_have_count(3)
+    place = "document.querySelector('#run-view .plots')"
+    page.evaluate(f"""async () => {{
+      const {{ curves }} = await import("/static/curves.js"), parent = {place};
+      const steps = Array.from({{ length: 20 }}, (_, k) => k);
+      const own = (seed) => ({{ agent: "a", is_bound: false, columns: {{ steps,
+        return: steps.map((k) => (k || seed ? k : -1e6)), violation_rate: steps.map(() => 0) }} }});
+      parent.previousElementSibling.remove();
+      parent.replaceChildren();
+      curves(parent, [own(0), own(1)]);
+    }}""")
+    plot = PLOT.format("#run-view .plots .chart", 0)
+    note = page.locator("#run-view .plots figcaption").first
+    expect(note).to_contain_text("1 outside")
+    poll(page, f"{plot}.u?.series.length === 3")
+    low, high, width = page.evaluate(f"[...{plot}.what.y, {plot}.what.lines[0].width]")
+    assert -100 < low < 0 < 19 < high < 100
+    assert width == 1
+    page.get_by_label("scales with outliers").check()
+    expect(note).not_to_contain_text("outside")
+    assert page.evaluate(f"{plot}.what.y[0]") < -1e6
+    page.get_by_label("scales with outliers").uncheck()
+    page.get_by_label("Smoothing").fill("0.5")
+    # Behind each smoothed line is what was measured: after 0, 1, 2 the mean (0/4 + 1/2 + 2) / 1.75.
+    assert page.evaluate(f"{plot}.what.lines.length") == 4
+    assert page.evaluate(f"{plot}.what.lines[3].y[2]") == pytest.approx(2.5 / 1.75)
 
 
 def test_a_link_in_a_foreign_page_leaves_the_browser_its_own(address: str, page: Page):

@@ -48,7 +48,7 @@ from excite.web.requests import MAX_UPLOAD, RefusedError
 from excite.web.runs import found
 from excite.web.security import MAX_TRIES, _source
 from excite.web.sessions import MAX_JOBS, MAX_SESSIONS, PageSettings, Place, Session, Sessions
-from excite.web.trainings import Training, _free
+from excite.web.trainings import Training, TrainingStatus, _free
 
 HERE = "http://127.0.0.1:8000"
 TRAINING = {
@@ -959,13 +959,67 @@ def test_the_page_offers_what_can_be_trained_for(page: TestClient):
 
 def test_a_long_learning_curve_is_thinned(tmp_path: Path):
     training = Training("x", tmp_path, ["train", "aero2", "--objective", "D"])
-    (tmp_path / "seeds" / "agent" / "0").mkdir(parents=True)
+    progress = tmp_path / "seeds" / "agent" / "0" / "progress.json"
+    progress.parent.mkdir(parents=True)
     for i in range(2000):
-        write_json(tmp_path / "seeds" / "agent" / "0" / "progress.json", {"steps": i})
+        progress.write_text(f'{{"steps": {i}}}')
         training._look()
-    steps = [row["steps"] or 0.0 for row in training.told()["curve"]]
+    steps = [row["steps"] or 0.0 for row in training.told()["curves"]["0"]]
     assert len(steps) <= 501
     assert (steps[0], steps[-1], steps) == (0, 1999, sorted(steps))
+    progress.write_text('{"steps": 1500}')
+    training._look()  # it was resumed from a checkpoint
+    resumed = [row["steps"] or 0.0 for row in training.told()["curves"]["0"]]
+    assert resumed == [step for step in steps if step < 1500] + [1500]
+
+
+FAILING = """
+import os, pathlib, sys
+if "train" in sys.orig_argv:
+    folder = pathlib.Path(sys.orig_argv[-1])
+    folder.mkdir(exist_ok=True)
+    (folder / "methods.json").write_text("{}")
+    print("aero2: agent seed 0: compiling, 3 s so far", file=sys.stderr)
+    print("the last words", file=sys.stderr)
+    print("aero2, 4 s so far", file=sys.stderr, flush=True)
+    os._exit(1)
+"""
+
+
+def test_a_training_that_fails_at_its_start_leaves_no_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    (tmp_path / "sitecustomize.py").write_text(FAILING)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    folder = tmp_path / "mine"
+
+    async def ended(is_resumable: bool) -> TrainingStatus:
+        training = Training("x", folder, ["train", "aero2", "--objective", "D"])
+        if is_resumable:
+            (folder / "seeds" / "agent" / "0").mkdir(parents=True)
+            (folder / "seeds" / "agent" / "0" / "checkpoint.safetensors").write_text("")
+        await training.start()
+        assert training._followed is not None
+        await training._followed
+        return training.told()
+
+    told = asyncio.run(ended(is_resumable=False))
+    assert (told["state"], told["sentence"]) == ("failed", "the last words")
+    assert told["progress"] == ""
+    assert not folder.exists()
+    assert asyncio.run(ended(is_resumable=True))["state"] == "failed"
+    assert folder.exists()
+
+
+def test_what_a_training_does_is_told_as_in_a_terminal(tmp_path: Path):
+    training = Training("x", tmp_path, ["train", "aero2", "--objective", "D"])
+    training._said = (
+        b"warning: aero2: old\n"
+        b"aero2: agent seed 0: updating 120 of 2,000; return 3, 6 %, 4 min left\n"
+        b"finished: methods\naero2: agent seed 0: upda"
+    )
+    expected = "agent seed 0: updating 120 of 2,000; return 3, 6 %, 4 min left"
+    assert training.told()["progress"] == expected
 
 
 def test_a_full_store_takes_no_more(page: TestClient, monkeypatch: pytest.MonkeyPatch):
@@ -1014,21 +1068,25 @@ def test_a_browser_cannot_see_or_stop_what_is_anothers(address: str, client, tol
         assert kinds[-1] == "end"
 
 
-def test_a_browser_cannot_see_or_stop_anothers_training(tmp_path: Path):
-    asked = {**TRAINING, "updates": 100_000}
+def test_any_browser_with_a_session_stops_a_training_and_resumes_it(tmp_path: Path):
+    asked = {**TRAINING, "updates": 100_000, "seeds": 2}
     with (
         served(tmp_path, "--workers", "1") as where,
         browser(where) as own,
         browser(where) as other,
     ):
         name = own.post("/api/trainings", json=asked).json()["name"]
-        assert other.get("/api/trainings").json() == {"trainings": []}
-        assert other.delete(f"/api/trainings/{name}").status_code == 404
-        [training] = own.get("/api/trainings").json()["trainings"]
+        assert other.post(f"/api/trainings/{name}", json={}).status_code == 409  # it runs
+        told = other.get("/api/trainings").json()
+        [training] = told["trainings"]
         assert training["state"] in ("starting", "training")
+        assert training["command"].endswith("--set num_updates=100000 --seeds 2 --out mine")
+        assert told["resources"]["running"] == 1
         assert trainings_in(tmp_path)
-        assert own.delete(f"/api/trainings/{name}").json()["state"] == "stopped"
+        assert other.delete(f"/api/trainings/{name}").json()["state"] == "stopped"
         assert not trainings_in(tmp_path)
+        assert other.post(f"/api/trainings/{name}", json={}).json()["state"] == "starting"
+        assert own.post("/api/trainings/x", json={}).status_code == 404
 
 
 def test_a_browser_has_so_many_things_under_way(tmp_path: Path):
@@ -1063,8 +1121,8 @@ def test_what_computes_is_not_idle(tmp_path: Path):
     busy, done = sessions.get(first), sessions.get(second)
     assert busy is not None
     assert done is not None
-    busy.trainings["x"], done.trainings["x"] = (Training("x", tmp_path, []) for _ in range(2))
-    done.trainings["x"].state = "finished"
+    busy.begin()
+    done.kept["x"] = Place(tmp_path, "upload")
     sessions.new()
     assert sessions.get(first) is busy
     assert sessions.get(second) is done, "what holds nothing goes first"

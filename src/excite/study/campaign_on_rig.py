@@ -135,7 +135,7 @@ def campaign(
         made.require_reachable()
     for sentence in made.warnings:
         on_warning(sentence)
-    with locked_folder(root, "this campaign"):
+    with locked_folder(root, "this campaign", ["run.json", "campaign.json"]):
         folder.resume(made, on_round)
         while not made.reason and not made.interrupted:
             count = len(made.rounds)

@@ -1,6 +1,7 @@
 """Progress of a training: `progress.json` beside the checkpoint of every running seed.
 
-`search.json` says how far the search for violations is that follows.
+`phase.json` says what else is done before and after: compiling, searching for violations,
+evaluating.
 
 The worker that trains writes it. The command line and the bench page read it without JAX.
 """
@@ -13,7 +14,9 @@ from pathlib import Path
 
 from ..files import write_json
 
-_NAME, _SEARCH = "progress.json", "search.json"
+_NAME, _PHASE = "progress.json", "phase.json"
+FILES = (_NAME, _PHASE)
+"""Their names."""
 
 
 def write_progress(seed_folder: Path, look: Mapping[str, float]) -> None:
@@ -39,20 +42,20 @@ def _is_number(value: object) -> bool:
     return value is None or isinstance(value, int | float)
 
 
-def write_search(seed_folder: Path, text: str) -> None:
-    """Stores how far the search for violations is that follows a training."""
-    write_json(seed_folder / _SEARCH, {"text": text})
+def write_phase(seed_folder: Path, text: str) -> None:
+    """Stores what is done before or after the updates of a training; empty: these are made."""
+    write_json(seed_folder / _PHASE, {"text": text})
 
 
-def read_search(seed_folder: Path) -> str:
-    """How far that search is; empty where it has not begun."""
+def read_phase(seed_folder: Path) -> str:
+    """What is done before or after the updates; empty while these are made, or nothing is done."""
     try:
-        return str(json.loads((seed_folder / _SEARCH).read_text(encoding="utf-8"))["text"])
+        return str(json.loads((seed_folder / _PHASE).read_text(encoding="utf-8"))["text"])
     except (OSError, ValueError, RecursionError, LookupError, TypeError):
         return ""
 
 
 def remove_progress(seed_folder: Path) -> None:
     """Removes the files after the training."""
-    (seed_folder / _NAME).unlink(missing_ok=True)
-    (seed_folder / _SEARCH).unlink(missing_ok=True)
+    for name in FILES:
+        (seed_folder / name).unlink(missing_ok=True)

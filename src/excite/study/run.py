@@ -25,6 +25,7 @@ from .. import __version__
 from ..description import path_from, require_whole
 from ..files import (
     csv_text,
+    holds_only,
     json_ready,
     locked_folder,
     new_run_folder,
@@ -48,7 +49,8 @@ from .example_episodes import episodes_data, example_episodes
 from .folder import advice, agent_settings, fingerprint, read_json, seed_folder, study_of
 from .methods import compared, method_rows
 from .pool import num_cores
-from .progress import read_progress, read_search, remove_progress
+from .progress import FILES as PROGRESS_FILES
+from .progress import read_phase, read_progress, remove_progress
 from .spec import Study, read_study
 from .table import best_seeds, learning_curves, study_table, too_near
 from .tasks import clairvoyant_task, methods_task, safety_task, seed_task
@@ -67,6 +69,7 @@ _TASKS = {
     "seed": seed_task,
     "safety": safety_task,
 }
+_MARKERS = ("study.json", "run.json")
 
 
 class StudyFailedError(RuntimeError):
@@ -203,9 +206,10 @@ def _failed(failures: Mapping[str, Exception], folder: Path) -> Exception:
         names.setdefault(str(error), []).append(name)
     reasons = "; ".join(f"{', '.join(some)}: {reason}" for reason, some in names.items())
     is_mistake = all(isinstance(error, ValueError) for error in failures.values())
+    kept = f"what is finished is kept in {folder}; rerun the same command to resume"
     return (ValueError if is_mistake else StudyFailedError)(
-        f"{len(failures)} task{'s' * (len(failures) > 1)} failed ({reasons}); what is finished "
-        f"is kept in {folder}; rerun the same command to resume"
+        f"{len(failures)} task{'s' * (len(failures) > 1)} failed ({reasons}); "
+        f"{kept if folder.exists() else 'nothing is finished'}"
     )
 
 
@@ -257,11 +261,10 @@ def opened(
         ValueError: where the folder is not a run folder, holds another study, or is in use.
     """
     every = _checkpoint_seconds()
-    markers = {"study.json", "run.json"}
-    is_begun = folder.is_dir() and bool({p.name for p in folder.iterdir()} - {*markers, ".lock"})
-    if is_begun and not any((folder / name).is_file() for name in markers):
+    is_begun = folder.is_dir() and bool({p.name for p in folder.iterdir()} - {*_MARKERS, ".lock"})
+    if is_begun and not any((folder / name).is_file() for name in _MARKERS):
         raise ValueError(f"{folder} exists and is no run folder; choose another name")
-    with locked_folder(folder, "this study"):
+    with locked_folder(folder, "this study", [*_MARKERS, *PROGRESS_FILES]):
         plant, text = study.build_plant(), _plant_text(study)
         marker = {**_marker(study, plant, text), "command": command}
         if overwrite:
@@ -407,6 +410,7 @@ def run_tasks(
     Returns:
         The error of each task that failed after all tries.
     """
+    is_new = not folder.exists()
     with opened(study, folder, command, overwrite) as tasks:
         targets = _names(study)
         if tasks:  # an earlier table is outdated
@@ -435,6 +439,8 @@ def run_tasks(
             if kind == "safety":
                 chosen = _with_policies(chosen, targets, folder)
             failures |= run(function, chosen, engine, on_done=finished, on_tick=tick)
+        if failures and is_new and holds_only(folder, [*_MARKERS, *PROGRESS_FILES]):
+            shutil.rmtree(folder, ignore_errors=True)  # nothing is finished
         return failures
 
 
@@ -509,14 +515,14 @@ def _live(study: Study, target: _Target, folder: Path) -> tuple[float, str]:
         return float((where / f"{kind}.json").is_file()), ""
     if (place / "metrics.json").is_file():
         return 1.0, ""
-    row = read_progress(place)
+    row, phase = read_progress(place), read_phase(place)
+    own, steps = study.agent(agent), 0.0 if row is None else row["steps"] or 0.0
+    share = steps / own.total_steps(study.num_steps)
+    if phase:
+        return share, f"{agent} seed {seed}: {phase}"
     if row is None:
-        return 0.0, ""
-    own, steps = study.agent(agent), row["steps"] or 0.0
-    if part := read_search(place):
-        return 1.0, f"{agent} seed {seed}: searching for violations ({part})"
-    stage = f"{agent} seed {seed}: {own.stage(steps, study.num_steps)}"
-    return steps / own.total_steps(study.num_steps), f"{stage}; {_looks(row)}"
+        return share, ""
+    return share, f"{agent} seed {seed}: {own.stage(steps, study.num_steps)}; {_looks(row)}"
 
 
 def _looks(row: Mapping[str, float | None]) -> str:

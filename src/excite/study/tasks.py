@@ -35,7 +35,7 @@ from .agent import Agent
 from .falsify import falsify
 from .folder import agent_settings, fingerprint
 from .methods import CHUNK, episode_keys, evaluate_method, method_rows, player_of, scores
-from .progress import write_progress, write_search
+from .progress import write_phase, write_progress
 from .spec import Study, study_from
 from .statistics import table_row
 
@@ -104,6 +104,7 @@ def seed_task(
         mark, own = fingerprint(chosen, built, agent), chosen.agent(agent)
         place = Path(folder) if folder and Path(folder).is_dir() else None
         keeper = _Keeper(place, mark, checkpoint_seconds)
+        keeper.enter("compiling")
         env = chosen.env(agent, built)
         trained = _trained(env, own, seed, keeper)
         seconds = keeper.seconds()
@@ -117,6 +118,7 @@ def seed_task(
         policy = Policy(built.description, env.layout, trained.weights, provenance)
         if env.uncertainty is not None:
             policy = falsify(policy, built, progress=keeper.searching).certified()
+        keeper.enter("evaluating")
         rows, rms = evaluate_method(chosen, built, agent, PolicyExcitation.of(policy))
         limit = np.array(policy.layout.input_half)
         metrics = SeedMetrics(
@@ -149,7 +151,7 @@ class _Keeper:
         self.path = None if folder is None else folder / "checkpoint.safetensors"
         self.log_folder = None if folder is None else str(folder / "tensorboard")
         self.before, self.start, self.last = 0.0, time.monotonic(), time.monotonic()
-        self.last_search = 0.0
+        self.last_search, self.num_boundaries = 0.0, 0
 
     def seconds(self) -> float:
         """Training time so far [s], that before an interruption included."""
@@ -174,6 +176,9 @@ class _Keeper:
         """Called at every boundary."""
         if self.folder is None or self.path is None:
             return
+        self.num_boundaries += 1
+        if self.num_boundaries == 2:  # the first update is compiled and made
+            self.enter("")
         if row is not None:
             write_progress(self.folder, row)
         if time.monotonic() - self.last >= self.every:
@@ -183,11 +188,15 @@ class _Keeper:
             write_bytes(self.path, dataclasses.replace(made, state=state).to_bytes())
             self.last = time.monotonic()
 
+    def enter(self, phase: str) -> None:
+        """Says what is done before and after the updates."""
+        if self.folder is not None:
+            write_phase(self.folder, phase)
+
     def searching(self, part: str, done: float, total: float) -> None:
         """Called during the search for violations after the training."""
-        is_due = time.monotonic() - self.last_search >= 1 or done == total
-        if self.folder is not None and is_due:
-            write_search(self.folder, f"{part}, {100 * done / total:.0f} %")
+        if time.monotonic() - self.last_search >= 1 or done == total:
+            self.enter(f"searching for violations ({part}, {100 * done / total:.0f} %)")
             self.last_search = time.monotonic()
 
 

@@ -15,7 +15,6 @@ from pathlib import Path
 
 from ..study.pool import num_cores
 from .requests import RefusedError
-from .trainings import Training
 
 MAX_JOBS = 4
 """Largest number of jobs that a browser may run at once."""
@@ -104,13 +103,11 @@ class Session:
         folder: its uploads and results.
         stops: functions that stop the running jobs, by name; None for a short one.
         kept: results and uploads by name, the one used last at the end.
-        trainings: trainings it has started, by name.
     """
 
     folder: Path
     stops: dict[str, asyncio.Event | None] = field(default_factory=dict)
     kept: dict[str, Place] = field(default_factory=dict)
-    trainings: dict[str, Training] = field(default_factory=dict)
     seen: float = field(default_factory=time.monotonic)
 
     @contextlib.contextmanager
@@ -152,12 +149,12 @@ class Session:
     @property
     def is_empty(self) -> bool:
         """Whether it holds no data."""
-        return not (self.kept or self.trainings)
+        return not self.kept
 
     @property
     def is_idle(self) -> bool:
         """Whether none of its jobs runs."""
-        return not (self.stops or any(t.is_running for t in self.trainings.values()))
+        return not self.stops
 
     def begin(self, stop: asyncio.Event | None = None) -> str:
         """The name of a new job, which runs until `end`.
