@@ -414,6 +414,37 @@ def test_plots_share_a_cross_hair_and_a_zoom(address: str, page: Page):
     assert shown_range(page, "#signals .chart", 0) == [0, 50]
 
 
+def test_very_many_samples_are_drawn_by_what_they_cover(address: str, page: Page):
+    """The number of shapes follows the pixels, not the samples; few samples are points again."""
+    prepared(page, address)
+    shapes = """async (zoom) => {
+      const { Plot } = await import("/static/plot.js"), parent = document.querySelector("#signals");
+      const x = Array.from({ length: 1e5 }, (_, k) => k), y = x.map((k) => Math.sin(k));
+      const { arc, rect } = Path2D.prototype, drawn = { points: 0, columns: 0 };
+      Path2D.prototype.arc = function (...how) { drawn.points++; return arc.apply(this, how); };
+      Path2D.prototype.rect = function (...how) { drawn.columns++; return rect.apply(this, how); };
+      parent.replaceChildren();
+      const plot = new Plot(parent, "many", "many samples"), told = [];
+      plot.show({ x: [0, 1e5], y: [-1, 1], lines: [{ x, y, color: "output", points: true }] });
+      const next = () => new Promise((done) => requestAnimationFrame(() => setTimeout(done)));
+      while (!plot.u) await next();
+      plot.rescale();
+      await next();
+      told.push({ ...drawn }, plot.u.bbox.width);
+      Object.assign(drawn, { points: 0, columns: 0 });
+      plot.group.show([100, 200]);
+      await next();
+      told.push(drawn, plot.u.scales.y.max);
+      Object.assign(Path2D.prototype, { arc, rect });
+      return told;
+    }"""
+    whole, width, part, most = page.evaluate(shapes)
+    assert 0 < whole["columns"] < 5 * width
+    assert whole["points"] == 0
+    assert 100 <= part["points"] < 500
+    assert 1 < most < 1.2
+
+
 def test_a_hidden_plot_shows_the_newest_when_it_is_seen_again(address: str, page: Page):
     ready(page, address)
     page.get_by_label("Played in").select_option("2")
@@ -588,6 +619,8 @@ def test_a_file_is_previewed_and_its_units_are_taken_from_the_names(address: str
     page.locator("#file").set_input_files({"name": "a.csv", "mimeType": "", "buffer": content})
     expect(page.locator("#first-rows tbody tr")).to_have_count(5, timeout=WAIT)
     expect(page.locator("#columns figure")).to_have_count(3)
+    notes = page.locator("#columns figcaption")
+    expect(notes.nth(0)).to_contain_text("steps of 100, no gaps")
     for name, unit in (("time", "ms"), ("voltage", "V"), ("pitch", "°")):
         expect(page.locator(f"#unit-{name}")).to_have_value(unit)
     page.get_by_role("button", name="Identify").click()
@@ -602,6 +635,20 @@ def test_a_file_is_previewed_and_its_units_are_taken_from_the_names(address: str
     page.get_by_role("button", name="Copy").click()
     expect(page.locator("#record-again [role=status]")).to_have_text("Copied.")
     assert page.evaluate("navigator.clipboard.readText()") == command
+    # What is known beforehand, by the words of the command line; and profiles.
+    page.locator("#record form summary").click()
+    page.get_by_label("hold Jp").fill("0.0232")
+    page.get_by_label("prior of Kpu").fill("normal:0.0125:5%")
+    page.get_by_label("Intervals").select_option("profile")
+    page.get_by_role("button", name="Identify").click()
+    expect(page.locator("#identified tbody tr").first).to_contain_text("held", timeout=WAIT)
+    known = page.locator("#record-again pre").text_content()
+    assert known is not None
+    assert "--hold J_p=0.0232 --prior K_pu=normal:0.0125:5%" in known
+    expect(page.locator("#profiles canvas")).to_have_count(2)
+    page.get_by_label("prior of Kpu").fill("wide")
+    page.get_by_role("button", name="Identify").click()
+    expect(status(page, "record")).to_contain_text("prior of 'K_pu' must be", timeout=WAIT)
 
 
 def test_a_file_that_fails_late_says_nothing_about_the_next(address: str, page: Page):

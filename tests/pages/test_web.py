@@ -5,6 +5,7 @@ import contextlib
 import csv
 import io
 import json
+import math
 import os
 import pickle
 import re
@@ -43,6 +44,7 @@ from excite.report.html import report_html
 from excite.study.objectives import OBJECTIVES
 from excite.web import _Server, application, connections, listening_at, requests
 from excite.web.first import FILE, events
+from excite.web.jobs import _noted
 from excite.web.places import _file_name, _receive
 from excite.web.requests import MAX_UPLOAD, RefusedError
 from excite.web.runs import found
@@ -308,6 +310,7 @@ def test_the_command_of_an_upload_does_the_same(
     uploaded = client.post(f"/api/uploads?name={name}", content=text.getvalue()).json()
     asked = {"upload": uploaded["upload"], "plant": "aero2", "estimator": "nls"}
     asked |= {"columns": {"pitch": column}, "scales": {"pitch": 1}, "initial_state": "known"}
+    asked |= {"hold": {"J_p": 0.0215}, "priors": {"D_p": "lognormal:0.007:5%"}}
     [event] = streamed(client, "/api/identifications", asked).of("identified")
     run = max(temporary.glob("*/*/*/run"), key=lambda path: path.stat().st_mtime)
     (tmp_path / name).write_text(text.getvalue())
@@ -597,6 +600,22 @@ def is_running(process: int) -> bool:
         return "excite.study.worker" in Path(f"/proc/{process}/cmdline").read_text()
     except OSError:
         return False
+
+
+@pytest.mark.parametrize(
+    ("values", "note"),
+    [
+        ([0.0, 0.1, 0.2, 0.5, 0.6], "steps of 0.1, gaps: 1, the longest 0.3"),
+        ([0.0, 1.0, 2.0, 3.0], "steps of 1, no gaps"),
+        ([2.0, 2.0, 2.0], "constant"),
+        ([1.0, math.nan, 1.0, 0.5], "1 missing"),
+        ([*np.minimum(np.arange(20.0), 15), 0.5], "24 % at its largest value: saturated?"),
+        ([0.0, 1.0, 1.0, 1.0, 0.0, 1.0], ""),  # a signal of two levels
+        ([], ""),
+    ],
+)
+def test_what_a_column_shows_is_told(values: list[float], note: str):
+    assert _noted(np.array(values)) == note
 
 
 # ------------------------------------------------------------------------------ bad files

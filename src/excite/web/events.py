@@ -38,6 +38,8 @@ class IdentificationRequest(TypedDict):
     intervals: str
     hold_input: str
     effects: list[str]
+    hold: Numbers
+    priors: dict[str, str]
 
 
 class StartedEvent(TypedDict):
@@ -159,10 +161,12 @@ class LeftOut(TypedDict):
 class Preview(TypedDict):
     """A column of an uploaded file: its first cells, and numbers for a small plot.
 
-    `values` are those of the rows `index`; empty for a column of texts.
+    `values` are those of the rows `index`; empty for a column of texts. `note` says what is found
+    in it: sampling and gaps of a column that increases, missing values, a suspected saturation.
     """
 
     first: list[str]
+    note: str
     index: list[int]
     values: list[float]
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 import shlex
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -65,6 +66,8 @@ _FIRST = 40  # samples before the first estimate
 _RECORD = "record.csv"  # name of a simulated record
 _MAX_POINTS = 200_000  # of a record on the page; longer ones show the extremes of each section
 _MAX_PREVIEW, _FIRST_ROWS = 400, 5  # points of a column's plot, and its rows in the table
+_GAP = 1.5  # steps of time over the usual one
+_FEW_VALUES, _OFTEN = 10, 0.02  # values of a signal with levels; a share of samples at its end
 _MAX_COLUMNS, _MAX_NAME = 500, 200  # of an uploaded file, and characters of a column's name
 
 
@@ -251,6 +254,8 @@ def _identification_again(asked: IdentificationRequest, name: str) -> str:
         "--initial-state", asked["initial_state"],
         *(["--intervals", asked["intervals"]] if asked["intervals"] != "linear" else []),
         *(["--hold-input", asked["hold_input"]] if asked["hold_input"] != "constant" else []),
+        *_given("--hold", asked["hold"]),
+        *itertools.chain(*(_given("--prior", {n: text}) for n, text in asked["priors"].items())),
         *_given("--column", asked["columns"]),
         *_given("--scale", asked["scales"]), *_given("--unit", asked["units"]), "--out", "run",
     ]  # fmt: skip
@@ -356,8 +361,36 @@ def _previews(columns: Mapping[str, np.ndarray]) -> dict[str, Preview]:
             values = np.zeros(0)
         kept = kept_samples([values], _MAX_PREVIEW) if len(values) else np.zeros(0, int)
         first = [str(cell)[:_MAX_NAME] for cell in cells[:_FIRST_ROWS]]
-        found[name] = {"first": first, "index": kept.tolist(), "values": values[kept].tolist()}
+        found[name] = {
+            "first": first,
+            "note": _noted(values),
+            "index": kept.tolist(),
+            "values": values[kept].tolist(),
+        }
     return found
+
+
+def _noted(values: np.ndarray) -> str:
+    """What a column shows: its sampling and gaps, missing values, a suspected saturation."""
+    known = values[np.isfinite(values)]
+    if len(known) < 3:
+        return ""
+    missing = len(values) - len(known)
+    notes = [f"{missing} missing"] * (missing > 0)
+    steps = np.diff(known)
+    if np.all(steps > 0):
+        usual = float(np.median(steps))
+        longer = steps[steps > _GAP * usual]
+        gap = f"gaps: {len(longer)}, the longest {longer.max(initial=0.0):.4g}"
+        notes += [f"steps of {usual:.4g}", gap if len(longer) else "no gaps"]
+    elif not steps.any():
+        notes.append("constant")
+    elif len(np.unique(known)) > _FEW_VALUES:
+        for end, word in ((known.max(), "largest"), (known.min(), "smallest")):
+            is_at = known == end
+            if is_at.mean() >= _OFTEN and np.any(is_at[:-2] & is_at[1:-1] & is_at[2:]):
+                notes.append(f"{100 * is_at.mean():.0f} % at its {word} value: saturated?")
+    return ", ".join(notes)
 
 
 def identified(
@@ -372,6 +405,8 @@ def identified(
             asked["estimator"],
             intervals=cast(Intervals, asked["intervals"]),
             hold_input=asked["hold_input"],
+            hold=asked["hold"],
+            prior=asked["priors"] or None,
             initial_state=cast(InitialState, asked["initial_state"]),  # checked there
             columns=asked["columns"],
             scales=asked["scales"],

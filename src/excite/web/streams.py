@@ -110,6 +110,8 @@ def _identification(asked: Asked, plants: Mapping[str, str]) -> IdentificationRe
         "intervals": word({"intervals": "linear", **asked}, "intervals"),
         "hold_input": word({"hold_input": "constant", **asked}, "hold_input"),
         "effects": words(asked, "effects", 32),
+        "hold": numbers(asked, "hold"),
+        "priors": texts(asked, "priors"),
     }
 
 

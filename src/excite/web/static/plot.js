@@ -64,6 +64,39 @@ function nearest(list, x) {
   return Math.abs(list[low] - x) <= Math.abs(list[high] - x) ? low : high;
 }
 
+const DOT = 3.5; // diameter of a measured sample [px]
+
+/** Measured samples as points; where there are several a pixel, what they cover. For uPlot: a path of the samples from first to last. */
+function scattered(u, series, first, last) {
+  const x = u.data[0], y = u.data[series], { left, top, width, height } = u.bbox, size = DOT * devicePixelRatio, path = new Path2D();
+  const { x: { min: x0, max: x1 }, y: { min: y0, max: y1 } } = u.scales, perX = width / (x1 - x0), perY = height / (y1 - y0);
+  const X = (i) => left + (x[i] - x0) * perX, Y = (value) => top + (y1 - value) * perY;
+  if (last - first < 4 * width) {
+    for (let i = first; i <= last; i++) {
+      if (y[i] === null || y[i] === undefined) continue;
+      const at = X(i), height = Y(y[i]);
+      path.moveTo(at + size / 2, height);
+      path.arc(at, height, size / 2, 0, 2 * Math.PI);
+    }
+    return { stroke: null, fill: path, flags: 1 };
+  }
+  let column = -Infinity, low = Infinity, high = -Infinity;
+  const end = () => { if (low <= high) path.rect(column, Y(high) - size / 2, 1, (high - low) * perY + size); };
+  for (let i = first; i <= last; i++) {
+    const value = y[i];
+    if (value === null || value === undefined) continue;
+    const at = Math.floor(X(i));
+    if (at !== column) {
+      end();
+      column = at;
+      low = high = value;
+    } else if (value < low) low = value;
+    else if (value > high) high = value;
+  }
+  end();
+  return { stroke: null, fill: path, flags: 1 };
+}
+
 /** What the plots of one view share: the cross-hair, and the part of the axis that is shown. */
 class Group {
   constructor() {
@@ -186,8 +219,9 @@ export class Plot {
       },
       series: [{}, ...this.lines.map((line) => ({
         stroke: colour(line.color), width: line.width ?? 1.6, dash: line.dash,
-        paths: line.points ? () => null : line.step ? uPlot.paths.stepped({ align: 1 }) : undefined,
-        points: { show: Boolean(line.dots || line.points), size: line.points ? 3.5 : 5, fill: colour(line.color), width: 0 },
+        fill: line.points ? colour(line.color) : undefined,
+        paths: line.points ? scattered : line.step ? uPlot.paths.stepped({ align: 1 }) : undefined,
+        points: { show: Boolean(line.dots), size: 5, fill: colour(line.color), width: 0 },
       }))],
       hooks: {
         drawAxes: [(u) => this.below(u)], draw: [(u) => this.above(u)],
@@ -200,8 +234,16 @@ export class Plot {
   reach() {
     const { zoom } = this.group, { log, y } = this.what;
     if (!zoom || log) return y;
-    const seen = this.lines.flatMap((line) => line.y.filter((value, i) => line.x[i] >= zoom[0] && line.x[i] <= zoom[1] && isNumber(value)));
-    return seen.length ? range(seen, seen[0]) : y;
+    let low = Infinity, high = -Infinity;
+    for (const line of this.lines) {
+      for (let i = nearest(line.x, zoom[0]), last = nearest(line.x, zoom[1]); i <= last; i++) {
+        const value = line.y[i];
+        if (line.x[i] < zoom[0] || line.x[i] > zoom[1] || !isNumber(value)) continue;
+        if (value < low) low = value;
+        if (value > high) high = value;
+      }
+    }
+    return low <= high ? range([low, high], low) : y;
   }
 
   rescale() {

@@ -12,8 +12,10 @@ export function begin(known) {
   task = new Task(form, () => file !== null && needed().every((name) => at(`column-${name}`)?.value));
   options(at("record-plant"), Object.keys(catalogue.plants), "aero2");
   options(at("estimator"), catalogue.estimators, "nls");
-  at("record-plant").addEventListener("change", () => { effects(); showMapping(); });
+  at("record-plant").addEventListener("change", () => { effects(); beforehand(); showMapping(); });
+  at("effects").addEventListener("change", beforehand);
   effects();
+  beforehand();
   at("file").addEventListener("change", () => take(at("file").files[0]));
   const drop = section.querySelector(".drop");
   const over = (is) => (event) => { event.preventDefault(); drop.classList.toggle("over", is); };
@@ -56,12 +58,30 @@ function preview() {
   for (const name of names) {
     const { index: x, values: y } = file.previews[name];
     if (y.length < 2) continue;
-    new Plot(at("columns"), name, `column ${name} over the rows`).show({ x: [0, x.at(-1)], y: range(y, y[0] ?? 0), unit: "row", lines: [{ x, y, color: "output" }] });
+    const plot = new Plot(at("columns"), name, `column ${name} over the rows`);
+    plot.note.textContent = file.previews[name].note;
+    plot.show({ x: [0, x.at(-1)], y: range(y, y[0] ?? 0), unit: "row", lines: [{ x, y, color: "output" }] });
   }
 }
 
 const effects = () => at("effects").replaceChildren(...plant().effects.map((name) => el("label", {}, el("input", { type: "checkbox", value: name }), name)));
 const boxes = () => [...at("effects").querySelectorAll("input")];
+
+/** A row a parameter, also of the chosen effects: its known value, or its prior. What was given stays. */
+function beforehand() {
+  const given = (id) => at(id)?.value ?? "";
+  at("beforehand").replaceChildren(...estimated().map((name) => {
+    const [hold, prior] = [`hold-${name}`, `prior-${name}`], input = (id, how) => el("input", { id, value: given(id), ...how });
+    const { unit = "" } = plant().parameters.find((p) => p.name === name) ?? {};
+    return el("div", { class: "known" },
+      el("div", { class: "field" }, el("label", { for: hold }, "hold ", symbol(name), " ", el("span", { class: "unit" }, unit)), input(hold, { type: "number", step: "any", placeholder: "estimated" })),
+      el("div", { class: "field" }, el("label", { for: prior }, "prior of ", symbol(name)), input(prior, { type: "text", placeholder: "none", maxlength: 200, spellcheck: "false" })));
+  }));
+}
+
+const estimated = () => [...plant().parameters.map((p) => p.name), ...boxes().filter((box) => box.checked).map((box) => box.value)];
+/** What is given of the parameters: numbers that are held, or priors. */
+const given = (kind, as) => Object.fromEntries(estimated().map((name) => [name, at(`${kind}-${name}`).value.trim()]).filter(([, text]) => text).map(([name, text]) => [name, as(text)]));
 
 const plant = () => catalogue.plants[at("record-plant").value];
 const needed = () => ["time", ...plant().inputs.map((p) => p.name), ...plant().outputs.map((p) => p.name)];
@@ -115,6 +135,8 @@ function asked() {
     effects: boxes().filter((box) => box.checked).map((box) => box.value),
     hold_input: at("hold-input").value,
     intervals: at("intervals").value,
+    hold: given("hold", Number),
+    priors: given("prior", String),
   };
 }
 
@@ -148,6 +170,7 @@ function show(wanted, { identification, plant: fitted, result, time, inputs, out
     download(`api/results/${result}/record.json`, "Sidecar"),
     download(`api/results/${result}/estimate.json`, "Estimate"));
   causes(wanted, identification.suspects ?? []);
+  profiles(identification);
   correlations(Object.keys(identification.params), identification.correlation ?? []);
   at("record-again").replaceChildren(command(again));
   const parent = at("record-signals"), x = [time[0], time.at(-1)];
@@ -183,9 +206,27 @@ function causes(wanted, suspects) {
     type: "button", click: () => {
       const more = { ...wanted, effects: [...wanted.effects, name] };
       if (at("record-plant").value === wanted.plant) boxes().forEach((box) => { box.checked = more.effects.includes(box.value); });
+      if (at("record-plant").value === wanted.plant) beforehand();
       identify(more);
     },
   }, i ? `Or estimate ${name}` : `Estimate ${name}, too`)));
+}
+
+/** The profile likelihoods: growth of the squares over its limit, with the ends of the interval. */
+function profiles({ params, profiles: every }) {
+  at("profiles").replaceChildren();
+  for (const [name, points] of Object.entries(every ?? {})) {
+    const drawn = points.filter(([value, growth]) => Number.isFinite(value) && Number.isFinite(growth) && growth < 5).sort(([a], [b]) => a - b);
+    if (drawn.length < 2) continue;
+    const x = drawn.map(([value]) => value), y = drawn.map(([, growth]) => Math.max(0, growth)), ends = [x[0], x.at(-1)];
+    const own = el("div", { class: "own" });
+    at("profiles").append(own);
+    new Plot(own, el("span", {}, "profile of ", symbol(name)), `profile likelihood of ${name}: growth of the squares over the limit of the 95 % interval`).show({
+      x: ends, y: range(y, 0, 1), unit: params[name].unit,
+      lines: [{ x, y, name: "growth / limit", color: "output", dots: true }, { x: ends, y: [1, 1], name: "95 %", color: "bound", dash: [6, 4] }],
+      marks: (params[name].ci95 ?? []).filter(Number.isFinite).map((end) => ({ x: end, color: "soft", word: "" })),
+    });
+  }
 }
 
 /** The correlations as a table, the stronger the darker. */
