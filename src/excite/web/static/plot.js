@@ -66,36 +66,60 @@ function nearest(list, x) {
 
 const DOT = 3.5; // diameter of a measured sample [px]
 
-/** Measured samples as points; where there are several a pixel, what they cover. For uPlot: a path of the samples from first to last. */
+/** Where a plot draws samples, from first to last: their coordinates on the canvas. */
+function placed(u, series) {
+  const x = u.data[0], y = u.data[series], { left, top, width, height } = u.bbox, { x: { min: x0, max: x1 }, y: { min: y0, max: y1 } } = u.scales;
+  const perX = width / (x1 - x0), perY = height / (y1 - y0);
+  return { y, X: (i) => left + (x[i] - x0) * perX, Y: (value) => top + (y1 - value) * perY };
+}
+
+/** Samples as points. */
 function scattered(u, series, first, last) {
-  const x = u.data[0], y = u.data[series], { left, top, width, height } = u.bbox, size = DOT * devicePixelRatio, path = new Path2D();
-  const { x: { min: x0, max: x1 }, y: { min: y0, max: y1 } } = u.scales, perX = width / (x1 - x0), perY = height / (y1 - y0);
-  const X = (i) => left + (x[i] - x0) * perX, Y = (value) => top + (y1 - value) * perY;
-  if (last - first < 4 * width) {
-    for (let i = first; i <= last; i++) {
-      if (y[i] === null || y[i] === undefined) continue;
-      const at = X(i), height = Y(y[i]);
-      path.moveTo(at + size / 2, height);
-      path.arc(at, height, size / 2, 0, 2 * Math.PI);
-    }
-    return { stroke: null, fill: path, flags: 1 };
-  }
-  let column = -Infinity, low = Infinity, high = -Infinity;
-  const end = () => { if (low <= high) path.rect(column, Y(high) - size / 2, 1, (high - low) * perY + size); };
+  const { y, X, Y } = placed(u, series), radius = (DOT / 2) * devicePixelRatio, path = new Path2D();
   for (let i = first; i <= last; i++) {
-    const value = y[i];
-    if (value === null || value === undefined) continue;
-    const at = Math.floor(X(i));
-    if (at !== column) {
-      end();
-      column = at;
-      low = high = value;
-    } else if (value < low) low = value;
-    else if (value > high) high = value;
+    if (!isNumber(y[i])) continue;
+    const at = X(i), height = Y(y[i]);
+    path.moveTo(at + radius, height);
+    path.arc(at, height, radius, 0, 2 * Math.PI);
   }
-  end();
   return { stroke: null, fill: path, flags: 1 };
 }
+
+/** Fills what many samples a pixel cover: from the lowest to the highest of each column of pixels, and of a line also from the sample before. */
+function cover(u, series, first, last, size, isLine) {
+  const { y, X, Y } = placed(u, series), half = (size / 2) * devicePixelRatio, { ctx: g, bbox: box } = u;
+  let column = -Infinity, low = Infinity, high = -Infinity, before = null;
+  const end = () => { if (low <= high) g.fillRect(column, Y(high) - half, 1, Y(low) - Y(high) + 2 * half); }; // far quicker than one path of all
+  g.save();
+  g.beginPath();
+  g.rect(box.left, box.top, box.width, box.height);
+  g.clip();
+  g.fillStyle = u.series[series].fill(u, series);
+  for (let i = first; i <= last; i++) {
+    const value = y[i];
+    if (isNumber(value)) {
+      const at = Math.floor(X(i));
+      if (at !== column) {
+        end();
+        column = at;
+        low = high = isLine && before !== null ? before : value;
+      }
+      if (value < low) low = value;
+      if (value > high) high = value;
+      before = value;
+    } else if (value === null) before = null; // a gap
+  }
+  end();
+  g.restore();
+  return null; // no path: it is filled again with the next drawing
+}
+
+const joined = uPlot.paths.linear(), held = uPlot.paths.stepped({ align: 1 });
+/** How a line is drawn: its samples, or what they cover where there are several a pixel. */
+const pathsOf = ({ points, step, width }) => (u, series, first, last) => {
+  if (last - first > 4 * u.bbox.width) return cover(u, series, first, last, points ? DOT : width ?? 1.6, !points);
+  return points ? scattered(u, series, first, last) : { ...(step ? held : joined)(u, series, first, last), fill: null };
+};
 
 /** What the plots of one view share: the cross-hair, and the part of the axis that is shown. */
 class Group {
@@ -219,8 +243,7 @@ export class Plot {
       },
       series: [{}, ...this.lines.map((line) => ({
         stroke: colour(line.color), width: line.width ?? 1.6, dash: line.dash,
-        fill: line.points ? colour(line.color) : undefined,
-        paths: line.points ? scattered : line.step ? uPlot.paths.stepped({ align: 1 }) : undefined,
+        fill: colour(line.color), paths: pathsOf(line),
         points: { show: Boolean(line.dots), size: 5, fill: colour(line.color), width: 0 },
       }))],
       hooks: {
