@@ -10,7 +10,9 @@ import sys
 import tempfile
 from pathlib import Path
 
-from playwright.sync_api import Page, expect, sync_playwright
+import matplotlib.image as mpimg
+import numpy as np
+from playwright.sync_api import Browser, Page, expect, sync_playwright
 
 ROOT = Path(__file__).parents[1]
 FIGURES = ROOT / "docs" / "figures"
@@ -18,10 +20,10 @@ PATIENCE = 120_000  # milliseconds; the first experiment waits for what is compi
 
 
 def main() -> None:
-    words = [sys.executable, "-m", "excite", "serve", "--runs", str(ROOT / "results")]
     with (
         tempfile.TemporaryDirectory() as folder,
-        subprocess.Popen([*words, "--port", "0", "--json"], stdout=subprocess.PIPE) as server,
+        tempfile.TemporaryDirectory() as own,
+        subprocess.Popen([*words(own), "--port", "0", "--json"], stdout=subprocess.PIPE) as server,
         sync_playwright() as playwright,
     ):
         told = b"".join(iter(server.stdout.readline, b"}\n")) + b"}"
@@ -32,11 +34,54 @@ def main() -> None:
         experiment(page, json.loads(told)["address"], Path(folder))
         record(page, Path(folder))
         runs(page)
+        training(page)
+        dark_screens(browser, json.loads(told)["address"], Path(folder))
         dark = browser.new_page(viewport={"width": 1000, "height": 900}, color_scheme="dark")
         dark.goto((Path(folder) / "report.html").as_uri())
         dark.screenshot(path=FIGURES / "report.png")
         browser.close()
         server.terminate()
+
+
+def words(own: str) -> list[str]:
+    """The command of a page that shows the results of this repository, and trains elsewhere."""
+    for run in (ROOT / "results").iterdir():
+        if run.is_dir():
+            (Path(own) / run.name).mkdir()
+            for file in run.iterdir():
+                if file.is_file():
+                    shutil.copy(file, Path(own) / run.name)
+    return [sys.executable, "-m", "excite", "serve", "--runs", own]
+
+
+def training(page: Page) -> None:
+    page.set_viewport_size({"width": 1440, "height": 900})
+    page.evaluate("location.hash = 'training'")
+    for label, value in (("Updates", "400"), ("Length", "60"), ("Seeds", "2")):
+        page.locator("#training").get_by_label(label).fill(value)
+    page.get_by_role("button", name="Start").click()
+    card = page.locator("#trainings section")
+    expect(card.locator(".progress")).to_contain_text("left", timeout=PATIENCE)
+    expect(card.locator(".progress")).to_contain_text("updating", timeout=PATIENCE)
+    page.wait_for_timeout(20_000)  # some rows of the curves
+    page.screenshot(path=FIGURES / "bench-page-training.png", full_page=True)
+    card.get_by_role("button", name="Stop").click()
+    expect(card.get_by_role("status")).to_contain_text("stopped", timeout=PATIENCE)
+
+
+def dark_screens(browser: Browser, address: str, folder: Path) -> None:
+    """The top of the page at 390 and 1024 px, dark, beside each other."""
+    pictures = []
+    for width in (390, 1024):
+        page = browser.new_page(viewport={"width": width, "height": 1100}, color_scheme="dark")
+        page.goto(address)
+        expect(page.locator("#comparison tbody tr")).to_have_count(3, timeout=PATIENCE)
+        page.evaluate("document.querySelector('#experiment .view').scrollIntoView()")
+        page.screenshot(path=folder / f"{width}.png")
+        pictures.append(mpimg.imread(folder / f"{width}.png")[..., :3])
+        page.close()
+    gap = np.ones((1100, 20, 3))
+    mpimg.imsave(FIGURES / "bench-page-dark.png", np.hstack([pictures[0], gap, pictures[1]]))
 
 
 def experiment(page: Page, address: str, folder: Path) -> None:

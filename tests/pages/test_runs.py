@@ -1,9 +1,11 @@
 """The run folder on the bench page: its table, and what is done with several runs."""
 
+import asyncio
 import itertools
 import os
 import re
 import shutil
+import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -24,6 +26,7 @@ from excite.report.html import report_html
 from excite.report.study_table import common_table, violations_cell
 from excite.study.table import finished_table
 from excite.web import application
+from excite.web import runs as web_runs
 from excite.web.deletions import _delete
 from excite.web.requests import RefusedError
 from excite.web.sessions import PageSettings
@@ -288,6 +291,36 @@ def test_what_appears_at_the_instant_of_a_deletion_is_not_overwritten(
             "some/rig.csv cannot be moved (Input/output error), but rig.json cannot be moved back "
             "from runs"
         )
+
+
+def test_one_look_at_the_folder_answers_all_that_wait(runs: Path, monkeypatch: pytest.MonkeyPatch):
+    """And never one that came after it began."""
+    looks, listed = list[Path](), web_runs.routes(runs)[0].endpoint
+    look = web_runs.found
+
+    def counted(folder: Path) -> dict[str, Path]:
+        looks.append(folder)
+        seen = look(folder)
+        if len(looks) == 1:
+            shutil.copytree(folder / "frontier", folder / "later")
+            waiting.wait(PATIENCE)
+        return seen
+
+    async def all_at_once() -> list[bytes]:
+        first = asyncio.create_task(listed(None))
+        while not (runs / "later").exists():
+            await asyncio.sleep(0)
+        others = [asyncio.create_task(listed(None)) for _ in range(20)]
+        await asyncio.sleep(0)  # they wait
+        waiting.set()
+        return [answer.body for answer in await asyncio.gather(first, *others)]
+
+    waiting = threading.Event()
+    monkeypatch.setattr(web_runs, "found", counted)
+    first, *others = asyncio.run(all_at_once())
+    assert b'"later"' not in first
+    assert all(b'"later"' in answer for answer in others)
+    assert len(looks) == 2
 
 
 def test_a_sidecar_is_read_once_while_it_does_not_change(

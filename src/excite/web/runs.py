@@ -6,6 +6,7 @@ becomes a path. Links are not followed.
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import csv
 import json
@@ -18,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from starlette.requests import Request
-from starlette.responses import FileResponse, JSONResponse
+from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
 
 from ..description import PlantDescription
@@ -53,10 +54,23 @@ _RESULTS = ("run.json", "study.json", "table.json", "estimate.json", "campaign.j
 
 def routes(folder: Path) -> list[Route]:
     """Routes that show the run folder."""
+    looking, last = asyncio.Lock(), 0
+    latest = (0, b"")  # the last request that it answers, and the answer
 
-    def listed(request: Request) -> JSONResponse:
+    def look() -> bytes:
+        every = sorted(found(folder).items())
+        return bytes(JSONResponse({"runs": [_summary(name, run) for name, run in every]}).body)
+
+    async def listed(request: Request) -> Response:
+        """The list as it is after the request came: one look answers all that came before it."""
+        nonlocal latest, last
         del request
-        return JSONResponse({"runs": [_summary(n, p) for n, p in sorted(found(folder).items())]})
+        own = last = last + 1
+        async with looking:
+            if latest[0] < own:
+                answered = last
+                latest = (answered, await asyncio.to_thread(look))
+        return Response(latest[1], media_type="application/json")
 
     def shown(request: Request) -> JSONResponse:
         return JSONResponse(_content(run_of(folder, request)))

@@ -188,6 +188,9 @@ export class Plot {
 
   get lines() { return this.what.lines.filter((line) => !this.hidden.has(line.name)); }
 
+  /** To the right of the axis [px]: for half of its last label, which has the unit. */
+  get room() { return Math.max(18, 4 * (this.what.unit ?? "").length + 8); }
+
   get size() { return { width: this.chart.clientWidth, height: this.chart.clientHeight }; }
 
   end() {
@@ -230,7 +233,7 @@ export class Plot {
     const axis = { stroke: soft, grid, ticks: { show: false }, font: "12px system-ui, sans-serif" };
     const { unit, log } = this.what;
     return {
-      ...this.size, legend: { show: false }, padding: [8, 18, 0, 0],
+      ...this.size, legend: { show: false }, padding: [8, this.room, 0, 0],
       scales: { x: { time: false, range: () => this.group.zoom ?? this.what.x }, y: { range: () => this.reach() } },
       axes: [
         { ...axis, size: 26, splits: (u, i, low, high) => ticks(low, high, Math.max(2, u.bbox.width / devicePixelRatio / 90)), values: (u, found) => found.map((x, i) => label(x) + (i === found.length - 1 && unit ? ` ${unit}` : "")) },
@@ -408,7 +411,7 @@ export class Plot {
   /** What is drawn on the canvas, in the same order. */
   svg() {
     const { width, height } = this.size, { x: { min: x0, max: x1 }, y: { min: y0, max: y1 } } = this.u.scales;
-    const left = 54, right = width - 18, top = 8, bottom = height - 26, two = (v) => +v.toFixed(2);
+    const left = 54, right = width - this.room, top = 8, bottom = height - 26, two = (v) => +v.toFixed(2);
     const X = (x) => two(left + ((x - x0) / (x1 - x0)) * (right - left)), Y = (y) => two(bottom - ((y - y0) / (y1 - y0)) * (bottom - top));
     const text = (x, y, anchor, word, color = "soft") => `<text x="${x}" y="${y}" text-anchor="${anchor}" fill="${colour(color)}">${word.replaceAll("&", "&amp;").replaceAll("<", "&lt;")}</text>`;
     const line = (points, color, more = "") => `<polyline points="${points.join(" ")}" fill="none" stroke="${colour(color)}" ${more}/>`;
