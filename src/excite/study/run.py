@@ -70,6 +70,7 @@ _TASKS = {
     "safety": safety_task,
 }
 _MARKERS = ("study.json", "run.json")
+_NO_RESULTS = (*_MARKERS, *PROGRESS_FILES)  # a new folder with nothing else is removed
 
 
 class StudyFailedError(RuntimeError):
@@ -264,7 +265,7 @@ def opened(
     is_begun = folder.is_dir() and bool({p.name for p in folder.iterdir()} - {*_MARKERS, ".lock"})
     if is_begun and not any((folder / name).is_file() for name in _MARKERS):
         raise ValueError(f"{folder} exists and is no run folder; choose another name")
-    with locked_folder(folder, "this study", [*_MARKERS, *PROGRESS_FILES]):
+    with locked_folder(folder, "this study", _NO_RESULTS):
         plant, text = study.build_plant(), _plant_text(study)
         marker = {**_marker(study, plant, text), "command": command}
         if overwrite:
@@ -439,7 +440,7 @@ def run_tasks(
             if kind == "safety":
                 chosen = _with_policies(chosen, targets, folder)
             failures |= run(function, chosen, engine, on_done=finished, on_tick=tick)
-        if failures and is_new and holds_only(folder, [*_MARKERS, *PROGRESS_FILES]):
+        if failures and is_new and holds_only(folder, _NO_RESULTS):
             shutil.rmtree(folder, ignore_errors=True)  # nothing is finished
         return failures
 
