@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 import pytest
+from anyio.from_thread import start_blocking_portal
 from chromium import require_chromium
 from commands import PATIENCE
 from served import served
@@ -317,7 +318,8 @@ def test_one_look_at_the_folder_answers_all_that_wait(runs: Path, monkeypatch: p
 
     waiting = threading.Event()
     monkeypatch.setattr(web_runs, "found", counted)
-    first, *others = asyncio.run(all_at_once())
+    with start_blocking_portal() as portal:  # a browser has the loop of this thread
+        first, *others = portal.call(all_at_once)
     assert b'"later"' not in first
     assert all(b'"later"' in answer for answer in others)
     assert len(looks) == 2
