@@ -30,6 +30,7 @@ MAPPED: Any = {
     "columns": {"pitch": "theta (deg)", "voltage": "u"},
     "scales": {"pitch": 3.141592653589793 / 180},
     "units": {}, "intervals": "linear", "hold_input": "constant", "effects": [],
+    "hold": {}, "priors": {},
 }  # fmt: skip
 OPTIONS = {
     "a scale": {},
@@ -38,6 +39,9 @@ OPTIONS = {
         "effects": ["delay_voltage", "bias_pitch"],
     },
     "profiles": {"estimator": "nls", "intervals": "profile"},
+    "a known value and a prior": {
+        "estimator": "nls", "hold": {"J_p": 0.025}, "priors": {"D_p": "normal:0.0071:0.001"},
+    },
 }  # fmt: skip
 CHANGES = {
     "a signal": {},
