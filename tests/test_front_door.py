@@ -19,7 +19,10 @@ from excite.cli import cli
 from excite.study.catalogue import shipped_studies
 
 NAMES = [name for name in ex.__all__ if name != "__version__"]
-LONGEST = {"train", "campaign", "design", "run_study", "compare_plants"}
+LONGEST = {
+    "campaign", "choose_experiments", "compare_plants", "design", "discriminate", "evaluate",
+    "falsify", "information_gain", "next_experiment", "run_study", "train",
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", [LONG(name) if name in LONGEST else name for name in NAMES])
@@ -301,6 +304,7 @@ print(json.dumps(said))
 """
 
 
+@pytest.mark.science
 def test_a_mistake_is_one_sentence_and_what_can_be_meant_works():
     """In a process without the tests' run-time check of types, which would speak first."""
     done = subprocess.run(
