@@ -99,20 +99,22 @@ def test_what_is_in_use_stays(tmp_path: Path):
     session = Session(tmp_path)
 
     def made() -> str:
-        with session.making("result") as (name, place):
+        name = session.begin()
+        with session.making("result", name) as place:
             place.is_done = True
+        session.end(name)
         return name
 
     oldest = made()
-    with session.using(oldest) as folder, session.making("result") as (name, place):
+    with session.using(oldest, "result") as folder, session.making("result", "new") as place:
         for _ in range(2 * MAX_KEPT):
             made()
         assert folder.is_dir()
         assert place.folder.is_dir()
-    assert name not in session.kept
+    assert "new" not in session.kept
     made()
     made()
-    with pytest.raises(RefusedError, match="run it again"), session.using(oldest):
+    with pytest.raises(RefusedError, match="run it again"), session.using(oldest, "result"):
         pass
     assert not folder.exists()
     assert len(session.kept) == MAX_KEPT
