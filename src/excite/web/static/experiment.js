@@ -19,18 +19,18 @@ export function begin(known) {
   form.addEventListener("submit", (event) => { event.preventDefault(); run(); });
   choosePlant();
   task = new Task(form);
-  say(form, "Ready.");
-  prepared();
+  const gone = task.kept.fill(), { shown: before } = task.kept.state;
+  say(form, gone || "Ready.", Boolean(gone));
+  if (before) follow(`api/results/${before}/events`);
+  else prepared(gone);
 }
 
 /** Draws the default experiment, as it was computed for this page. */
-async function prepared() {
-  const events = await get("static/first.json");
+async function prepared(gone) {
+  const events = await get("static/first.json"), others = events.filter(({ kind }) => kind === "other");
   if (task.isBusy || at("signals").querySelector("figure")) return;
-  clear();
-  const follow = follower(events.filter(({ kind }) => kind === "result" || kind === "other").length);
-  events.forEach(follow);
-  say(form, "Ready. What is shown was prepared: chirp, PRBS and the policy aero2. Press Run for your own.");
+  [{ kind: "job", asked: { others } }, ...events].forEach(follower());
+  say(form, gone || "Ready. What is shown was prepared: chirp, PRBS and the policy aero2. Press Run for your own.", Boolean(gone));
 }
 
 const fields = (id) => [...at(id).querySelectorAll("input")];
@@ -110,11 +110,15 @@ function asked() {
 const waiting = (live) => (live.found.length ? "Estimating and comparing…"
   : "Compiling the estimator for this plant and length; only needed for the first run…");
 
-async function run() {
-  const wanted = asked();
+function run() {
   clear();
   say(form, "Waiting for a worker…");
-  await task.run("api/experiments", wanted, follower(wanted.others.length + 1));
+  follow("api/experiments", asked());
+}
+
+/** Shows an experiment as it goes on: a new one, or without `wanted` one that was shown before. */
+async function follow(address, wanted) {
+  await task.run(address, wanted, follower(wanted));
   if (shownRun && !shownRun.isFull) shownRun.halt(); // no more samples come
 }
 
@@ -125,13 +129,18 @@ function clear() {
   empty(at("signals"), at("estimates"), at("overlays"));
 }
 
-/** Draws the events of an experiment and its comparisons, of which there are so many. */
-function follower(total) {
-  let live = null, rows = [];
+/** Draws the events of an experiment and its comparisons. */
+function follower(wanted) {
+  let live = null, rows = [], total = 1;
   return (event) => {
-    if (event.kind === "started") say(form, "Preparing. The first run with a plant, a length or an excitation compiles programs, which can take a minute or two…");
-    else if (event.kind === "plan") live = new Live(event);
-    else if (event.kind === "samples") {
+    if (event.kind === "job") {
+      clear();
+      total += event.asked.others.length;
+    } else if (event.kind === "started") say(form, "Preparing. The first run with a plant, a length or an excitation compiles programs, which can take a minute or two…");
+    else if (event.kind === "plan") {
+      live = new Live(event);
+      if (wanted && matchMedia("(max-width: 60rem)").matches) section.querySelector(".view").scrollIntoView();
+    } else if (event.kind === "samples") {
       live.samples(event);
       say(form, live.isFull ? waiting(live) : "Running.");
       tell(form, live.isFull ? "" : `${shown(live.time.at(-1))} of ${shown(live.end)} s`);
@@ -155,7 +164,6 @@ class Live {
     Object.assign(this, { plan, time: [], inputs: [], outputs: [], found: [], compared: [], until: null });
     shownRun = this;
     this.end = (plan.num_samples - 1) * plan.plant.dt;
-    if (task.isBusy && matchMedia("(max-width: 60rem)").matches) section.querySelector(".view").scrollIntoView();
     if (plan.warning) say(form, plan.warning, true);
     const title = (part) => el("span", {}, part.name, " ", el("span", { class: "unit" }, part.shown_unit));
     this.play();
