@@ -6,17 +6,18 @@ const content = (field) => (field.type === "checkbox" ? "checked" : "value");
 export class Kept {
   /** What was kept for this form in this tab, or else in the tab that was used last. */
   constructor(form) {
-    Object.assign(this, { form, name: form.parentElement.id, isFilling: false });
+    Object.assign(this, { form, name: form.parentElement.id, more: form.querySelector("details"), isFilling: false });
     const before = sessionStorage.getItem(this.name) ?? localStorage.getItem(this.name);
-    this.state = { fields: {}, shown: null, upload: null, ...JSON.parse(before) };
+    this.state = { fields: {}, isOpen: false, shown: null, upload: null, ...JSON.parse(before) };
     ["input", "change", "click"].forEach((kind) => form.addEventListener(kind, () => this.save()));
+    this.more.addEventListener("toggle", () => this.save());
   }
 
   /** Keeps the form as it is now, and more of the state. What a form lacks for now, such as columns, stays. */
   save(more = {}) {
     if (this.isFilling) return;
     for (const field of fieldsOf(this.form)) this.state.fields[field.id] = field[content(field)];
-    const text = JSON.stringify(Object.assign(this.state, more));
+    const text = JSON.stringify(Object.assign(this.state, { isOpen: this.more.open }, more));
     [sessionStorage, localStorage].forEach((store) => store.setItem(this.name, text));
   }
 
@@ -24,6 +25,7 @@ export class Kept {
   fill() {
     let gone = "";
     this.isFilling = true;
+    this.more.open = this.state.isOpen;
     for (const [id, before] of Object.entries(this.state.fields)) {
       const field = document.getElementById(id), is = field && content(field);
       if (!field || field[is] === before) continue;
