@@ -382,6 +382,37 @@ def test_a_prepared_result_is_drawn_before_anything_is_run(address: str, page: P
     require_no_sideways_scroll(page)
 
 
+def test_the_estimates_of_all_excitations_are_in_the_colours_of_their_signals(
+    address: str, page: Page
+):
+    """Each with its bound, up to the time that is shown; what was prepared has them, too."""
+    prepared(page, address)
+    lines = """(which) => document.querySelector(which).plot.what.lines
+      .map(({ name, color, dash, x, y }) => ({ name, color, dash, x, y }))"""
+    signals = page.evaluate(lines, "#overlays .chart")
+    found = page.evaluate(lines, "#estimates .chart")
+    own, bounds = found[:3], found[3:]
+    for key in ("name", "color"):
+        assert [line[key] for line in own] == [line[key] for line in signals]
+    twice = [line for line in own for _ in range(2)]
+    assert [line["name"] for line in bounds] == [f"{line['name']}, bound" for line in twice]
+    assert [line["color"] for line in bounds] == [line["color"] for line in twice]
+    for line, upper in zip(own, bounds[::2], strict=True):
+        assert len(line["x"]) == 20
+        row = page.locator("#comparison tbody tr", has_text=line["name"])
+        error = float(row.locator("td").nth(2).inner_text().split()[0])
+        assert abs(line["y"][-1]) == pytest.approx(error, abs=5e-6)  # of eight digits
+        assert abs(line["y"][-1]) < 3 * upper["y"][-1]
+    page.get_by_label("Time that is shown").fill("250")
+    found = page.evaluate(lines, "#estimates .chart")
+    assert {len(line["x"]) for line in found} == {9}
+    figure = page.locator("#estimates figure").first
+    toggle = figure.get_by_role("button", name="prbs, bound")
+    toggle.focus()
+    page.keyboard.press("Enter")
+    expect(toggle).to_have_attribute("aria-pressed", "false")
+
+
 def test_plots_share_a_cross_hair_and_a_zoom(address: str, page: Page):
     prepared(page, address)
     first, chart = page.locator("#signals .chart").first, page.locator("#signals .chart").nth(1)

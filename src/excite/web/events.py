@@ -144,11 +144,12 @@ class Concluded(TypedDict):
 
 
 class Compared(TypedDict):
-    """Result of another excitation on the same plant."""
+    """Result of another excitation on the same plant, and its estimates from first to last."""
 
     kind: Literal["other"]
     row: Row
     traces: Traces
+    estimates: list[Estimate]
 
 
 class LeftOut(TypedDict):

@@ -1,6 +1,7 @@
 // Choose a plant and an excitation, run the experiment, watch the estimates.
 
 import { command, download, el, get, options, say, symbol, Task, tell } from "./api.js";
+import { COLOURS } from "./curves.js";
 import { drawSignals, levelsOf, linesOf, passed, reach, signalPlots } from "./overlay.js";
 import { digits, empty, Plot, range, shown } from "./plot.js";
 
@@ -149,9 +150,10 @@ function follower(wanted) {
       if (live.isFull) say(form, waiting(live));
     } else if (["result", "other", "left_out"].includes(event.kind)) {
       rows.push(event.row ?? event);
-      if (event.traces) live.compared.push({ name: event.row.excitation, ...event.traces });
+      if (event.traces) live.compared.push({ name: event.row.excitation, estimates: event.estimates, ...event.traces });
       compare(live, rows, total);
       overlay(live.plan, live.compared);
+      live.track();
       if (event.kind === "result") conclude(event);
       if (rows.length === total) say(form, "Done.");
     }
@@ -171,7 +173,7 @@ class Live {
     this.plots = [...plan.plant.inputs, ...plan.plant.outputs].map((part) =>
       new Plot(at("signals"), title(part), `${part.name} over time, with its safety levels`));
     this.tracks = plan.plant.parameters.map((p) =>
-      new Plot(at("estimates"), from(p.name), `estimate of ${p.name} over time, deviation from the true value in percent, 95 % interval and Cramér-Rao bound`));
+      new Plot(at("estimates"), from(p.name), `estimate of ${p.name} over time for every excitation, deviation from the true value in percent, 95 % interval and Cramér-Rao bounds`));
     this.draw();
   }
 
@@ -220,30 +222,27 @@ class Live {
     this.track();
   }
 
+  /** The estimates of every excitation up to the time that is shown, each with its bound; the interval of the first. */
   track() {
-    const { plant, params } = this.plan, found = this.found.filter((e) => this.until === null || e.k < this.until), time = found.map((e) => e.k * plant.dt);
+    const { plant, params, excitation } = this.plan, isSeen = ({ k }) => this.until === null || k < this.until;
+    const every = [{ name: excitation, estimates: this.found }, ...this.compared.slice(1)].map((own) => ({ ...own, found: own.estimates.filter(isSeen) }));
     plant.parameters.forEach(({ name, scale, unit }, i) => {
-      const true_ = params[name], per = 100 / (Math.abs(true_) || scale);
-      const column = (what) => found.map((e) => (e[what][name] === null ? null : e[what][name] * per));
-      const middle = column("estimate").map((v) => (v === null ? null : v - true_ * per));
-      const half = column("half"), bound = column("bound");
-      // The first estimates are far off: the scale follows the later ones.
-      const from = Math.floor(found.length / 2.5), reach = [];
-      for (let j = from; j < middle.length; j++) if (middle[j] !== null) reach.push(Math.abs(middle[j]) + half[j], bound[j]);
-      const top = 1.15 * (Math.max(...reach.filter(Number.isFinite), 0) || 100);
-      const good = middle.map((v, j) => j).filter((j) => middle[j] !== null);
-      const pick = (values) => good.map((j) => values[j]);
-      this.tracks[i].show({
-        x: [0, this.end], y: [-top, top], unit: "s",
-        bands: [{ x: pick(time), lower: good.map((j) => middle[j] - half[j]), upper: good.map((j) => middle[j] + half[j]), color: "band" }],
-        lines: [
-          { x: time, y: middle, name: "estimate", color: "output", dots: true },
-          { x: time, y: bound, name: "Cramér-Rao bound, 95 %", color: "bound", dash: [5, 4], width: 1.2 },
-          { x: time, y: bound.map((b) => (b === null ? null : -b)), name: "Cramér-Rao bound, 95 %", color: "bound", dash: [5, 4], width: 1.2 },
-        ],
+      const true_ = params[name], per = 100 / (Math.abs(true_) || scale), reach = [], lines = [], bounds = [], bands = [];
+      every.forEach(({ name: who, found }, j) => {
+        const x = found.map(({ k }) => k * plant.dt), color = COLOURS[j];
+        const column = (what) => found.map((e) => (e[what][name] === null ? null : e[what][name] * per));
+        const y = column("estimate").map((v) => (v === null ? null : v - true_ * per)), half = column("half"), bound = column("bound");
+        const good = found.map((_, k) => k).filter((k) => y[k] !== null);
+        // The first estimates are far off: the scale follows the later ones.
+        for (const k of good.filter((k) => k >= Math.floor(found.length / 2.5))) reach.push(Math.abs(y[k]) + (j ? 0 : half[k]), bound[k]);
+        lines.push({ x, y, name: who, color, dots: true });
+        for (const sign of [1, -1]) bounds.push({ x, y: bound.map((v) => (v === null ? null : sign * v)), name: `${who}, bound`, color, dash: [5, 4], width: 1.2 });
+        if (!j) bands.push({ x: good.map((k) => x[k]), lower: good.map((k) => y[k] - half[k]), upper: good.map((k) => y[k] + half[k]), color: "band" });
       });
-      const last = found.at(-1)?.estimate[name] ?? null, half95 = found.at(-1)?.half[name];
-      this.tracks[i].note.textContent = last === null ? "no estimate yet" : `${shown(last, digits(last, half95))} ± ${shown(half95, 2)} ${unit}`;
+      const top = 1.15 * (Math.max(...reach.filter(Number.isFinite), 0) || 100);
+      this.tracks[i].show({ x: [0, this.end], y: [-top, top], unit: "s", bands, lines: [...lines, ...bounds] });
+      const { estimate, half } = every[0].found.at(-1) ?? { estimate: {}, half: {} }, last = estimate[name] ?? null;
+      this.tracks[i].note.textContent = last === null ? "no estimate yet" : `${shown(last, digits(last, half[name]))} ± ${shown(half[name], 2)} ${unit}`;
     });
   }
 
