@@ -382,6 +382,37 @@ def test_a_prepared_result_is_drawn_before_anything_is_run(address: str, page: P
     require_no_sideways_scroll(page)
 
 
+def test_the_estimates_of_all_excitations_are_in_the_colours_of_their_signals(
+    address: str, page: Page
+):
+    """Each with its bound, up to the time that is shown; what was prepared has them, too."""
+    prepared(page, address)
+    lines = """(which) => document.querySelector(which).plot.what.lines
+      .map(({ name, color, dash, x, y }) => ({ name, color, dash, x, y }))"""
+    signals = page.evaluate(lines, "#overlays .chart")
+    found = page.evaluate(lines, "#estimates .chart")
+    own, bounds = found[:3], found[3:]
+    for key in ("name", "color"):
+        assert [line[key] for line in own] == [line[key] for line in signals]
+    twice = [line for line in own for _ in range(2)]
+    assert [line["name"] for line in bounds] == [f"{line['name']}, bound" for line in twice]
+    assert [line["color"] for line in bounds] == [line["color"] for line in twice]
+    for line, upper in zip(own, bounds[::2], strict=True):
+        assert len(line["x"]) == 20
+        row = page.locator("#comparison tbody tr", has_text=line["name"])
+        error = float(row.locator("td").nth(2).inner_text().split()[0])
+        assert abs(line["y"][-1]) == pytest.approx(error, abs=5e-6)  # of eight digits
+        assert abs(line["y"][-1]) < 3 * upper["y"][-1]
+    page.get_by_label("Time that is shown").fill("250")
+    found = page.evaluate(lines, "#estimates .chart")
+    assert {len(line["x"]) for line in found} == {9}
+    figure = page.locator("#estimates figure").first
+    toggle = figure.get_by_role("button", name="prbs, bound")
+    toggle.focus()
+    page.keyboard.press("Enter")
+    expect(toggle).to_have_attribute("aria-pressed", "false")
+
+
 def test_plots_share_a_cross_hair_and_a_zoom(address: str, page: Page):
     prepared(page, address)
     first, chart = page.locator("#signals .chart").first, page.locator("#signals .chart").nth(1)
@@ -733,6 +764,137 @@ def test_what_the_plant_leaves_out_is_estimated_by_one_click(
     values, edge = page.evaluate(f"[{plot}.lines[0].y, {plot}.bands[0].upper[0]]")
     assert len(values) == 30
     assert sum(abs(v) > edge for v in values) <= 6
+
+
+FORM = """(part) => Object.fromEntries([...document.querySelectorAll(`#${part} form [id]`)]
+  .filter((field) => field.matches("select, input:not([type=file])"))
+  .map((field) => [field.id, field.type === "checkbox" ? field.checked : field.value]))"""
+PLOTS = """(part) => [...document.querySelectorAll(`#${part} .chart`)]
+  .map(({ plot }) => JSON.stringify(plot.what))"""
+
+
+def seen(page: Page, part: str) -> tuple[Any, ...]:
+    """The form of a view, the texts of its result, and what its plots show."""
+    texts = page.locator(f"#{part} .view").locator("table, li, pre, h2, .downloads a, figcaption")
+    hidden = page.locator(f"#{part} .view > section[hidden]").count()
+    return page.evaluate(FORM, part), texts.all_inner_texts(), page.evaluate(PLOTS, part), hidden
+
+
+def test_an_experiment_comes_back_when_the_page_is_loaded_again(address: str, page: Page):
+    ready(page, address)
+    page.locator("#plant").select_option("cart_pole")
+    page.locator("#plant").select_option("worst")
+    page.locator("#excitation").select_option("multisine")
+    page.get_by_label("First", exact=True).select_option("aero2")
+    page.get_by_label("Second", exact=True).select_option("multisine")
+    for field, value in (("amplitude", "6.5"), ("noise-pitch", "0.2")):
+        page.locator(f"#{field}").fill(value)
+    page.get_by_role("button", name="Draw within").click()
+    page.get_by_label("Played in").select_option("0")
+    page.get_by_role("button", name="Run", exact=True).click()
+    expect(status(page)).to_have_text("Done.", timeout=WAIT)
+    page.locator("#seed").fill("9")  # for the next one
+    page.locator("#steps").fill("400")
+    before = seen(page, "experiment")
+    assert (before[0]["plant"], before[0]["excitation"]) == ("worst", "multisine")
+    page.reload()
+    expect(status(page)).to_have_text("Done.", timeout=WAIT)
+    assert seen(page, "experiment") == before
+    with page.expect_download() as waiting:
+        page.locator("#outcome a[href$='record.csv']").click()
+    assert len(waiting.value.path().read_text().splitlines()) == 502
+    # The tab is closed, and the address opened again.
+    later = page.context.new_page()
+    page.close()
+    later.goto(address)
+    expect(status(later)).to_have_text("Done.", timeout=WAIT)
+    later.set_viewport_size({"width": 390, "height": 800})
+    assert seen(later, "experiment")[:2] == before[:2]
+    assert Axe().run(later).response["violations"] == []
+    # The server knows this browser no more, as after it was started again.
+    later.context.clear_cookies()
+    later.reload()
+    expect(status(later)).to_contain_text("no longer on the server", timeout=WAIT)
+    assert seen(later, "experiment")[0] == before[0]
+    expect(later.get_by_role("button", name="Run", exact=True)).to_be_enabled()
+
+
+def test_a_plant_that_is_gone_is_told(address: str, page: Page):
+    page.goto(f"{address}/static/first.json")  # where no script runs
+    page.evaluate("""localStorage.setItem("experiment",
+      JSON.stringify({ fields: { plant: "my_own", excitation: "prbs" } }))""")
+    page.goto(address)
+    expect(status(page)).to_have_text("the plant my_own is no longer on the server", timeout=WAIT)
+    expect(page.locator("#signals canvas")).to_have_count(2)
+    expect(status(page)).to_have_class(re.compile("bad"))
+    expect(page.locator("#excitation")).to_have_value("chirp")
+
+
+def test_an_experiment_that_runs_is_followed_again(address: str, page: Page):
+    """And what was stopped is shown up to there."""
+    ready(page, address)
+    page.get_by_label("Played in").select_option("20")
+    page.get_by_role("button", name="Run", exact=True).click()
+    expect(status(page)).to_have_text(re.compile("^Running"), timeout=WAIT)
+    page.reload()
+    expect(status(page)).to_have_text(re.compile("^Running"), timeout=WAIT)
+    expect(page.get_by_role("button", name="Run", exact=True)).to_be_disabled()
+    page.locator("#experiment .stop").click()
+    expect(status(page)).to_have_text("Stopped.", timeout=WAIT)
+    before = seen(page, "experiment")
+    assert len(before[2]) == 5
+    page.reload()
+    expect(status(page)).to_have_text("Stopped.", timeout=WAIT)
+    assert seen(page, "experiment") == before
+
+
+def test_a_file_and_its_result_come_back_when_the_page_is_loaded_again(
+    address: str, page: Page, tmp_path: Path
+):
+    page.goto(f"{address}/#record")
+    expect(page.locator("#record-plant option").first).to_be_attached(timeout=WAIT)
+    record = ex.simulate("aero2", "chirp", steps=200)
+    columns = 1000 * record.time, record.inputs[:, 0] / 2, np.degrees(record.outputs[:, 0])
+    rows = "".join(f"{t:.9g},{u:.9g},{y:.9g}\n" for t, u, y in zip(*columns, strict=True))
+    (tmp_path / "log.csv").write_text("stamp,u,y\n" + rows)
+    page.locator("#record-plant").select_option("worst")
+    page.locator("#file").set_input_files(tmp_path / "log.csv")
+    expect(status(page, "record")).to_contain_text("log.csv: 3 columns", timeout=WAIT)
+    for name, column in (("time", "stamp"), ("voltage", "u"), ("pitch", "y")):
+        page.locator(f"#column-{name}").select_option(column)
+    page.locator("#unit-time").select_option("ms")
+    page.locator("#unit-pitch").select_option("deg")
+    page.locator("#scale-voltage").fill("2")
+    page.locator("#record form summary").click()
+    page.get_by_label("bias_pitch").check()
+    page.get_by_label("hold Jp").fill("0.0232")
+    page.get_by_label("prior of Kpu").fill("normal:0.0125:5%")
+    page.get_by_label("Intervals").select_option("profile")
+    page.get_by_label("Initial state").select_option("known")
+    mapped = seen(page, "record")
+    page.reload()  # before anything is identified
+    expect(status(page, "record")).to_contain_text("log.csv: 3 columns", timeout=WAIT)
+    assert seen(page, "record") == mapped
+    page.get_by_label("bias_pitch").uncheck()  # "Advanced" is open, as it was
+    page.get_by_label("Intervals").select_option("linear")
+    page.get_by_role("button", name="Identify").click()
+    expect(status(page, "record")).to_have_text("Done: successful.", timeout=WAIT)
+    before = seen(page, "record")
+    page.reload()
+    expect(status(page, "record")).to_have_text("Done: successful.", timeout=WAIT)
+    assert seen(page, "record") == before
+    assert Axe().run(page).response["violations"] == []
+    # The server knows this browser no more: the file is chosen again, and is mapped as before.
+    page.context.clear_cookies()
+    page.reload()
+    gone = "this file is no longer on the server; choose it again"
+    expect(status(page, "record")).to_have_text(gone, timeout=WAIT)
+    expect(page.get_by_role("button", name="Identify")).to_be_disabled()
+    page.locator("#file").set_input_files(tmp_path / "log.csv")
+    expect(status(page, "record")).to_contain_text("log.csv: 3 columns", timeout=WAIT)
+    assert seen(page, "record")[0] == before[0]
+    page.get_by_role("button", name="Identify").click()
+    expect(status(page, "record")).to_have_text("Done: successful.", timeout=WAIT)
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

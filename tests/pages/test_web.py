@@ -199,6 +199,9 @@ def test_what_the_page_shows_first_is_what_its_workers_compute():
         for name in ("time", "inputs", "outputs", "log_det"):  # None becomes NaN
             old, new = (np.array(e["traces"][name], float) for e in (before, after))
             np.testing.assert_allclose(old, new, rtol=1e-3, atol=1e-6)
+        for old, new in zip(before.get("estimates", []), after.get("estimates", []), strict=True):
+            assert old["k"] == new["k"]
+            assert old["bound"] == pytest.approx(new["bound"], rel=1e-3, nan_ok=True)
 
 
 def test_traces_are_the_experiment_and_its_information(told: Told):
@@ -265,6 +268,12 @@ def test_two_others_are_compared_on_the_same_plant(told: Told):
     others = [event["row"] for event in told.of("other")]
     assert [row["excitation"] for row in others] == ["prbs", "aero2"]
     assert all(row["params"]["J_p"]["true"] == 0.025 for row in others)
+    for event in told.of("other"):  # their estimates over time end where they do
+        assert [e["k"] for e in event["estimates"]] == [e["k"] for e in told.of("estimate")]
+        last = event["estimates"][-1]
+        for name, p in event["row"]["params"].items():
+            assert last["estimate"][name] == pytest.approx(p["estimate"], rel=1e-9)
+            assert last["bound"][name] == pytest.approx(1.959964 * p["cramer_rao_bound"])
 
 
 def test_another_excitation_that_does_not_fit_is_left_out(client, told: Told):

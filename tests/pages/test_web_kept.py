@@ -1,5 +1,6 @@
 """What the bench page keeps for a browser, and for how long; links in the run folder."""
 
+import asyncio
 import json
 import shutil
 from collections.abc import AsyncGenerator, Mapping
@@ -10,9 +11,9 @@ import pytest
 from starlette.testclient import TestClient
 
 from excite.files import write_json
-from excite.web import application
+from excite.web import application, sessions
 from excite.web.requests import RefusedError
-from excite.web.sessions import MAX_KEPT, PageSettings, Session
+from excite.web.sessions import MAX_JOBS, MAX_KEPT, Job, PageSettings, Session
 from excite.web.workers import Workers
 
 HERE = "http://127.0.0.1:8000"
@@ -99,23 +100,109 @@ def test_what_is_in_use_stays(tmp_path: Path):
     session = Session(tmp_path)
 
     def made() -> str:
-        with session.making("result") as (name, place):
+        name = session.begin()
+        with session.making("result", name) as place:
             place.is_done = True
+        session.end(name)
         return name
 
     oldest = made()
-    with session.using(oldest) as folder, session.making("result") as (name, place):
+    with session.using(oldest, "result") as folder, session.making("result", "new") as place:
         for _ in range(2 * MAX_KEPT):
             made()
         assert folder.is_dir()
         assert place.folder.is_dir()
-    assert name not in session.kept
+    assert "new" not in session.kept
     made()
     made()
-    with pytest.raises(RefusedError, match="run it again"), session.using(oldest):
+    with pytest.raises(RefusedError, match="run it again"), session.using(oldest, "result"):
         pass
     assert not folder.exists()
     assert len(session.kept) == MAX_KEPT
+
+
+# ------------------------------------------------------------- a page that is loaded again
+
+
+def test_what_was_shown_is_told_again(page: TestClient):
+    """The request and all events of a result, and the columns of an upload; one by one."""
+    upload = uploaded(page)
+    asked = {**ASKED, "upload": upload, "columns": {"time": "time"}}
+    told = page.post("/api/identifications", json=asked)
+    first, found, _ = map(json.loads, told.text.splitlines())
+    assert (first["kind"], first["asked"]) == ("job", asked)
+    assert first["job"] == found["result"]
+    again = page.get(f"/api/results/{first['job']}/events")
+    assert (again.status_code, again.text) == (200, told.text)
+    assert page.get(f"/api/uploads/{upload}").json() == {
+        "upload": upload, "file": "a.csv", "columns": {"time": 2}, "previews": {},
+    }  # fmt: skip
+    for name in (upload, "none"):
+        answer = page.get(f"/api/results/{name}/events")
+        assert (answer.status_code, "run it again" in answer.text) == (404, True)
+    answer = page.get(f"/api/uploads/{first['job']}")
+    assert (answer.status_code, "choose it again" in answer.text) == (404, True)
+
+
+def test_another_browser_is_told_nothing_again(page: TestClient):
+    upload = uploaded(page)
+    result = identified(page, upload)
+    page.cookies.clear()
+    assert page.get(f"/api/results/{result}/events").status_code == 403
+    assert page.post("/api/session", json={}).is_success
+    for place in (f"results/{result}/events", f"uploads/{upload}"):
+        assert page.get(f"/api/{place}").status_code == 404
+
+
+@pytest.mark.parametrize("grace", [0.0, 60.0])
+def test_a_job_goes_on_while_its_page_is_loaded_again(
+    grace: float, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(sessions, "GRACE", grace)
+
+    async def left_and_followed() -> list[str]:
+        job, may_end = Job(), asyncio.Event()
+
+        async def work() -> None:
+            job.tell("first")
+            await may_end.wait()
+            job.tell("last")
+
+        job.start(work())
+        page = job.follow()
+        assert await anext(page) == "first"
+        assert not job.is_abandoned
+        await page.aclose()
+        assert job.is_abandoned
+        await asyncio.sleep(0.01)  # the page is being loaded
+        may_end.set()
+        return [line async for line in job.follow()]
+
+    if grace:
+        assert asyncio.run(left_and_followed()) == ["first", "last"]
+    else:
+        with pytest.raises(asyncio.CancelledError):
+            asyncio.run(left_and_followed())
+
+
+def test_a_job_that_was_left_gives_way(tmp_path: Path):
+    async def one_more() -> tuple[str, dict[str, Job | None]]:
+        session, jobs = Session(tmp_path), [Job() for _ in range(MAX_JOBS)]
+        names = [session.begin(job) for job in jobs]
+        for job in jobs:
+            job.start(asyncio.sleep(60))
+        followed = [asyncio.ensure_future(anext(job.follow())) for job in jobs]
+        await asyncio.sleep(0)
+        with pytest.raises(RefusedError, match="stop one"):
+            session.begin()
+        followed[1].cancel()
+        await asyncio.wait({followed[1]})
+        session.begin()
+        return names[1], session.jobs
+
+    left, jobs = asyncio.run(one_more())
+    assert left not in jobs
+    assert len(jobs) == MAX_JOBS
 
 
 # ---------------------------------------------------------------------------------- links

@@ -122,7 +122,8 @@ async def _body(request: Request) -> dict[str, object]:
             raise RefusedError(413, "the request is too large")
     try:
         asked = json.loads(bytes(content))
-        json.dumps(asked, ensure_ascii=False).encode()  # refuses lone surrogates
+        # Refuses lone surrogates, and numbers that JSON does not have.
+        json.dumps(asked, ensure_ascii=False, allow_nan=False).encode()
     except (ValueError, RecursionError):
         asked = None
     if not isinstance(asked, dict):

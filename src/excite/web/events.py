@@ -5,6 +5,7 @@ They are JSON from the worker to the browser: a number that is not finite is Non
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Literal, NotRequired, TypedDict
 
 Numbers = dict[str, float]
@@ -143,11 +144,12 @@ class Concluded(TypedDict):
 
 
 class Compared(TypedDict):
-    """Result of another excitation on the same plant."""
+    """Result of another excitation on the same plant, and its estimates from first to last."""
 
     kind: Literal["other"]
     row: Row
     traces: Traces
+    estimates: list[Estimate]
 
 
 class LeftOut(TypedDict):
@@ -212,10 +214,14 @@ JobEvent = (
 
 
 class Begun(TypedDict):
-    """The first event of a stream: the name by which it can be stopped."""
+    """The first event of a stream: what was asked, and the name.
+
+    By the name it can be stopped and followed again, and its result is found.
+    """
 
     kind: Literal["job"]
     job: str
+    asked: Mapping[str, object]
 
 
 class Pulse(TypedDict):

@@ -1,6 +1,7 @@
 """The experiment that the page shows before anything is run: the events of the default one.
 
-`python -m excite.web.first` writes them to `static/first.json`, with five digits a number.
+`python -m excite.web.first` writes them to `static/first.json`, with five digits a number,
+eight of an estimate, which is shown by its small distance from the true value.
 """
 
 from __future__ import annotations
@@ -28,13 +29,17 @@ def events() -> list[dict[str, Any]]:
     return [_shortened(json_ready(event)) for event in [plan, samples, *followed]]
 
 
-def _shortened(value: Any) -> Any:
-    """The same with numbers of five digits."""
+def _shortened(value: Any, digits: int = 5) -> Any:
+    """The same with numbers of so many digits."""
     if isinstance(value, dict):
-        return {name: _shortened(part) for name, part in value.items() if name != "profiles"}
+        return {
+            name: _shortened(part, 8 if name == "estimate" else digits)
+            for name, part in value.items()
+            if name != "profiles"
+        }
     if isinstance(value, list):
-        return [_shortened(part) for part in value]
-    return float(f"{value:.5g}") if isinstance(value, float) else value
+        return [_shortened(part, digits) for part in value]
+    return float(f"{value:.{digits}g}") if isinstance(value, float) else value
 
 
 if __name__ == "__main__":

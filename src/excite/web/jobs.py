@@ -57,7 +57,15 @@ from ..record.formats import columns_in
 from ..report.html import report_html
 from ..safety import critical_levels, is_violation, max_abs_output
 from ..simulation import Experiment, Trajectory
-from .events import ExperimentRequest, IdentificationRequest, ParameterRow, Preview, Row, Traces
+from .events import (
+    Estimate,
+    ExperimentRequest,
+    IdentificationRequest,
+    ParameterRow,
+    Preview,
+    Row,
+    Traces,
+)
 from .events import JobEvent as Event
 from .plants import shown_plant
 
@@ -206,12 +214,13 @@ def followed(asked: ExperimentRequest, folder: str) -> Iterator[Event]:
             continue
         its = running_information(other.plant, other.params, its_run.inputs)
         row, traces = _outcome(plant, other, its_run, its[-1])[0], _traces(other, its_run, its)
-        yield {"kind": "other", "row": row, "traces": traces}
+        estimates = list(_estimates(plant, other, its_run, its))
+        yield {"kind": "other", "row": row, "traces": traces, "estimates": estimates}
 
 
 def _estimates(
     plant: AbstractPlant, own: Experiment, run: Trajectory, information: Array
-) -> Iterator[Event]:
+) -> Iterator[Estimate]:
     """Estimates from growing numbers of samples, the last one from all."""
     size = relative_size(own.plant, own.params)
     data = stack_experiments(plant, [run.inputs], [run.measured], True)

@@ -37,20 +37,26 @@ def routes(workers: Workers, run_of: Callable[[Request], Path]) -> list[Route]:
         file = _file_name(request.query_params.get("name", ""))
         job = session.begin()
         try:
-            with session.making("upload") as (name, place):
+            with session.making("upload", job) as place:
                 await _receive(request, place.folder / file, session.folder.parent)
-                wanted = {"folder": str(place.folder), "name": file}
-                told = await _last(workers, "columns", wanted, True)
+                found = await _columns(workers, place.folder)
                 place.is_done = True
         finally:
             session.end(job)
-        columns = told if told["kind"] == "columns" else {"columns": {}, "previews": {}}
-        found = {"columns": columns["columns"], "previews": columns["previews"]}
-        return JSONResponse({"upload": name, "file": file, **found})
+        return JSONResponse({"upload": job, **found})
+
+    async def uploaded(request: Request) -> JSONResponse:
+        session, name = request.state.session, request.path_params["name"]
+        job = session.begin()
+        try:
+            with session.using(name, "upload") as folder:
+                return JSONResponse({"upload": name, **await _columns(workers, folder)})
+        finally:
+            session.end(job)
 
     def file(request: Request) -> FileResponse:
         asked = request.path_params
-        with request.state.session.using(asked["name"]) as folder:
+        with request.state.session.using(asked["name"], "result") as folder:
             path = folder / "run" / asked["file"]
         if asked["file"] not in _DOWNLOADS or not path.is_file():
             raise RefusedError(404, "this result has no such file")
@@ -58,7 +64,7 @@ def routes(workers: Workers, run_of: Callable[[Request], Path]) -> list[Route]:
 
     async def report(request: Request) -> Response:
         session: Session = request.state.session
-        with session.using(request.path_params["name"]) as folder:
+        with session.using(request.path_params["name"], "result") as folder:
             if not (folder / "run").is_dir():
                 raise RefusedError(404, "there is no result to report yet")
             return await _reported(workers, session, folder / "run")
@@ -71,10 +77,19 @@ def routes(workers: Workers, run_of: Callable[[Request], Path]) -> list[Route]:
 
     return [
         Route("/api/uploads", upload, methods=["POST"]),
+        Route("/api/uploads/{name}", uploaded),
         Route("/api/results/{name}/report.html", report),
         Route("/api/results/{name}/{file}", file),
         Route("/api/run/report.html", run_report),
     ]
+
+
+async def _columns(workers: Workers, folder: Path) -> dict[str, object]:
+    """The name of the file in the folder of an upload, and its columns."""
+    [file] = folder.iterdir()
+    told = await _last(workers, "columns", {"folder": str(folder), "name": file.name}, True)
+    found = told if told["kind"] == "columns" else {"columns": {}, "previews": {}}
+    return {"file": file.name, "columns": found["columns"], "previews": found["previews"]}
 
 
 async def _reported(workers: Workers, session: Session, run: Path) -> Response:

@@ -9,7 +9,7 @@ import secrets
 import shutil
 import tempfile
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import AsyncGenerator, Coroutine, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -23,6 +23,13 @@ MAX_STORED = 2 * 2**30
 """Limit of the data stored for all browsers [bytes]; beyond it uploads are refused."""
 MAX_KEPT = 8
 """Number of results, and of uploads, stored for a browser; the oldest is removed first."""
+GRACE = 10.0
+"""Seconds that a job goes on while no page follows it: its page may be loaded again."""
+GONE = {
+    "upload": "this file is no longer on the server; choose it again",
+    "result": "this result is no longer on the server, or was interrupted; run it again",
+}
+"""What is said of an upload or a result that a browser does not have."""
 
 
 @dataclass(frozen=True)
@@ -95,41 +102,98 @@ class Place:
     is_done: bool = False
 
 
+class Job:
+    """A job that runs, whichever pages follow it; `GRACE` seconds without one end it.
+
+    Attributes:
+        stop: to be set to stop it.
+        lines: what it has told so far.
+    """
+
+    def __init__(self) -> None:
+        self.stop, self.lines = asyncio.Event(), list[str]()
+        self._more, self._num_followers = asyncio.Event(), 0
+        self._task: asyncio.Task[None]
+        self._ending: asyncio.TimerHandle | None = None
+
+    def start(self, work: Coroutine[None, None, None]) -> None:
+        """Runs the work, which tells its lines."""
+        self._task = asyncio.create_task(work)
+        self._task.add_done_callback(lambda _: self._more.set())
+
+    def tell(self, line: str) -> None:
+        """Adds a line for all pages."""
+        self.lines.append(line)
+        self._more.set()
+        self._more = asyncio.Event()
+
+    async def follow(self) -> AsyncGenerator[str]:
+        """All lines from the first, until it ends."""
+        if self._ending is not None:
+            self._ending.cancel()
+            self._ending = None
+        self._num_followers += 1
+        sent = 0
+        try:
+            while True:
+                more, is_over = self._more, self._task.done()
+                while sent < len(self.lines):
+                    sent += 1
+                    yield self.lines[sent - 1]
+                if is_over:
+                    self._task.result()  # an unexpected error breaks the connection
+                    return
+                await more.wait()
+        finally:
+            self._num_followers -= 1
+            if not self._num_followers:
+                self._ending = asyncio.get_running_loop().call_later(GRACE, self.end)
+
+    @property
+    def is_abandoned(self) -> bool:
+        """Whether the pages that followed it have left."""
+        return self._ending is not None
+
+    def end(self) -> None:
+        """Ends it at once, without a result."""
+        self._task.cancel()
+
+
 @dataclass
 class Session:
     """The session of one browser, and the data that only this browser can see.
 
     Attributes:
         folder: its uploads and results.
-        stops: functions that stop the running jobs, by name; None for a short one.
+        jobs: those that run, by name; None for a short one, which cannot be stopped.
         kept: results and uploads by name, the one used last at the end.
     """
 
     folder: Path
-    stops: dict[str, asyncio.Event | None] = field(default_factory=dict)
+    jobs: dict[str, Job | None] = field(default_factory=dict)
     kept: dict[str, Place] = field(default_factory=dict)
     seen: float = field(default_factory=time.monotonic)
 
     @contextlib.contextmanager
-    def making(self, kind: str) -> Iterator[tuple[str, Place]]:
-        """A new folder with a name that cannot be guessed; it is removed if not completed."""
-        name, folder = secrets.token_urlsafe(12), Path(tempfile.mkdtemp(dir=self.folder))
-        place = self.kept[name] = Place(folder, kind)
-        self._give_way(kind, name)
+    def making(self, kind: str, name: str) -> Iterator[Place]:
+        """A new folder for what the job of this name makes; it is removed if not completed."""
+        place = self.kept[name] = Place(Path(tempfile.mkdtemp(dir=self.folder)), kind)
         try:
-            with self.using(name):
-                yield name, place
+            with self.using(name, kind):
+                yield place
         finally:
-            if not place.is_done:
+            if place.is_done:
+                self._give_way(kind, name)
+            else:
                 self._forget(name)
 
     @contextlib.contextmanager
-    def using(self, name: str) -> Iterator[Path]:
+    def using(self, name: str, kind: str) -> Iterator[Path]:
         """The folder of a result or upload of this browser, not removed while in use."""
-        place = self.kept.pop(name, None)
-        if place is None:
-            raise RefusedError(404, "this browser has no such result; run it again")
-        self.kept[name] = place  # now the last one
+        place = self.kept.get(name)
+        if place is None or place.kind != kind:
+            raise RefusedError(404, GONE[kind])
+        self.kept[name] = self.kept.pop(name)  # now the last one
         place.num_users += 1
         try:
             yield place.folder
@@ -154,23 +218,30 @@ class Session:
     @property
     def is_idle(self) -> bool:
         """Whether none of its jobs runs."""
-        return not self.stops
+        return not self.jobs
 
-    def begin(self, stop: asyncio.Event | None = None) -> str:
-        """The name of a new job, which runs until `end`.
+    def begin(self, job: Job | None = None) -> str:
+        """The name of a new job, which runs until `end`; it cannot be guessed.
+
+        Where too many run, the first that was abandoned ends.
 
         Raises:
-            RefusedError: where too many run already.
+            RefusedError: where all of them are followed.
         """
-        if len(self.stops) >= MAX_JOBS:
-            raise RefusedError(429, f"{MAX_JOBS} jobs already running in this browser; stop one")
+        if len(self.jobs) >= MAX_JOBS:
+            left = [(name, one) for name, one in self.jobs.items() if one and one.is_abandoned]
+            if not left:
+                sentence = f"{MAX_JOBS} jobs already running in this browser; stop one"
+                raise RefusedError(429, sentence)
+            left[0][1].end()
+            self.end(left[0][0])
         name = secrets.token_urlsafe(12)
-        self.stops[name] = stop
+        self.jobs[name] = job
         return name
 
     def end(self, name: str) -> None:
         """Ends the entry of a job."""
-        self.stops.pop(name, None)
+        self.jobs.pop(name, None)
 
 
 class Sessions:

@@ -9,14 +9,15 @@ from __future__ import annotations
 import asyncio
 import json
 import math
-from collections.abc import AsyncGenerator, AsyncIterator, Callable, Mapping
+from collections.abc import AsyncGenerator, Callable, Mapping
 from contextlib import aclosing
+from pathlib import Path
 
 from starlette.requests import Request
-from starlette.responses import JSONResponse, StreamingResponse
+from starlette.responses import FileResponse, JSONResponse, StreamingResponse
 from starlette.routing import Route
 
-from ..files import is_class_word
+from ..files import is_class_word, write_bytes
 from .events import (
     Episode,
     ExperimentRequest,
@@ -39,12 +40,14 @@ from .requests import (
     word,
     words,
 )
-from .sessions import Session
+from .sessions import GONE, Job, Session
 from .workers import Workers
 
 FRAME = 0.04
 """Seconds between two parts of a stream."""
 _PULSE = 1.0  # seconds without an event, then a pulse is sent
+_KEPT, _LINES = "events.ndjson", "application/x-ndjson"
+_COMPLETE = ("result", "identified", "stopped", "end")  # there is something to show again
 
 Events = AsyncGenerator[StreamEvent]
 
@@ -58,28 +61,47 @@ def routes(workers: Workers, plants: Mapping[str, str], body: Body) -> list[Rout
     """
 
     async def experiment(request: Request) -> StreamingResponse:
-        session, asked = request.state.session, await body(request)
-        seconds, asked = number(asked, "seconds", 0, 60), _experiment(asked, plants)
-        return _streamed(session, lambda stop: _played(workers, session, asked, seconds, stop))
+        wanted = await body(request)
+        seconds, asked = number(wanted, "seconds", 0, 60), _experiment(wanted, plants)
+
+        def events(folder: Path, stop: asyncio.Event) -> Events:
+            return _played(workers, asked, seconds, folder, stop)
+
+        return _streamed(request.state.session, wanted, events)
 
     async def identification(request: Request) -> StreamingResponse:
-        session, asked = request.state.session, await body(request)
-        upload = str(asked.get("upload"))
-        with session.using(upload):  # or there is none
-            asked = _identification(asked, plants)
-        return _streamed(session, lambda stop: _identified(workers, session, asked, upload, stop))
+        session, wanted = request.state.session, await body(request)
+        upload = str(wanted.get("upload"))
+        with session.using(upload, "upload"):  # or there is none
+            asked = _identification(wanted, plants)
+
+        def events(folder: Path, stop: asyncio.Event) -> Events:
+            return _identified(workers, session, asked, upload, folder, stop)
+
+        return _streamed(session, wanted, events)
+
+    async def again(request: Request) -> StreamingResponse | FileResponse:
+        """All events from the first, of a job that runs or has ended."""
+        session, name = request.state.session, request.path_params["name"]
+        job = session.jobs.get(name)
+        if job is not None:
+            return StreamingResponse(job.follow(), media_type=_LINES)
+        with session.using(name, "result") as folder:
+            if not (folder / _KEPT).is_file():
+                raise RefusedError(404, GONE["result"])
+            return FileResponse(folder / _KEPT, media_type=_LINES)
 
     async def stop(request: Request) -> JSONResponse:
-        stops: dict[str, asyncio.Event | None] = request.state.session.stops
-        asked = stops.get(request.path_params["job"])
-        if asked is None:
+        job = request.state.session.jobs.get(request.path_params["job"])
+        if job is None:
             raise RefusedError(404, "this browser has no such job")
-        asked.set()
+        job.stop.set()
         return JSONResponse({"stopped": True})
 
     return [
         Route("/api/experiments", experiment, methods=["POST"]),
         Route("/api/identifications", identification, methods=["POST"]),
+        Route("/api/results/{name}/events", again),
         Route("/api/jobs/{job}", stop, methods=["DELETE"]),
     ]
 
@@ -122,23 +144,36 @@ def _estimator(name: str) -> str:
     return name
 
 
-def _streamed(session: Session, events: Callable[[asyncio.Event], Events]) -> StreamingResponse:
-    """A response that continues until the events end, or the browser stops or leaves."""
-    stop = asyncio.Event()
-    job = session.begin(stop)
+def _streamed(
+    session: Session, wanted: Asked, events: Callable[[Path, asyncio.Event], Events]
+) -> StreamingResponse:
+    """The events of a new job, which a page follows; those of a completed one are kept.
 
-    async def lines() -> AsyncIterator[str]:
+    Args:
+        wanted: what the browser asked for.
+        events: of the job that writes its run folder there, until it is stopped.
+    """
+    job = Job()
+    name = session.begin(job)
+
+    async def work() -> None:
+        job.tell(_line({"kind": "job", "job": name, "asked": wanted}))
         try:
-            yield _line({"kind": "job", "job": job})
-            async with aclosing(events(stop)) as told:
-                async for event in told:
-                    yield _line(event)
+            with session.making("result", name) as place:
+                async with aclosing(events(place.folder / "run", job.stop)) as told:
+                    async for event in told:
+                        if event["kind"] == "result" or event["kind"] == "identified":
+                            event["result"] = name
+                        job.tell(_line(event))
+                        place.is_done |= event["kind"] in _COMPLETE
+                write_bytes(place.folder / _KEPT, "".join(job.lines).encode())
         except RefusedError as refused:
-            yield _line({"kind": "failed", "sentence": refused.sentence})
+            job.tell(_line({"kind": "failed", "sentence": refused.sentence}))
         finally:
-            session.end(job)
+            session.end(name)
 
-    return StreamingResponse(lines(), media_type="application/x-ndjson")
+    job.start(work())
+    return StreamingResponse(job.follow(), media_type=_LINES)
 
 
 def _line(event: StreamEvent) -> str:
@@ -176,27 +211,23 @@ async def _identified(
     session: Session,
     asked: IdentificationRequest,
     upload: str,
+    folder: Path,
     stop: asyncio.Event,
 ) -> Events:
-    with session.using(upload) as source, session.making("result") as (name, place):
-        arguments = {
-            "asked": asked,
-            "source": str(source),
-            "name": next(iter(source.iterdir())).name,
-            "folder": str(place.folder / "run"),
-        }
+    with session.using(upload, "upload") as source:
+        [file] = source.iterdir()
+        paths = {"source": str(source), "name": file.name, "folder": str(folder)}
+        arguments = {"asked": asked, **paths}
         async with aclosing(_lively(workers.events("identified", arguments), stop)) as events:
             async for event in events:
-                if event["kind"] == "identified":
-                    place.is_done, event["result"] = True, name
                 yield event
 
 
 async def _played(
     workers: Workers,
-    session: Session,
     asked: ExperimentRequest,
     seconds: float,
+    folder: Path,
     stop: asyncio.Event,
 ) -> Events:
     """Samples at their pace with estimates between them, then the remaining events."""
@@ -211,13 +242,10 @@ async def _played(
         return
     player = _Player(shown, seconds)
     yield player.plan()
-    with session.making("result") as (name, place):
-        arguments = {"asked": asked, "folder": str(place.folder / "run")}
-        async with aclosing(_followed(workers, arguments, player, stop)) as events:
-            async for event in events:
-                if event["kind"] == "result":
-                    place.is_done, event["result"] = event["identification"] is not None, name
-                yield event
+    arguments = {"asked": asked, "folder": str(folder)}
+    async with aclosing(_followed(workers, arguments, player, stop)) as events:
+        async for event in events:
+            yield event
 
 
 async def _followed(

@@ -1,5 +1,7 @@
 // Requests to the server, and functions that every part of the page uses.
 
+import { Kept } from "./kept.js";
+
 /** An element: el("td", {class: "best"}, "text", child, ...); texts stay texts. */
 export function el(name, attributes = {}, ...children) {
   const element = document.createElement(name);
@@ -54,9 +56,9 @@ export const post = async (address, content) => (await answered(address, json("P
 export const remove = async (address) => (await answered(address, { method: "DELETE" })).json();
 export const upload = async (address, file) => (await answered(address, { method: "POST", body: file })).json();
 
-/** Posts, and hands every line of the answer to `onEvent` as it comes. */
+/** Posts what is wanted, if anything, and hands every line of the answer to `onEvent` as it comes. */
 export async function stream(address, content, onEvent) {
-  const reader = (await answered(address, json("POST", content))).body.pipeThrough(new TextDecoderStream()).getReader();
+  const reader = (await answered(address, content && json("POST", content))).body.pipeThrough(new TextDecoderStream()).getReader();
   for (let rest = ""; ;) {
     const { done, value } = await reader.read();
     if (done) return;
@@ -67,10 +69,10 @@ export async function stream(address, content, onEvent) {
   }
 }
 
-/** Something long behind the buttons of a form: one at a time, stopped by its stop button. */
+/** Something long behind the buttons of a form: one at a time, stopped by its stop button; it is found again by what is kept. */
 export class Task {
   constructor(form, isReady = () => true) {
-    Object.assign(this, { form, isReady, isBusy: false, job: null });
+    Object.assign(this, { form, isReady, isBusy: false, job: null, kept: new Kept(form) });
     this.halt = form.querySelector(".stop");
     this.halt.addEventListener("click", () => this.stop());
     this.refresh();
@@ -86,17 +88,24 @@ export class Task {
     if (this.isBusy) return;
     this.isBusy = true;
     this.refresh();
+    this.kept.save();
     let ending = "the connection ended too early; run it again";
     try {
       await stream(address, content, (event) => {
-        if (event.kind === "job") this.job = event.job;
-        else if (event.kind === "end") ending = null;
+        if (event.kind === "job") {
+          this.job = event.job;
+          this.kept.save({ shown: this.job });
+          onEvent(event);
+        } else if (event.kind === "end") ending = null;
         else if (event.kind === "stopped") { ending = null; say(this.form, "Stopped."); }
-        else if (event.kind === "failed") ending = event.sentence;
-        else onEvent(event);
+        else if (event.kind === "failed") {
+          ending = event.sentence;
+          this.kept.save({ shown: null });
+        }         else onEvent(event);
       });
       if (ending) say(this.form, ending, true);
     } catch (error) {
+      this.kept.save({ shown: null });
       say(this.form, error.message, true);
     } finally {
       tell(this.form, "");

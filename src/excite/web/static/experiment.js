@@ -1,6 +1,7 @@
 // Choose a plant and an excitation, run the experiment, watch the estimates.
 
 import { command, download, el, get, options, say, symbol, Task, tell } from "./api.js";
+import { COLOURS } from "./curves.js";
 import { drawSignals, levelsOf, linesOf, passed, reach, signalPlots } from "./overlay.js";
 import { digits, empty, Plot, range, shown } from "./plot.js";
 
@@ -19,18 +20,18 @@ export function begin(known) {
   form.addEventListener("submit", (event) => { event.preventDefault(); run(); });
   choosePlant();
   task = new Task(form);
-  say(form, "Ready.");
-  prepared();
+  const gone = task.kept.fill(), { shown: before } = task.kept.state;
+  say(form, gone || "Ready.", Boolean(gone));
+  if (before) follow(`api/results/${before}/events`);
+  else prepared(gone);
 }
 
 /** Draws the default experiment, as it was computed for this page. */
-async function prepared() {
-  const events = await get("static/first.json");
+async function prepared(gone) {
+  const events = await get("static/first.json"), others = events.filter(({ kind }) => kind === "other");
   if (task.isBusy || at("signals").querySelector("figure")) return;
-  clear();
-  const follow = follower(events.filter(({ kind }) => kind === "result" || kind === "other").length);
-  events.forEach(follow);
-  say(form, "Ready. What is shown was prepared: chirp, PRBS and the policy aero2. Press Run for your own.");
+  [{ kind: "job", asked: { others } }, ...events].forEach(follower());
+  say(form, gone || "Ready. What is shown was prepared: chirp, PRBS and the policy aero2. Press Run for your own.", Boolean(gone));
 }
 
 const fields = (id) => [...at(id).querySelectorAll("input")];
@@ -110,11 +111,15 @@ function asked() {
 const waiting = (live) => (live.found.length ? "Estimating and comparing…"
   : "Compiling the estimator for this plant and length; only needed for the first run…");
 
-async function run() {
-  const wanted = asked();
+function run() {
   clear();
   say(form, "Waiting for a worker…");
-  await task.run("api/experiments", wanted, follower(wanted.others.length + 1));
+  follow("api/experiments", asked());
+}
+
+/** Shows an experiment as it goes on: a new one, or without `wanted` one that was shown before. */
+async function follow(address, wanted) {
+  await task.run(address, wanted, follower(wanted));
   if (shownRun && !shownRun.isFull) shownRun.halt(); // no more samples come
 }
 
@@ -125,13 +130,18 @@ function clear() {
   empty(at("signals"), at("estimates"), at("overlays"));
 }
 
-/** Draws the events of an experiment and its comparisons, of which there are so many. */
-function follower(total) {
-  let live = null, rows = [];
+/** Draws the events of an experiment and its comparisons. */
+function follower(wanted) {
+  let live = null, rows = [], total = 1;
   return (event) => {
-    if (event.kind === "started") say(form, "Preparing. The first run with a plant, a length or an excitation compiles programs, which can take a minute or two…");
-    else if (event.kind === "plan") live = new Live(event);
-    else if (event.kind === "samples") {
+    if (event.kind === "job") {
+      clear();
+      total += event.asked.others.length;
+    } else if (event.kind === "started") say(form, "Preparing. The first run with a plant, a length or an excitation compiles programs, which can take a minute or two…");
+    else if (event.kind === "plan") {
+      live = new Live(event);
+      if (wanted && matchMedia("(max-width: 60rem)").matches) section.querySelector(".view").scrollIntoView();
+    } else if (event.kind === "samples") {
       live.samples(event);
       say(form, live.isFull ? waiting(live) : "Running.");
       tell(form, live.isFull ? "" : `${shown(live.time.at(-1))} of ${shown(live.end)} s`);
@@ -140,9 +150,10 @@ function follower(total) {
       if (live.isFull) say(form, waiting(live));
     } else if (["result", "other", "left_out"].includes(event.kind)) {
       rows.push(event.row ?? event);
-      if (event.traces) live.compared.push({ name: event.row.excitation, ...event.traces });
+      if (event.traces) live.compared.push({ name: event.row.excitation, estimates: event.estimates, ...event.traces });
       compare(live, rows, total);
       overlay(live.plan, live.compared);
+      live.track();
       if (event.kind === "result") conclude(event);
       if (rows.length === total) say(form, "Done.");
     }
@@ -155,7 +166,6 @@ class Live {
     Object.assign(this, { plan, time: [], inputs: [], outputs: [], found: [], compared: [], until: null });
     shownRun = this;
     this.end = (plan.num_samples - 1) * plan.plant.dt;
-    if (task.isBusy && matchMedia("(max-width: 60rem)").matches) section.querySelector(".view").scrollIntoView();
     if (plan.warning) say(form, plan.warning, true);
     const title = (part) => el("span", {}, part.name, " ", el("span", { class: "unit" }, part.shown_unit));
     this.play();
@@ -163,7 +173,7 @@ class Live {
     this.plots = [...plan.plant.inputs, ...plan.plant.outputs].map((part) =>
       new Plot(at("signals"), title(part), `${part.name} over time, with its safety levels`));
     this.tracks = plan.plant.parameters.map((p) =>
-      new Plot(at("estimates"), from(p.name), `estimate of ${p.name} over time, deviation from the true value in percent, 95 % interval and Cramér-Rao bound`));
+      new Plot(at("estimates"), from(p.name), `estimate of ${p.name} over time for every excitation, deviation from the true value in percent, 95 % interval and Cramér-Rao bounds`));
     this.draw();
   }
 
@@ -212,30 +222,27 @@ class Live {
     this.track();
   }
 
+  /** The estimates of every excitation up to the time that is shown, each with its bound; the interval of the first. */
   track() {
-    const { plant, params } = this.plan, found = this.found.filter((e) => this.until === null || e.k < this.until), time = found.map((e) => e.k * plant.dt);
+    const { plant, params, excitation } = this.plan, isSeen = ({ k }) => this.until === null || k < this.until;
+    const every = [{ name: excitation, estimates: this.found }, ...this.compared.slice(1)].map((own) => ({ ...own, found: own.estimates.filter(isSeen) }));
     plant.parameters.forEach(({ name, scale, unit }, i) => {
-      const true_ = params[name], per = 100 / (Math.abs(true_) || scale);
-      const column = (what) => found.map((e) => (e[what][name] === null ? null : e[what][name] * per));
-      const middle = column("estimate").map((v) => (v === null ? null : v - true_ * per));
-      const half = column("half"), bound = column("bound");
-      // The first estimates are far off: the scale follows the later ones.
-      const from = Math.floor(found.length / 2.5), reach = [];
-      for (let j = from; j < middle.length; j++) if (middle[j] !== null) reach.push(Math.abs(middle[j]) + half[j], bound[j]);
-      const top = 1.15 * (Math.max(...reach.filter(Number.isFinite), 0) || 100);
-      const good = middle.map((v, j) => j).filter((j) => middle[j] !== null);
-      const pick = (values) => good.map((j) => values[j]);
-      this.tracks[i].show({
-        x: [0, this.end], y: [-top, top], unit: "s",
-        bands: [{ x: pick(time), lower: good.map((j) => middle[j] - half[j]), upper: good.map((j) => middle[j] + half[j]), color: "band" }],
-        lines: [
-          { x: time, y: middle, name: "estimate", color: "output", dots: true },
-          { x: time, y: bound, name: "Cramér-Rao bound, 95 %", color: "bound", dash: [5, 4], width: 1.2 },
-          { x: time, y: bound.map((b) => (b === null ? null : -b)), name: "Cramér-Rao bound, 95 %", color: "bound", dash: [5, 4], width: 1.2 },
-        ],
+      const true_ = params[name], per = 100 / (Math.abs(true_) || scale), reach = [], lines = [], bounds = [], bands = [];
+      every.forEach(({ name: who, found }, j) => {
+        const x = found.map(({ k }) => k * plant.dt), color = COLOURS[j];
+        const column = (what) => found.map((e) => (e[what][name] === null ? null : e[what][name] * per));
+        const y = column("estimate").map((v) => (v === null ? null : v - true_ * per)), half = column("half"), bound = column("bound");
+        const good = found.map((_, k) => k).filter((k) => y[k] !== null);
+        // The first estimates are far off: the scale follows the later ones.
+        for (const k of good.filter((k) => k >= Math.floor(found.length / 2.5))) reach.push(Math.abs(y[k]) + (j ? 0 : half[k]), bound[k]);
+        lines.push({ x, y, name: who, color, dots: true });
+        for (const sign of [1, -1]) bounds.push({ x, y: bound.map((v) => (v === null ? null : sign * v)), name: `${who}, bound`, color, dash: [5, 4], width: 1.2 });
+        if (!j) bands.push({ x: good.map((k) => x[k]), lower: good.map((k) => y[k] - half[k]), upper: good.map((k) => y[k] + half[k]), color: "band" });
       });
-      const last = found.at(-1)?.estimate[name] ?? null, half95 = found.at(-1)?.half[name];
-      this.tracks[i].note.textContent = last === null ? "no estimate yet" : `${shown(last, digits(last, half95))} ± ${shown(half95, 2)} ${unit}`;
+      const top = 1.15 * (Math.max(...reach.filter(Number.isFinite), 0) || 100);
+      this.tracks[i].show({ x: [0, this.end], y: [-top, top], unit: "s", bands, lines: [...lines, ...bounds] });
+      const { estimate, half } = every[0].found.at(-1) ?? { estimate: {}, half: {} }, last = estimate[name] ?? null;
+      this.tracks[i].note.textContent = last === null ? "no estimate yet" : `${shown(last, digits(last, half[name]))} ± ${shown(half[name], 2)} ${unit}`;
     });
   }
 

@@ -320,8 +320,8 @@ export class Plot {
   toggles() {
     const named = [...new Map(this.what.lines.filter(({ name }) => name).map((line) => [line.name, line])).values()];
     const focused = this.legend.contains(document.activeElement) ? document.activeElement.dataset.name : null;
-    this.legend.replaceChildren(...named.map(({ name, color, points }) => el("button", {
-      type: "button", class: `key ${color}${points ? " points" : ""}`, "data-name": name, "aria-pressed": String(!this.hidden.has(name)),
+    this.legend.replaceChildren(...named.map(({ name, color, points, dash }) => el("button", {
+      type: "button", class: `key ${color}${points ? " points" : ""}${dash ? " dashed" : ""}`, "data-name": name, "aria-pressed": String(!this.hidden.has(name)),
       click: () => { if (!this.hidden.delete(name)) this.hidden.add(name); this.draw(true); },
     }, name, el("span"))));
     if (focused !== null) [...this.legend.children].find((button) => button.dataset.name === focused)?.focus();

@@ -1,11 +1,11 @@
 // A recorded experiment: drop a file, map its columns, identify.
 
-import { command, download, el, options, say, symbol, Task, tell, upload } from "./api.js";
+import { command, download, el, get, options, say, symbol, Task, tell, upload } from "./api.js";
 import { digits, empty, Plot, range, shown } from "./plot.js";
 
 const section = document.getElementById("record"), form = section.querySelector("form");
 const at = (id) => document.getElementById(id);
-let catalogue, task, file = null, reading = 0;
+let catalogue, task, file = null, reading = 0, isKept = false;
 
 export function begin(known) {
   catalogue = known;
@@ -23,6 +23,34 @@ export function begin(known) {
   section.addEventListener("dragleave", over(false));
   section.addEventListener("drop", (event) => { over(false)(event); take(event.dataTransfer.files[0]); });
   form.addEventListener("submit", (event) => { event.preventDefault(); identify(asked()); });
+  again(task.kept.fill());
+}
+
+/** Shows again the file and the result that were shown before the page was loaded, or says what is gone. */
+async function again(gone) {
+  const own = reading, { upload: name, shown: before } = task.kept.state;
+  isKept = name !== null;
+  try {
+    const taken = isKept && await get(`api/uploads/${name}`);
+    if (own === reading && taken) put(taken);
+  } catch (error) {
+    gone ||= error.message;
+  }
+  if (own === reading && before) await follow(`api/results/${before}/events`);
+  if (own === reading && gone) say(form, gone, true);
+}
+
+/** Shows a file that the server has read; its columns as they were assigned where the page was loaded again. */
+function put(taken) {
+  file = taken;
+  showMapping();
+  if (isKept) task.kept.fill();
+  isKept = false;
+  task.kept.save({ upload: file.upload });
+  preview();
+  task.refresh();
+  const counts = Object.values(file.columns);
+  say(form, `${file.file}: ${counts.length} columns, ${Math.max(...counts)} samples. ${task.isBusy ? "Another file is still being identified; wait, or stop it." : "Map them, then identify."}`);
 }
 
 async function take(chosen) {
@@ -31,17 +59,13 @@ async function take(chosen) {
   file = null;
   task.refresh();
   if (!task.isBusy) hideResults();
+  task.kept.save({ upload: null, shown: task.job });
   at("mapping").hidden = true;
   say(form, `Reading ${chosen.name}…`);
   try {
     const taken = await upload(`api/uploads?name=${encodeURIComponent(chosen.name)}`, chosen);
     if (own !== reading) return; // another was chosen while this one was read
-    file = taken;
-    showMapping();
-    preview();
-    task.refresh();
-    const counts = Object.values(file.columns);
-    say(form, `${chosen.name}: ${counts.length} columns, ${Math.max(...counts)} samples. ${task.isBusy ? "Another file is still being identified; wait, or stop it." : "Map them, then identify."}`);
+    put(taken);
   } catch (error) {
     if (own === reading) say(form, error.message, true);
   }
@@ -51,6 +75,7 @@ async function take(chosen) {
 function preview() {
   const names = Object.keys(file.previews), rows = names.length ? file.previews[names[0]].first.length : 0;
   at("preview").hidden = !names.length;
+  at("preview").querySelector("h2").textContent = `The file: ${file.file}`;
   at("first-rows").replaceChildren(
     el("thead", {}, el("tr", {}, ...names.map((name) => el("th", { scope: "col" }, name)))),
     el("tbody", {}, ...Array.from({ length: rows }, (_, k) => el("tr", {}, ...names.map((name) => el("td", {}, file.previews[name].first[k] ?? ""))))));
@@ -64,7 +89,7 @@ function preview() {
   }
 }
 
-const effects = () => at("effects").replaceChildren(...plant().effects.map((name) => el("label", {}, el("input", { type: "checkbox", value: name }), name)));
+const effects = () => at("effects").replaceChildren(...plant().effects.map((name) => el("label", {}, el("input", { id: `effect-${name}`, type: "checkbox", value: name }), name)));
 const boxes = () => [...at("effects").querySelectorAll("input")];
 
 /** A row a parameter, also of the chosen effects: its known value, or its prior. What was given stays. */
@@ -140,14 +165,19 @@ function asked() {
   };
 }
 
-async function identify(wanted) {
+function identify(wanted) {
   hideResults();
   say(form, "Waiting for a worker…");
-  const start = Date.now();
-  let found = null;
-  await task.run("api/identifications", wanted, (event) => {
-    if (event.kind === "started") say(form, "Identifying…");
-    else if (event.kind === "pulse") tell(form, `${Math.round((Date.now() - start) / 1000)} s`);
+  follow("api/identifications", wanted);
+}
+
+/** Shows what is found: for a new request, or without one for that which the address names. */
+async function follow(address, request) {
+  let wanted = null, found = null, seconds = 0;
+  await task.run(address, request, (event) => {
+    if (event.kind === "job") wanted = event.asked;
+    else if (event.kind === "started") say(form, "Identifying…");
+    else if (event.kind === "pulse") tell(form, `${(seconds += 1)} s`);
     else if (event.kind === "identified") found = event;
   });
   if (found) show(wanted, found);
