@@ -101,7 +101,7 @@ export class Task {
         else if (event.kind === "failed") {
           ending = event.sentence;
           this.kept.save({ shown: null });
-        }         else onEvent(event);
+        } else onEvent(event);
       });
       if (ending) say(this.form, ending, true);
     } catch (error) {
