@@ -10,7 +10,7 @@ PYTEST := $(BIN)/python -m pytest -n 2
 FEWER_PASSES := --xla_cpu_use_fusion_emitters=false
 QUICK := XLA_FLAGS="$(FEWER_PASSES) --xla_backend_optimization_level=0"
 
-.PHONY: help demo test units test-pages test-science test-all check-results coverage lint types docs results \
+.PHONY: help demo test units test-slow test-pages test-science test-all check-results coverage lint types docs results \
     agents policies certificates evaluations clean
 
 help: ## this list
@@ -27,19 +27,22 @@ test: lint ## style, types, unit and command-line tests
 units: .venv/dev ## unit and command-line tests
 	$(QUICK) $(PYTEST) --dist loadfile
 
+test-slow: .venv/dev ## the unit and command-line tests that take more than about three seconds
+	$(QUICK) $(PYTEST) --dist loadfile -m 'slow and not science'
+
 test-pages: .venv/dev ## commands of the documentation, and the bench page in a browser
 	XLA_FLAGS="$(FEWER_PASSES)" $(PYTEST) --dist worksteal tests/pages
 
-test-science: .venv/dev ## promises of the shipped policies, baselines, trainings from end to end, and what takes long
+test-science: .venv/dev ## promises of the shipped policies, baselines, trainings from end to end
 	XLA_FLAGS="$(FEWER_PASSES)" $(PYTEST) --dist worksteal -m science
 
 check-results: .venv/dev ## the committed results are what the documentation says of them
 	$(BIN)/python -m pytest tests/results
 
-test-all: test test-pages test-science check-results ## all tests
+test-all: test test-slow test-pages test-science check-results ## all tests
 
 coverage: .venv/dev ## lines of the package that no unit or command-line test runs
-	$(QUICK) $(PYTEST) --dist loadfile --cov=excite --cov-report=term-missing:skip-covered
+	$(QUICK) $(PYTEST) --dist loadfile -m 'not science' --cov=excite --cov-report=term-missing:skip-covered
 
 lint: .venv/dev ## style
 	$(BIN)/ruff check .

@@ -60,6 +60,7 @@ PLANTS: dict[str, AbstractPlant] = {
 }
 
 LONG = partial(pytest.param, marks=pytest.mark.science)
+SLOW = partial(pytest.param, marks=pytest.mark.slow)
 """A parameter of the long tests."""
 
 FEW_AND_ALL = [name if name in ("aero2", "two_masses") else LONG(name) for name in PLANTS]

@@ -133,7 +133,7 @@ def test_counts_add_up(rows):
         assert row["violation_rate"]["estimate"] == row["violations"] / 8
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_a_run_in_chunks_is_the_run_in_one(rows, monkeypatch):
     monkeypatch.setattr(benchmark, "CHUNK", 4)
     reports = []
@@ -391,7 +391,7 @@ def test_an_overwritten_run_begins_anew(tmp_path):
         assert len(tasks) == 2
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_what_was_evaluated_is_told_with_and_without_a_run_folder(tmp_path):
     for out in (None, tmp_path / "run"):
         told: list[str] = []
@@ -414,7 +414,7 @@ def test_a_study_with_signals_to_design_needs_a_run_folder():
         run_study(tiny(clairvoyant={"plants": 2}))
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_a_table_shows_itself_and_is_filtered_and_sorted(rows):
     table = run_study(tiny(), estimators=["arx-rls-wide", "nls"])
     assert repr(table).startswith("tiny\nmethod")

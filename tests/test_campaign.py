@@ -165,7 +165,7 @@ def test_a_quantity_that_is_not_allowed_is_one_sentence(given, words):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_the_interval_of_a_quantity_is_that_of_many_draws():
     record = ex.simulate("aero2", "chirp", params=TRUE, seed=1)
     result, plant = ex.identify(record, "aero2"), Aero2()
@@ -248,7 +248,7 @@ def test_without_a_policy_signals_are_redesigned_after_the_first(designed):
     assert expected.samples.min() / 1.5 < first < 1.5 * expected.samples.max()
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_a_robust_signal_that_is_played_again_is_called_so(designed):
     record = ex.simulate("aero2", designed.ask(), params=TRUE, seed=0)
     designed.tell(record)
@@ -327,7 +327,7 @@ def test_a_campaign_ends_where_a_level_is_reached():
     assert tripped.reason == "unsafe: warning level exceeded"
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_a_record_that_tells_nothing_is_a_round_without_an_estimate():
     campaign = ex.Campaign("aero2", EASY, policy=steady())
     record = ex.simulate("aero2", ex.read_policy("aero2"), params=TRUE, seed=1)
@@ -356,7 +356,7 @@ def test_a_round_that_was_interrupted_does_not_count_in_the_budget():
     assert campaign.reason == "all rounds are played"
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_a_round_that_tells_nothing_does_not_make_later_ones_longer():
     campaign = ex.Campaign("aero2", {"D_p": "1%"}, policy=steady(), redesign=False)
     still = ex.simulate("aero2", np.zeros((20, 1)), params=TRUE, seed=1)
@@ -375,7 +375,7 @@ def test_a_first_signal_that_is_not_safe_is_refused(monkeypatch):
         _ = campaign.ask()
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_a_round_that_ended_too_early_makes_later_ones_longer():
     campaign = ex.Campaign("aero2", {"D_p": "0.001%"}, policy=steady(), redesign=False)
     assert campaign.monitor(waits=True)._enough(100) == 1
@@ -388,7 +388,7 @@ def test_a_round_that_ended_too_early_makes_later_ones_longer():
     assert enough == pytest.approx((1 - 1 / math.sqrt(2 * 100)) / missing)
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_records_that_the_plant_does_not_explain_are_a_warning():
     campaign = ex.Campaign("aero2", {"D_p": "0.1%"}, policy=steady())
     record = ex.simulate("aero2", steady(), params=TRUE, seed=1)
@@ -408,7 +408,7 @@ def test_a_share_of_nothing_is_infinite():
 # ------------------------------------------------------------------------- what is expected
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_the_expected_samples_are_those_of_the_bound():
     campaign = ex.Campaign("aero2", {"D_p": "30%", "K_pu": "20%"}, policy=steady(), rounds=3)
     plant, found = Aero2(), campaign.expected
@@ -445,7 +445,7 @@ def test_a_target_that_nothing_reaches_is_refused_before_the_first_round(tmp_pat
 # ------------------------------------------------------------------------ the running round
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_a_round_ends_only_where_the_free_motion_after_it_is_safe(monkeypatch):
     campaign = ex.Campaign("aero2", EASY, policy=steady())
     traces, usual = 0, response
@@ -480,7 +480,7 @@ def test_a_round_ends_only_where_the_free_motion_after_it_is_safe(monkeypatch):
     monitor.close()
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_a_later_round_leaves_room_for_the_error_of_the_noise():
     plant = Aero2()
     before = ex.identify(ex.simulate("aero2", steady(), params=TRUE, seed=1), "aero2")
@@ -545,7 +545,7 @@ def test_with_rivals_a_residual_larger_than_the_declared_noise_is_not_explained(
     assert campaign._is_explained() == is_explained
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_a_record_that_was_followed_by_another_ends_nothing():
     campaign = ex.Campaign("aero2", EASY, policy=ex.read_policy("aero2"), redesign=False)
     record = ex.simulate("aero2", campaign.ask(), params=TRUE, seed=1)

@@ -716,7 +716,7 @@ def test_a_failed_estimate_is_shown_and_ends_with_1(run, decay, here):
 # Benchmark
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_a_benchmark_leaves_table_and_study(run, here):
     words = "benchmark study.toml --episodes 8 --out runs/tiny --plot b.png --json"
     answer = run(*words.split())
@@ -990,7 +990,7 @@ BAD: dict[str, tuple[str, tuple[str, ...]]] = {
 }  # fmt: skip
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_plant_excitation_and_estimator_of_ones_own_work_from_a_file_to_the_next_experiment(
     run, here
 ):
@@ -1122,7 +1122,7 @@ def test_a_name_with_a_letter_missing_is_recognised(run):
 # As a program of its own
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_as_a_program_stdout_is_json_and_stderr_silent(here):
     answer = excite("identify", "good.csv", "--plant", "aero2", "--json", folder=here)
     assert answer.err == ""

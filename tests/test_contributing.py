@@ -51,7 +51,7 @@ def added(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Added]:
         sys.modules.pop(name, None)
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_the_plant_obeys_its_equations_and_the_classical_signals_are_safe(added, monkeypatch):
     text, functions = examples("Add a plant")
     plant = added("plant", "pendulum", text).Pendulum()
@@ -74,7 +74,7 @@ def test_the_excitation_swings_twice_as_fast_for_every_further_input(added):
     np.testing.assert_allclose(wave[:100, 1], wave[::2, 0], atol=1e-9)
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_the_estimator_passes_its_test(added, monkeypatch):
     text, test = examples("Add an estimator")
     OneStep = added("estimation", "one_step", text).OneStep
@@ -88,7 +88,7 @@ def test_the_estimator_passes_its_test(added, monkeypatch):
         ex.identify(record, "aero2", OneStep, initial_state="free")
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_classes_in_a_file_of_ones_own_work_from_python_and_the_command_line(tmp_path, monkeypatch):
     page = (ROOT / "docs/how-to/use-your-own-excitation.md").read_text()
     triangle, use, one_step, compare, _ = re.findall(r"```python\n(.*?)```", page, re.S)

@@ -141,7 +141,7 @@ class Bomb(AbstractPlant):
         return state
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_a_tuning_that_finds_no_usable_setting_says_so():
     with pytest.raises(ValueError, match="tuning 'chirp' found no usable setting"):
         tuned_signal(signal_env(Bomb(), 20, 0.3), "chirp", trials=2)
@@ -174,7 +174,7 @@ def test_every_plant_can_be_designed_for(name):
     assert design.inputs.shape == (1, 30, len(PLANTS[name].definition.inputs))
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_a_design_is_saved_shown_and_played(tmp_path):
     plant, told = Amplifier(), []
     made = design(

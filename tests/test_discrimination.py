@@ -51,7 +51,7 @@ def one_unknown(name: str, ranges: dict, sd: float) -> Rival:
     return Rival(name, Uncertainty.of(plant, 0.0, ranges))
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_the_evidence_is_the_likelihood_averaged_over_the_box():
     sd = 0.01
     rivals = [
@@ -101,7 +101,7 @@ def designed():
     return rivals, discriminating(rivals, [unplayed(r) for r in rivals], starts, COAST)
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_the_signal_is_safe_on_plants_of_both_rivals_coast_included(designed):
     rivals, made = designed
     whole = jnp.concatenate([made.inputs, jnp.zeros((COAST, 1))])
@@ -114,7 +114,7 @@ def test_the_signal_is_safe_on_plants_of_both_rivals_coast_included(designed):
     assert np.abs(made.inputs).max() <= 24
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_the_bound_of_two_known_plants_is_that_of_kailath_and_holds():
     sd = 0.02
     rivals = [one_unknown("aero2", {}, sd), one_unknown("aero2_lag", {"tau": (0.1, 0.1)}, sd)]
@@ -246,7 +246,7 @@ def test_a_record_from_elsewhere_is_refused():
 # --------------------------------------------------------------------------------- command
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_the_command_writes_the_signal_and_says_what_python_says(tmp_path):
     out, plot = tmp_path / "next.csv", tmp_path / "next.png"
     arguments = ["discriminate", *RIVALS, "--steps", STEPS, "--coast", COAST]

@@ -333,7 +333,7 @@ def policy_of(plant, num_steps: int = 30, gain: float = 0.1) -> Policy:
     return Policy(plant.description, layout, weights)
 
 
-@pytest.mark.science
+@pytest.mark.slow
 @pytest.mark.parametrize("gain", [0.1, 3.0])
 @pytest.mark.parametrize("plant", [AERO2, TWO], ids=["aero2", "two_masses"])
 def test_a_policy_meets_in_an_experiment_what_it_met_in_training(plant, gain):

@@ -127,7 +127,7 @@ def test_a_simulated_episode_and_the_response_delay_alike(delay):
     )
 
 
-@pytest.mark.science
+@pytest.mark.slow
 @pytest.mark.parametrize("delay", [0.02, 0.25, 1.05])
 def test_a_delay_is_estimated_with_its_interval(delay):
     record = simulate("aero2+delay", "prbs", params={"delay_voltage": delay}, seed=3)

@@ -259,7 +259,7 @@ def test_the_free_motion_after_the_end_counts_for_safety_alone():
     np.testing.assert_allclose(play(Cases(-jnp.ones(3), jnp.asarray(0))), expected, rtol=1e-9)
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_a_search_goes_on_after_the_end_and_is_replayed():
     kick = 12 * jnp.ones((KICK, 1))
     short, long = (
@@ -334,7 +334,7 @@ def small_policy(plant: AbstractPlant, steps: int = 20, **provenance) -> ex.Poli
     return ex.Policy(plant.description, layout, tuple(weights), provenance)
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_a_certificate_travels_in_the_policy_and_leaves_its_hash():
     policy = small_policy(Aero2())
     found = ex.falsify(policy, budget=100)
@@ -523,7 +523,7 @@ def test_the_command_refuses_in_one_sentence(arguments, words, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_the_command_ends_with_1_where_a_level_is_reached(tmp_path):
     worst = tmp_path / "worst.json"
     loud = ["prbs", "--set", "amplitude=20", "--plant", "dc_motor", "--steps", "40"]

@@ -12,20 +12,19 @@ from pathlib import Path
 import click
 import numpy as np
 import pytest
-from catalogue import LONG
+from catalogue import LONG, SLOW
 
 import excite as ex
 from excite.cli import cli
 from excite.study.catalogue import shipped_studies
 
 NAMES = [name for name in ex.__all__ if name != "__version__"]
-LONGEST = {
-    "campaign", "choose_experiments", "compare_plants", "design", "discriminate", "evaluate",
-    "falsify", "information_gain", "next_experiment", "run_study", "train",
-}  # fmt: skip
+MARKS = dict.fromkeys(("train", "campaign", "design", "run_study", "compare_plants"), LONG)
+MARKS |= dict.fromkeys(("next_experiment", "information_gain", "discriminate", "falsify"), SLOW)
+MARKS |= dict.fromkeys(("evaluate", "choose_experiments"), SLOW)
 
 
-@pytest.mark.parametrize("name", [LONG(name) if name in LONGEST else name for name in NAMES])
+@pytest.mark.parametrize("name", [MARKS.get(name, pytest.param)(name) for name in NAMES])
 def test_every_name_has_an_example_that_runs(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # some examples write a file
     found = inspect.unwrap(getattr(ex, name))
@@ -304,7 +303,7 @@ print(json.dumps(said))
 """
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_a_mistake_is_one_sentence_and_what_can_be_meant_works():
     """In a process without the tests' run-time check of types, which would speak first."""
     done = subprocess.run(

@@ -96,7 +96,7 @@ def test_an_unknown_criterion_or_form_is_refused():
         EstimationError(ALL, form="logs")
 
 
-@pytest.mark.science
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_the_error_of_the_output_error_estimate_is_that_of_nls(seed):
     """To first order in the noise, here a hundredth of a degree."""
@@ -168,7 +168,7 @@ def test_a_sum_is_worth_the_sum_of_its_terms():
     assert abs(together[1] - jnp.mean(together[0])) > 1e-3
 
 
-@pytest.mark.science
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [n if n == "D and errors" else LONG(n) for n in OBJECTIVES])
 def test_the_gradient_is_that_of_the_whole_experiment(name):
     env = env_of(OBJECTIVES[name])
@@ -188,7 +188,7 @@ def test_the_gradient_is_that_of_the_whole_experiment(name):
     np.testing.assert_allclose(gradient[0], difference, rtol=2e-3)
 
 
-@pytest.mark.science
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("criterion", "expected"),
     [
@@ -231,7 +231,7 @@ def test_excess_counts_from_the_margin_to_the_critical_level():
     np.testing.assert_allclose(batch.nearness[0], outputs.max() / critical, rtol=1e-6)
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_the_coast_is_penalised_and_not_rewarded():
     env = env_of(OBJECTIVES["D"], num_steps=8)
     network = Network(weights_of(env), env.layout)

@@ -91,7 +91,7 @@ def test_a_program_from_a_file_can_only_do_arithmetic():
         Program.from_dict(json.loads(json.dumps(whole).replace('"float64"', '"object"')))
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_for_a_linear_plant_the_filter_is_kalmans():
     plant = DCMotor()
     model = GuardModel.of(Uncertainty.of(plant, 0.0, {"initial_state": "5%"}))

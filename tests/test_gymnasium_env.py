@@ -149,7 +149,7 @@ def test_a_step_after_the_last_is_refused_until_the_next_reset():
 # ---------------------------------------------------------------------------- vectors
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_many_plants_are_stepped_as_one():
     env = make_vec(num_envs=128, layout=SHORT)
     assert isinstance(env.unwrapped, ExperimentVectorEnv)
@@ -317,7 +317,7 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.science
+@pytest.mark.slow
 @pytest.mark.parametrize("context", ["fork", "spawn"])
 def test_a_process_for_each_environment_is_spawned_or_refused(context, tmp_path):
     """A fork would hang in JAX."""

@@ -202,7 +202,7 @@ def assert_is_self_contained(page: Page) -> None:
     assert page.text.startswith("<!DOCTYPE html>\n<html lang=")
 
 
-@pytest.mark.science
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["table1", "nls"])  # the others: tests/results
 def test_a_study_makes_one_small_page_with_the_table_of_the_command_line(name, capsys):
     assert_is_the_page_of_a_study(name, capsys)

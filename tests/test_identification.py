@@ -129,7 +129,7 @@ def test_the_start_changes_no_estimate(result, chirp):
         assert abs(value - result.params[name]) < 0.02 * result.std_error[name]
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_a_known_parameter_is_held_and_the_others_gain(chirp, result):
     held = identify([chirp], PLANT, NLS(known=("K_pu",)), start={"K_pu": 0.012})
     assert held.status == "successful"
@@ -201,7 +201,7 @@ def test_a_free_initial_state_costs_accuracy(result, chirp):
 # Several records
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_records_fitted_together_share_their_information(chirp, foreign):
     short = dataclasses.replace(
         foreign, time=foreign.time[:151], inputs=foreign.inputs[:151], outputs=foreign.outputs[:151]
@@ -450,7 +450,7 @@ def test_a_correlation_needs_two_estimates(chirp):
     assert "correlation" not in str(identify([chirp], PLANT, hold=held))
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_an_input_of_the_wrong_sign_gives_no_usable_result(foreign):
     result = None
     with contextlib.suppress(ValueError):
@@ -526,7 +526,7 @@ def compilations() -> Iterator[list[str]]:
     jax.monitoring.unregister_event_duration_listener(listen)
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_another_start_or_record_compiles_nothing(compilations):
     identify([tank_record(2.2)], Tank())
     record = tank_record(2.1, seed=1)
@@ -655,7 +655,7 @@ def test_a_run_folder_holds_what_was_found(result, chirp, tmp_path):
     assert PlantDescription.from_dict(run["plant"]) == result.plant
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_a_run_folder_of_several_records_numbers_them(foreign, tmp_path):
     result = identify([free_decay(), foreign], PLANT)
     result.save(tmp_path / "run")

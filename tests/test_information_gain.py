@@ -29,7 +29,7 @@ def linear(steps):
     return 0.5 * np.linalg.slogdet(np.eye(3) + prior @ information)[1]
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_of_a_nearly_linear_response_the_gain_is_exact(narrow):
     expected = linear(60)
     for found in (narrow.lower, narrow.upper, narrow.laplace):
@@ -51,7 +51,7 @@ def test_samples_from_the_prior_give_wider_bounds_on_the_same_records(narrow):
     assert any("near its largest value, log(50 + 1) = 3.93" in told for told in found.warnings)
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_more_noise_tells_less_and_a_policy_may_react():
     options: Any = {"steps": 40, "plants": 32, "samples": 200, "spread": "factor:2"}
     quiet = ex.information_gain("aero2", "aero2", **options)
@@ -80,7 +80,7 @@ def test_what_is_not_allowed_is_one_sentence(options, words):
         ex.information_gain("aero2", **options)
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_the_command_prints_bounds():
     asked = ["gain", "aero2", "--steps", "40", "--plants", "8", "--samples", "50"]
     run = excite(*asked, "--prior", "J_p=lognormal:0.0232:10%", "--json")

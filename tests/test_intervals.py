@@ -83,7 +83,7 @@ def test_degrees_of_freedom_are_values_less_unknowns():
         np.testing.assert_allclose(np.asarray(estimator(Tank(), data).degrees), degrees)
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_six_samples_are_enough_for_two_unknowns():
     record = first_rows(tank_record(1.8), 6)
     result = identify(record, Tank())

@@ -33,7 +33,7 @@ def shooting(plant, data, segments, known=True):
     )
 
 
-@pytest.mark.science
+@pytest.mark.slow
 @pytest.mark.parametrize("block", [40, 10_000], ids=["several blocks", "one block"])
 @pytest.mark.parametrize("known", [True, False])
 def test_without_gaps_the_triangle_is_of_the_derivatives_of_one_simulation(known, block):
@@ -89,7 +89,7 @@ def test_blocks_change_nothing(known):
     np.testing.assert_allclose(one, other, atol=1e-9)
 
 
-@pytest.mark.science
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FEW_AND_ALL)
 def test_the_estimate_is_the_minimum_that_scipy_finds_for_one_simulation(name):
     plant = PLANTS[name]

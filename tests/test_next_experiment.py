@@ -71,7 +71,7 @@ def uncertainty(plant, inputs, goals):
     return math.exp(np.mean(total))
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_a_redesign_says_what_it_brings_and_brings_more_than_where_it_began(found):
     plant, starts, goals, made = found
     assert made.inputs.shape == (2, STEPS, 1)
@@ -80,7 +80,7 @@ def test_a_redesign_says_what_it_brings_and_brings_more_than_where_it_began(foun
     assert own < 0.7 * min(uncertainty(plant, start, goals) for start in starts)
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_a_redesign_is_safe_on_every_plant_that_is_possible_after_its_end_too(found):
     plant, _, _, made = found
     largest = 0.0
@@ -114,7 +114,7 @@ def test_what_a_candidate_brings_is_the_cramer_rao_bound_with_what_was_known():
     assert made.decision.endswith(f"every target is reached after {own.samples:.0f} samples")
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_a_parameter_that_was_not_estimated_is_known_by_the_spread_alone():
     record = ex.simulate("aero2", "chirp", steps=60, seed=1)
     held = ex.identify(record, hold={"D_p": 0.001})
@@ -143,7 +143,7 @@ def test_the_safe_candidate_that_reaches_the_targets_first_is_chosen():
     assert best_of([unsafe], targets) is None
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_the_command_writes_a_signal_that_can_be_played(tmp_path):
     record, out = tmp_path / "a.csv", tmp_path / "next.csv"
     ex.simulate("aero2", "chirp", steps=60, seed=1).save(record)

@@ -243,7 +243,7 @@ def test_without_disturbance_it_is_least_squares():
     np.testing.assert_allclose(np.sqrt(np.diagonal(by_pem.covariance)), sd, rtol=0.1)
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_data_without_any_noise_give_the_true_parameters():
     true = spread_params(TANK)
     u = jnp.asarray(levels(TANK, 200))

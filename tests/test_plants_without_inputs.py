@@ -74,7 +74,7 @@ def test_an_excitation_is_refused(excitation):
             verb(Conversion, excitation)
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_information_is_that_of_the_free_response():
     result = ex.information(Conversion, steps=20)
     bound = result.params["k1"].cramer_rao_bound
@@ -118,7 +118,7 @@ def test_a_description_needs_neither_inputs_nor_a_band():
     assert PlantDescription.from_dict(d.to_dict()) == d
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_the_command_line_identifies_a_file_without_inputs(tmp_path):
     rows = np.column_stack([TIME, measured(Conversion).outputs])
     np.savetxt(tmp_path / "r.csv", rows, delimiter=",", header="time,a,b", comments="")

@@ -179,7 +179,7 @@ def test_random_bytes_are_refused():
             assert refusal(struct.pack("<Q", length) + rng.bytes(length))
 
 
-@pytest.mark.science
+@pytest.mark.slow
 @pytest.mark.usefixtures("as_users_run_it")
 def test_a_flipped_bit_is_refused_wherever_it_is():
     content = policy_of(hidden=()).to_bytes()

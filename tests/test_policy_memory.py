@@ -99,7 +99,7 @@ def test_a_memory_tells_apart_what_the_window_no_longer_shows():
     assert last(0.0) != last(0.5)
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_the_training_plays_what_the_simulation_plays():
     """The memory goes on from step to step in the gradient's experiments, too."""
     network = Network(PolicyExcitation.of(policy()).weights, LAYOUT)
@@ -205,7 +205,7 @@ def test_other_runtimes_play_it_with_its_memory(tmp_path, monkeypatch, capsys):
         assert not np.allclose(kept[0], memory[0])
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_it_is_trained_by_one_argument():
     made = ex.train(
         "dc_motor", steps=20, window=1, memory=3, episodes=2, updates=2,
@@ -228,7 +228,7 @@ def test_trainings_that_cannot_be_are_one_sentence(options, message):
         ex.train("dc_motor", steps=20, memory=3, **options)
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_without_the_part_through_measurements_the_gradient_is_that_of_fixed_ones():
     """Of a policy that sees no measurement it is the whole gradient; of others another one."""
     process, keys = env(), jax.random.split(jax.random.key(0), 2)
@@ -271,7 +271,7 @@ def test_a_memory_finds_a_source_that_a_window_of_one_sample_does_not():
     assert worth[32] > 9
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_a_policy_with_a_memory_is_falsified():
     """The experiment that is found has the inputs of the policy, memory included."""
     found, player = ex.falsify(policy(), budget=200), PolicyPlayer(policy())

@@ -26,7 +26,7 @@ for name in sys.argv[1:]:
 OPTIONAL = {"excite.__main__", "excite.training.ppo"}  # a program; torch, which is slow to load
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_every_module_is_imported_without_posix():
     root = Path(excite.__file__).parent
     paths = [p.relative_to(root.parent).with_suffix("") for p in sorted(root.rglob("*.py"))]

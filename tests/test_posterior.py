@@ -302,7 +302,7 @@ def test_the_command_line_writes_samples_and_shows_them(tmp_path):
         assert summary(samples.load()) == told
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_what_has_no_posterior_says_so(monkeypatch):
     record = line(1.3, 0.4)
     result = ex.identify(record, Line, initial_state="known")

@@ -153,7 +153,7 @@ def test_another_seed_gives_other_weights(run):
     assert not same(train(aero2(), TINY, 4).weights, run[0].weights)
 
 
-@pytest.mark.science
+@pytest.mark.slow
 @pytest.mark.parametrize("num_steps", [0, 240, 480, 720, 960])
 def test_an_interrupted_training_goes_on_as_if_nothing_had_happened(run, num_steps):
     trained, files = run
@@ -237,7 +237,7 @@ def test_the_noise_is_learnt_where_none_is_given():
     assert noise[-1] != pytest.approx(0.5, abs=1e-4)
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_watching_plays_the_deterministic_policy(run):
     env, keys = aero2(), jax.random.split(jax.random.key(5), 3)
     seen = validate(env, run[0].weights, keys)

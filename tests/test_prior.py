@@ -101,7 +101,7 @@ def test_the_estimate_of_other_records_is_a_prior_for_these(tmp_path):
             assert found.std_error[name] == pytest.approx(both.std_error[name], rel=0.15)
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_a_prior_holds_what_the_data_do_not_tell_and_says_so():
     still = dataclasses.replace(noisy(), inputs=0 * INPUT)
     without = identify(still, Ramp)
@@ -113,7 +113,7 @@ def test_a_prior_holds_what_the_data_do_not_tell_and_says_so():
     assert "the estimate of a is that of its prior; the data hardly change it" in found.verdict
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_data_that_contradict_a_prior_are_remarked():
     found = identify(noisy(), Ramp, prior={"b": "normal:0.5:0.01"})
     assert "the data contradict the prior of b" in found.verdict
@@ -122,7 +122,7 @@ def test_data_that_contradict_a_prior_are_remarked():
     assert not any("prior" in sentence for sentence in agreed.verdict)
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_a_held_parameter_takes_its_joint_prior_as_a_condition():
     """As profile and standard intervals agree only then, and it contradicts nothing."""
     joint = Prior.normal(["a", "b"], [0.9, 0.6], [[0.01, 0.0095], [0.0095, 0.01]])
@@ -190,7 +190,7 @@ def test_records_of_two_samples_are_enough_together():
     np.testing.assert_allclose(list(identify(records, Ramp).params.values()), TRUTH, rtol=1e-6)
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_an_interval_does_not_leave_a_uniform_prior():
     free = identify(noisy(), Ramp)
     (low, high), center = free.ci95("b"), free.params.b

@@ -88,7 +88,7 @@ def test_noise_grows_with_the_root_of_the_sampling_time_and_none_is_no_field():
     assert (again.is_disturbed, again.observes_state) == (True, True)
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_where_records_are_linear_in_the_parameters_all_figures_are_the_exact_gain():
     found = ex.information_gain(Pushed, "prbs", steps=40, prior=PRIOR, plants=300, samples=300)
     plant, rng = Pushed(), np.random.default_rng(0)
@@ -116,7 +116,7 @@ def env_of(price: float = 0.0, num_steps: int = 30) -> Env:
     return Env.of(plant, objective=objective, layout=layout, prior=prior)
 
 
-@pytest.mark.science
+@pytest.mark.slow
 @pytest.mark.parametrize("dense", [False, True])
 def test_the_objective_is_the_exact_gain_less_the_price_of_changes(dense):
     env = env_of(price=0.1, num_steps=12)
@@ -185,7 +185,7 @@ def regression(record, sd=1.0):
     return np.linalg.solve(M, B.T @ y / sd**2), M, y - B @ np.linalg.solve(M, B.T @ y / sd**2)
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_where_the_state_is_observed_nls_is_the_regression_of_its_steps():
     records = [ex.simulate(Pushed, "prbs", steps=n, seed=n) for n in (40, 70)]
     for record in records:
@@ -205,7 +205,7 @@ def test_where_the_state_is_observed_nls_is_the_regression_of_its_steps():
     np.testing.assert_allclose(both.covariance, np.linalg.inv(M), rtol=1e-6)
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_with_a_prior_it_is_the_most_probable_estimate():
     record = ex.simulate(Pushed, "prbs", steps=40, seed=3)
     found = ex.identify(record, Pushed, estimator=NLS(noise="known"), prior=PRIOR)
@@ -216,7 +216,7 @@ def test_with_a_prior_it_is_the_most_probable_estimate():
     np.testing.assert_allclose(found.covariance, np.linalg.inv(M + W), rtol=1e-6)
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_a_sample_that_is_missing_costs_the_two_steps_beside_it():
     record = ex.simulate(Pushed, "prbs", steps=60, seed=4)
     outputs = record.outputs.copy()
@@ -232,7 +232,7 @@ def test_a_sample_that_is_missing_costs_the_two_steps_beside_it():
     assert np.isfinite(np.delete(told, [0, 20, 21], axis=0)).all()
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_the_step_across_a_gap_is_left_out():
     record = ex.simulate(Pushed, "prbs", steps=60, seed=4)
     time = record.time + np.where(np.arange(61) > 30, 5.0, 0.0)
@@ -243,7 +243,7 @@ def test_the_step_across_a_gap_is_left_out():
     np.testing.assert_allclose(list(found.params.values()), expected, rtol=1e-6)
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_a_held_out_record_is_judged_by_the_noise_of_the_estimation():
     record, same = (ex.simulate(Pushed, "prbs", steps=200, seed=seed) for seed in (5, 6))
     loud = ex.simulate(Loud, "prbs", steps=200, seed=7)
@@ -254,7 +254,7 @@ def test_a_held_out_record_is_judged_by_the_noise_of_the_estimation():
     assert outside < 50  # five times the noise
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_a_fit_by_steps_has_no_initial_state_among_its_unknowns():
     record = ex.simulate(Pushed, "prbs", steps=60, seed=4)
     counts = [

@@ -89,7 +89,7 @@ def test_profile_intervals_of_many_samples_are_those_of_standard_errors():
             assert usual.params[name] == pytest.approx(linear.params[name], rel=1e-6)
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_one_parameter_is_enough():
     record = tank_record(1.8)
     held = {"leak": 0.4}

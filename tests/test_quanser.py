@@ -222,7 +222,7 @@ def test_a_number_that_is_none_ends_in_zero_and_released_hardware(card, tmp_path
     assert num_recorded(tmp_path / "a.csv") == 3
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_a_failure_at_any_single_call_still_releases_everything(card, tmp_path, monkeypatch):
     player = SignalPlayer(np.full((2, 1), 6.0))
     experiment(tmp_path / "clean.csv", player)

@@ -75,7 +75,7 @@ def effects(plant: str) -> list[str]:
     return [*names, *(f"linear_{name}" for name in inputs), "outliers"]
 
 
-@pytest.mark.science
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "effect",
     [LONG("delay_voltage"), LONG("dead_zone_voltage"), "bias_pitch", "drift_pitch", "outliers"],

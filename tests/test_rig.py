@@ -1133,7 +1133,7 @@ def test_a_killed_process_leaves_a_record_that_identifies(tmp_path):
 CODES = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGHUP: 129}
 
 
-@pytest.mark.science
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("first", "second", "wait"),
     [
@@ -1156,7 +1156,7 @@ def test_two_signals_are_an_end_as_one_is(first, second, wait, tmp_path):
     assert len(read_record(tmp_path / "r.csv", IDEAL.description).time) >= ended["num_samples"] > 3
 
 
-@pytest.mark.science
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, LONG(signal.SIGTERM), LONG(signal.SIGHUP)])
 def test_a_signal_ends_it_with_its_own_code_and_a_whole_record(number, tmp_path):
     with experiment_under_way(tmp_path, 5) as process:

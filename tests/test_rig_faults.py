@@ -95,7 +95,7 @@ def test_latency_and_delay_are_one_time():
     np.testing.assert_allclose(readings(late)[0], readings(both)[0], rtol=0, atol=1e-12)
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_a_delay_that_is_no_whole_number_of_readings():
     """Against fine steps, in which each input is constant."""
     plant = Aero2()
@@ -147,7 +147,7 @@ def test_a_derivative_by_the_delay_is_that_of_differences():
 # ---------------------------------------------------------------------------------- effects
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_effects_leave_the_drawn_parameters_and_the_known_plant():
     keys = jax.random.split(jax.random.key(0), 3)
     bare = drawn_hardware(PLANT, READINGS, 0.3, keys, **AT_ONCE)
@@ -214,7 +214,7 @@ def test_an_actuator_sticks_dies_or_turns_round_from_a_time_on(delay):
     np.testing.assert_allclose(turned, gain, rtol=1e-12, atol=1e-15)
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_a_stuck_actuator_holds_its_input_also_after_a_trip():
     faults = Faults(actuator_stuck=FROM)
     loud = Replay(jnp.full((STEPS, 1), 20.0))
@@ -245,7 +245,7 @@ def facts(fault, name="simulated", plant=PLANT):
     return [rig.read().outputs[0] for _ in range(30)], rig.facts()["true_params"], rig
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_faults_and_effects_go_by_name():
     usual, params, _ = facts({})
     biased, _, _ = facts({"sensor_bias_pitch": 0.1})

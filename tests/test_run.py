@@ -140,7 +140,7 @@ def call(tmp_path, capsys, monkeypatch):
 FAST = ("--fast", "--out", "r.csv")
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_an_experiment_that_completes_is_one_json_object_and_a_record(call):
     code, out, err = call("--input", "u.csv", *FAST, "--json")
     assert (code, err) == (0, "")

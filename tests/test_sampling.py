@@ -68,7 +68,7 @@ def test_the_plant_is_found_from_what_scipy_solved(time, linear):
     np.testing.assert_allclose(list(found.params.values()), TRUE, rtol=3e-4)
 
 
-@pytest.mark.science
+@pytest.mark.slow
 @pytest.mark.parametrize("linear", [LONG(False, id="held"), pytest.param(True, id="linear")])
 def test_the_other_hold_is_named_where_it_fits_better(linear):
     right, wrong = ("linear", "constant") if linear else ("constant", "linear")

@@ -107,7 +107,7 @@ def test_results_of_several_runs_tell_as_much_as_their_records_together(records,
         np.testing.assert_allclose(own, error, rtol=0.2)
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_what_cannot_be_combined_is_one_sentence(records, tmp_path):
     result = ex.identify(records[0])
     other = ex.simulate("aero2", params={"D_p": 0.002}, seed=3, options={"amplitude": 2.0})
@@ -121,7 +121,7 @@ def test_what_cannot_be_combined_is_one_sentence(records, tmp_path):
             known_from(known, None, None, "factor:3")
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_a_plant_that_does_not_explain_the_records_is_told_and_the_given_one_stays():
     record = ex.simulate("aero2_lag", seed=1, options={"amplitude": 2.0})
     found = known_from(record, "aero2", None, "factor:3")

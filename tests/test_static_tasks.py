@@ -102,7 +102,7 @@ def test_an_outcome_that_is_infinite_at_zero_has_a_gradient():
     assert float(total(1.5)) == pytest.approx(0.0, abs=1e-12)
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_of_a_linear_task_all_figures_are_the_exact_gain():
     """Half the mean of log(1 + sum of squared designs over the variance), which bounds hold."""
     found = ex.information_gain(
@@ -148,7 +148,7 @@ class Even(AbstractStaticTask):
         return design * params.root**2
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_of_a_posterior_with_two_modes_both_are_found():
     found = ex.information_gain(
         Even, "random", options={"hold": 1}, steps=8, prior={"root": "normal:0:1"}, plants=512,

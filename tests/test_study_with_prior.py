@@ -54,7 +54,7 @@ def study(**changes):
     return study_from({**settings, **changes}, "small").checked("small")
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_plants_of_a_study_are_drawn_from_its_prior():
     plant, keys = Aero2(), jax.random.split(jax.random.key(0), 2000)
     uniform = plants_of(plant, {"K_pu": "uniform:0.01:0.02"}, 0.3)
@@ -73,7 +73,7 @@ def test_plants_of_a_study_are_drawn_from_its_prior():
     assert 1.28 < beside.max() < 1.31
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_an_agent_is_rewarded_in_nats_on_plants_of_the_prior():
     chosen = study()
     env = chosen.env("gradient", chosen.build_plant())
@@ -109,7 +109,7 @@ def test_a_price_of_changes_needs_information(objective):
         ex.train("aero2", objective=objective, change_price=0.1)
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_a_study_has_the_gain_that_information_gain_computes(tmp_path):
     table = ex.run_study(study(), tmp_path / "run", workers=1)
     of_prbs, of_agent = (row.expected_gain for row in table.rows)
@@ -166,7 +166,7 @@ def test_a_static_task_with_a_prior_is_trained_and_compared_in_one_study(tmp_pat
     assert "of 4 records has fewer than 10 effective samples" in notes
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_a_disturbed_plant_is_compared_by_the_likelihood_of_its_steps(tmp_path):
     prior = {"a": "normal:14.7:0.316228", "b": "normal:0:0.1", "c": "normal:3:0.316228"}
     own = study(plant=PENDULUM, prior=prior, agents={}, episodes=100, gain=None)

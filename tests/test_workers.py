@@ -293,7 +293,7 @@ def test_a_task_that_kills_the_workers_of_a_cluster_is_given_up(cluster):
     assert failures == {"always": "its worker died 2 times"}
 
 
-@pytest.mark.science
+@pytest.mark.slow
 def test_ctrl_c_calls_back_what_waits_on_a_cluster_and_a_lost_one_is_told(
     cluster, tmp_path, monkeypatch
 ):
