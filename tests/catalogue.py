@@ -60,8 +60,9 @@ PLANTS: dict[str, AbstractPlant] = {
 }
 
 LONG = partial(pytest.param, marks=pytest.mark.science)
-SLOW = partial(pytest.param, marks=pytest.mark.slow)
 """A parameter of the long tests."""
+SLOW = partial(pytest.param, marks=pytest.mark.slow)
+"""A parameter of the slow ones."""
 
 FEW_AND_ALL = [name if name in ("aero2", "two_masses") else LONG(name) for name in PLANTS]
 """Names of two plants that differ in everything, and of the others in the long tests."""

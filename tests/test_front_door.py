@@ -19,12 +19,13 @@ from excite.cli import cli
 from excite.study.catalogue import shipped_studies
 
 NAMES = [name for name in ex.__all__ if name != "__version__"]
-MARKS = dict.fromkeys(("train", "campaign", "design", "run_study", "compare_plants"), LONG)
-MARKS |= dict.fromkeys(("next_experiment", "information_gain", "discriminate", "falsify"), SLOW)
-MARKS |= dict.fromkeys(("evaluate", "choose_experiments"), SLOW)
+LONGEST = {"train", "campaign", "design", "run_study", "compare_plants"}
+SLOWER = {"next_experiment", "information_gain", "discriminate", "falsify", "evaluate"}
+SLOWER |= {"choose_experiments"}
+MARKED = [LONG(n) if n in LONGEST else SLOW(n) if n in SLOWER else n for n in NAMES]
 
 
-@pytest.mark.parametrize("name", [MARKS.get(name, pytest.param)(name) for name in NAMES])
+@pytest.mark.parametrize("name", MARKED)
 def test_every_name_has_an_example_that_runs(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # some examples write a file
     found = inspect.unwrap(getattr(ex, name))

@@ -821,13 +821,33 @@ def test_an_experiment_comes_back_when_the_page_is_loaded_again(address: str, pa
 
 def test_a_plant_that_is_gone_is_told(address: str, page: Page):
     page.goto(f"{address}/static/first.json")  # where no script runs
-    page.evaluate("""localStorage.setItem("experiment",
+    page.evaluate("""localStorage.setItem("excite-experiment",
       JSON.stringify({ fields: { plant: "my_own", excitation: "prbs" } }))""")
     page.goto(address)
     expect(status(page)).to_have_text("the plant my_own is no longer on the server", timeout=WAIT)
     expect(page.locator("#signals canvas")).to_have_count(2)
     expect(status(page)).to_have_class(re.compile("bad"))
     expect(page.locator("#excitation")).to_have_value("chirp")
+
+
+def test_a_storage_that_is_damaged_or_full_stops_nothing(address: str, page: Page):
+    page.goto(f"{address}/static/first.json")
+    page.evaluate("""["x", '{"fields": null}'].forEach((text, i) =>
+      localStorage.setItem(`excite-${["experiment", "record"][i]}`, text))""")
+    ready(page, address)
+    page.locator("#seed").fill("4")
+    kept = json.loads(page.evaluate("sessionStorage.getItem('excite-experiment')"))["fields"]
+    assert kept["seed"] == "4"
+    assert "amplitude" not in kept  # what was not changed follows the plant
+    assert not [name for name in kept if name.startswith(("params-", "noise-"))]
+    page.add_init_script("Storage.prototype.setItem = () => { throw new Error('full'); }")
+    page.reload()
+    expect(page.locator("#experiment .primary")).to_be_enabled(timeout=WAIT)
+    page.get_by_label("Played in").select_option("20")
+    page.get_by_role("button", name="Run", exact=True).click()
+    expect(status(page)).to_have_text(re.compile("^Running"), timeout=WAIT)
+    page.locator("#experiment .stop").click()
+    expect(status(page)).to_have_text("Stopped.", timeout=WAIT)
 
 
 def test_an_experiment_that_runs_is_followed_again(address: str, page: Page):
@@ -895,6 +915,15 @@ def test_a_file_and_its_result_come_back_when_the_page_is_loaded_again(
     assert seen(page, "record")[0] == before[0]
     page.get_by_role("button", name="Identify").click()
     expect(status(page, "record")).to_have_text("Done: successful.", timeout=WAIT)
+    # Another file of that name is mapped anew.
+    page.context.clear_cookies()
+    page.reload()
+    expect(status(page, "record")).to_have_text(gone, timeout=WAIT)
+    (tmp_path / "log.csv").write_text("t [s],u,y\n" + rows)
+    page.locator("#file").set_input_files(tmp_path / "log.csv")
+    expect(status(page, "record")).to_contain_text("log.csv: 3 columns", timeout=WAIT)
+    expect(page.locator("#unit-time")).to_have_value("s")
+    expect(page.locator("#scale-voltage")).to_have_value("")
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

@@ -3,15 +3,16 @@
 import asyncio
 import json
 import shutil
-from collections.abc import AsyncGenerator, Mapping
+from collections.abc import AsyncGenerator, AsyncIterator, Mapping
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 from starlette.testclient import TestClient
 
 from excite.files import write_json
-from excite.web import application, sessions
+from excite.web import application, sessions, streams
 from excite.web.requests import RefusedError
 from excite.web.sessions import MAX_JOBS, MAX_KEPT, Job, PageSettings, Session
 from excite.web.workers import Workers
@@ -183,6 +184,44 @@ def test_a_job_goes_on_while_its_page_is_loaded_again(
     else:
         with pytest.raises(asyncio.CancelledError):
             asyncio.run(left_and_followed())
+
+
+def test_a_result_whose_page_left_before_the_comparisons_is_shown_again(tmp_path: Path):
+    """And it is told that what was to follow was stopped."""
+
+    async def events(folder: Path, stop: asyncio.Event) -> AsyncIterator[Any]:
+        yield {"kind": "result"}
+        await stop.wait()
+
+    async def left() -> list[Any]:
+        session, making = Session(tmp_path), cast(Any, events)
+        lines = cast(Any, streams._streamed(session, {}, making).body_iterator)
+        name = json.loads(await anext(lines))["job"]
+        assert json.loads(await anext(lines))["result"] == name
+        cast(Job, session.jobs[name]).end()
+        with pytest.raises(asyncio.CancelledError):
+            _ = [line async for line in lines]
+        with session.using(name, "result") as folder:
+            return (folder / "events.ndjson").read_text().splitlines()
+
+    told = [json.loads(line)["kind"] for line in asyncio.run(left())]
+    assert told == ["job", "result", "stopped"]
+
+
+def test_an_experiment_that_no_worker_takes_fails():
+    class Full:
+        async def events(self, *_: object) -> AsyncIterator[Any]:
+            raise RefusedError(503, "the queue is full")
+            yield
+
+    player: Any = SimpleNamespace(hurry=lambda: None, frame=lambda: None, allows=lambda _: True)
+    player.is_over = True
+
+    async def told() -> list[Any]:
+        full: Any = Full()
+        return [e async for e in streams._followed(full, {}, player, asyncio.Event())]
+
+    assert asyncio.run(told()) == [{"kind": "failed", "sentence": "the queue is full"}]
 
 
 def test_a_job_that_was_left_gives_way(tmp_path: Path):

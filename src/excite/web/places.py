@@ -8,15 +8,17 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from starlette.requests import Request
-from starlette.responses import FileResponse, JSONResponse, Response
+from starlette.responses import FileResponse, Response
 from starlette.routing import Route
 
+from ..files import write_json
 from ..record import READ_ENDINGS, WRONG_ENDING
 from .events import JobEvent
 from .requests import MAX_UPLOAD, RefusedError, parts
-from .sessions import MAX_STORED, Session
-from .workers import Job, Workers
+from .sessions import MAX_STORED, UPLOADED, Session
+from .workers import Call, Workers
 
+_COLUMNS = "columns.json"
 _MAX_NAME = 200  # bytes of a file's name
 _DOWNLOADS = {
     "record.csv": "text/csv",
@@ -32,27 +34,28 @@ def routes(workers: Workers, run_of: Callable[[Request], Path]) -> list[Route]:
         run_of: the run in the run folder that a request names.
     """
 
-    async def upload(request: Request) -> JSONResponse:
+    async def upload(request: Request) -> FileResponse:
         session: Session = request.state.session
         file = _file_name(request.query_params.get("name", ""))
-        job = session.begin()
+        name = session.begin()
         try:
-            with session.making("upload", job) as place:
-                await _receive(request, place.folder / file, session.folder.parent)
-                found = await _columns(workers, place.folder)
+            with session.making("upload", name) as place:
+                folder = place.folder / UPLOADED
+                folder.mkdir()
+                await _receive(request, folder / file, session.folder.parent)
+                wanted = {"folder": str(folder), "name": file}
+                told = await _last(workers, "columns", wanted, True)
+                columns = told if told["kind"] == "columns" else {"columns": {}, "previews": {}}
+                found = {"columns": columns["columns"], "previews": columns["previews"]}
+                write_json(place.folder / _COLUMNS, {"upload": name, "file": file, **found})
                 place.is_done = True
         finally:
-            session.end(job)
-        return JSONResponse({"upload": job, **found})
+            session.end(name)
+        return FileResponse(place.folder / _COLUMNS)
 
-    async def uploaded(request: Request) -> JSONResponse:
-        session, name = request.state.session, request.path_params["name"]
-        job = session.begin()
-        try:
-            with session.using(name, "upload") as folder:
-                return JSONResponse({"upload": name, **await _columns(workers, folder)})
-        finally:
-            session.end(job)
+    def uploaded(request: Request) -> FileResponse:
+        with request.state.session.using(request.path_params["name"], "upload") as folder:
+            return FileResponse(folder / _COLUMNS)
 
     def file(request: Request) -> FileResponse:
         asked = request.path_params
@@ -82,14 +85,6 @@ def routes(workers: Workers, run_of: Callable[[Request], Path]) -> list[Route]:
         Route("/api/results/{name}/{file}", file),
         Route("/api/run/report.html", run_report),
     ]
-
-
-async def _columns(workers: Workers, folder: Path) -> dict[str, object]:
-    """The name of the file in the folder of an upload, and its columns."""
-    [file] = folder.iterdir()
-    told = await _last(workers, "columns", {"folder": str(folder), "name": file.name}, True)
-    found = told if told["kind"] == "columns" else {"columns": {}, "previews": {}}
-    return {"file": file.name, "columns": found["columns"], "previews": found["previews"]}
 
 
 async def _reported(workers: Workers, session: Session, run: Path) -> Response:
@@ -152,7 +147,7 @@ async def _receive(request: Request, path: Path, scratch: Path) -> None:
 
 
 async def _last(
-    workers: Workers, job: Job, arguments: Mapping[str, object], urgent: bool
+    workers: Workers, job: Call, arguments: Mapping[str, object], urgent: bool
 ) -> JobEvent:
     """The last event of a call before its end."""
     told: JobEvent = {"kind": "end"}

@@ -23,6 +23,8 @@ MAX_STORED = 2 * 2**30
 """Limit of the data stored for all browsers [bytes]; beyond it uploads are refused."""
 MAX_KEPT = 8
 """Number of results, and of uploads, stored for a browser; the oldest is removed first."""
+UPLOADED = "file"
+"""The folder of an uploaded file, in that of its upload."""
 GRACE = 10.0
 """Seconds that a job goes on while no page follows it: its page may be loaded again."""
 GONE = {
@@ -146,7 +148,7 @@ class Job:
                 await more.wait()
         finally:
             self._num_followers -= 1
-            if not self._num_followers:
+            if not self._num_followers and not self._task.done():
                 self._ending = asyncio.get_running_loop().call_later(GRACE, self.end)
 
     @property
@@ -155,8 +157,9 @@ class Job:
         return self._ending is not None
 
     def end(self) -> None:
-        """Ends it at once, without a result."""
-        self._task.cancel()
+        """Ends it at once."""
+        if not self._task.cancelling():
+            self._task.cancel()
 
 
 @dataclass
@@ -202,7 +205,7 @@ class Session:
 
     def _give_way(self, kind: str, new: str) -> None:
         """Removes the folders unused for longest, except those in use, where there are too many."""
-        same = [name for name, place in self.kept.items() if place.kind == kind]
+        same = [name for name, place in self.kept.items() if place.kind == kind and place.is_done]
         free = [name for name in same if not self.kept[name].num_users and name != new]
         for name in free[: max(0, len(same) - MAX_KEPT)]:
             self._forget(name)

@@ -7,6 +7,7 @@ an even pace, and an estimate not before the sample at which it was made.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import math
 from collections.abc import AsyncGenerator, Callable, Mapping
@@ -40,14 +41,14 @@ from .requests import (
     word,
     words,
 )
-from .sessions import GONE, Job, Session
+from .sessions import GONE, UPLOADED, Job, Session
 from .workers import Workers
 
 FRAME = 0.04
 """Seconds between two parts of a stream."""
 _PULSE = 1.0  # seconds without an event, then a pulse is sent
 _KEPT, _LINES = "events.ndjson", "application/x-ndjson"
-_COMPLETE = ("result", "identified", "stopped", "end")  # there is something to show again
+_COMPLETE = ("result", "identified", "stopped")  # there is something to show again
 
 Events = AsyncGenerator[StreamEvent]
 
@@ -160,13 +161,20 @@ def _streamed(
         job.tell(_line({"kind": "job", "job": name, "asked": wanted}))
         try:
             with session.making("result", name) as place:
-                async with aclosing(events(place.folder / "run", job.stop)) as told:
-                    async for event in told:
-                        if event["kind"] == "result" or event["kind"] == "identified":
-                            event["result"] = name
-                        job.tell(_line(event))
-                        place.is_done |= event["kind"] in _COMPLETE
-                write_bytes(place.folder / _KEPT, "".join(job.lines).encode())
+                try:
+                    async with aclosing(events(place.folder / "run", job.stop)) as told:
+                        async for event in told:
+                            if event["kind"] == "result" or event["kind"] == "identified":
+                                event["result"] = name
+                            job.tell(_line(event))
+                            place.is_done |= event["kind"] in _COMPLETE
+                except asyncio.CancelledError:
+                    job.tell(_line({"kind": "stopped"}))
+                    raise
+                finally:
+                    if place.is_done:
+                        with contextlib.suppress(OSError):  # it cannot be shown again
+                            write_bytes(place.folder / _KEPT, "".join(job.lines).encode())
         except RefusedError as refused:
             job.tell(_line({"kind": "failed", "sentence": refused.sentence}))
         finally:
@@ -214,7 +222,8 @@ async def _identified(
     folder: Path,
     stop: asyncio.Event,
 ) -> Events:
-    with session.using(upload, "upload") as source:
+    with session.using(upload, "upload") as kept:
+        source = kept / UPLOADED
         [file] = source.iterdir()
         paths = {"source": str(source), "name": file.name, "folder": str(folder)}
         arguments = {"asked": asked, **paths}
@@ -255,10 +264,13 @@ async def _followed(
     waiting = asyncio.Queue[JobEvent]()
 
     async def follow() -> None:
-        async with aclosing(workers.events("followed", arguments)) as events:
-            async for event in events:
-                if event["kind"] != "started":
-                    waiting.put_nowait(event)
+        try:
+            async with aclosing(workers.events("followed", arguments)) as events:
+                async for event in events:
+                    if event["kind"] != "started":
+                        waiting.put_nowait(event)
+        except RefusedError as refused:
+            waiting.put_nowait({"kind": "failed", "sentence": refused.sentence})
 
     following = asyncio.create_task(follow())
     try:

@@ -22,7 +22,7 @@ _NICENESS = 5  # the server has priority, so that streams are not delayed
 
 JOBS = "excite.web.jobs"
 """The module of the workers' functions, by name, because this process must not load JAX."""
-Job = Literal["catalogue", "episode", "followed", "columns", "identified", "reported"]
+Call = Literal["catalogue", "episode", "followed", "columns", "identified", "reported"]
 
 
 class Workers:
@@ -49,7 +49,7 @@ class Workers:
         await asyncio.to_thread(self._pool.close, "the server has ended")
 
     async def events(
-        self, job: Job, arguments: Mapping[str, object], urgent: bool = False
+        self, job: Call, arguments: Mapping[str, object], urgent: bool = False
     ) -> AsyncGenerator[JobEvent]:
         """Events of one call, from `started` to `end` or `failed`; closing it ends the work.
 

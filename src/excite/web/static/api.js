@@ -84,12 +84,13 @@ export class Task {
     this.halt.disabled = !this.isBusy;
   }
 
+  /** Returns what was said of a failure; null where there was none. */
   async run(address, content, onEvent) {
-    if (this.isBusy) return;
-    this.isBusy = true;
+    if (this.isBusy) return null;
+    this.isBusy = this.kept.isRunning = true;
     this.refresh();
     this.kept.save();
-    let ending = "the connection ended too early; run it again";
+    let ending = "the connection ended too early; run it again", hasResult = false;
     try {
       await stream(address, content, (event) => {
         if (event.kind === "job") {
@@ -100,19 +101,25 @@ export class Task {
         else if (event.kind === "stopped") { ending = null; say(this.form, "Stopped."); }
         else if (event.kind === "failed") {
           ending = event.sentence;
-          this.kept.save({ shown: null });
-        } else onEvent(event);
+          if (!hasResult) this.kept.save({ shown: null });
+        } else {
+          hasResult ||= event.kind === "result" || event.kind === "identified";
+          onEvent(event);
+        }
       });
       if (ending) say(this.form, ending, true);
     } catch (error) {
-      this.kept.save({ shown: null });
-      say(this.form, error.message, true);
+      if (error.status === 404) this.kept.save({ shown: null });
+      ending = error.message;
+      say(this.form, ending, true);
     } finally {
       tell(this.form, "");
       this.job = null;
-      this.isBusy = false;
+      this.isBusy = this.kept.isRunning = false;
+      this.kept.save();
       this.refresh();
     }
+    return ending;
   }
 
   async stop() {

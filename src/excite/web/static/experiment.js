@@ -22,8 +22,15 @@ export function begin(known) {
   task = new Task(form);
   const gone = task.kept.fill(), { shown: before } = task.kept.state;
   say(form, gone || "Ready.", Boolean(gone));
-  if (before) follow(`api/results/${before}/events`);
+  if (before) again(before, gone);
   else prepared(gone);
+}
+
+/** Shows the result that was shown before the page was loaded, or else the prepared one and what is gone. */
+async function again(name, gone) {
+  const failure = await follow(`api/results/${name}/events`);
+  if (!at("signals").querySelector("figure")) prepared(gone || failure);
+  else if (gone) say(form, gone, true);
 }
 
 /** Draws the default experiment, as it was computed for this page. */
@@ -71,6 +78,7 @@ function chooseExcitation() {
   const name = at("excitation").value, input = plant.inputs[0], isSignal = !name.startsWith("loop-") && !(name in plant.policies);
   const half = (input.upper - input.lower) / 2;
   Object.assign(at("amplitude"), { disabled: !isSignal, max: half, value: input.amplitude });
+  at("amplitude").dataset.usual = at("amplitude").value;
   section.querySelector("label[for=amplitude] .unit").textContent = isSignal ? `${input.unit}, at most ${half}` : "set by the excitation";
   const policy = plant.policies[name], longest = policy?.num_steps;
   at("about").textContent = policy ? "Learned: a policy that reacts to every measurement."
@@ -119,8 +127,9 @@ function run() {
 
 /** Shows an experiment as it goes on: a new one, or without `wanted` one that was shown before. */
 async function follow(address, wanted) {
-  await task.run(address, wanted, follower(wanted));
+  const failure = await task.run(address, wanted, follower(wanted));
   if (shownRun && !shownRun.isFull) shownRun.halt(); // no more samples come
+  return failure;
 }
 
 /** Takes away what is shown of the run before. */

@@ -3,29 +3,42 @@
 const fieldsOf = (form) => [...form.elements].filter((field) => field.id && field.matches("select, input:not([type=file])"));
 const content = (field) => (field.type === "checkbox" ? "checked" : "value");
 
+/** What a storage has under a name; null where the browser allows none. */
+function stored(storage, name) {
+  try { return window[storage].getItem(name); } catch { return null; }
+}
+
 export class Kept {
   /** What was kept for this form in this tab, or else in the tab that was used last. */
   constructor(form) {
-    Object.assign(this, { form, name: form.parentElement.id, more: form.querySelector("details"), isFilling: false });
-    const before = sessionStorage.getItem(this.name) ?? localStorage.getItem(this.name);
-    this.state = { fields: {}, isOpen: false, shown: null, upload: null, ...JSON.parse(before) };
+    Object.assign(this, { form, name: `excite-${form.parentElement.id}`, details: form.querySelector("details"), isFilling: false, isRunning: false });
+    const before = stored("sessionStorage", this.name) ?? stored("localStorage", this.name);
+    this.state = { fields: {}, isOpen: false, shown: null, upload: null, mapped: null };
+    try { Object.assign(this.state, JSON.parse(before)); } catch { /* not written by this page */ }
+    this.state.fields ??= {};
     ["input", "change", "click"].forEach((kind) => form.addEventListener(kind, () => this.save()));
-    this.more.addEventListener("toggle", () => this.save());
+    this.details.addEventListener("toggle", () => this.save());
   }
 
-  /** Keeps the form as it is now, and more of the state. What a form lacks for now, such as columns, stays. */
+  /** Keeps the form as it is now, and more of the state. What a form lacks for now, such as columns, stays; a new tab does not take over what runs. */
   save(more = {}) {
     if (this.isFilling) return;
-    for (const field of fieldsOf(this.form)) this.state.fields[field.id] = field[content(field)];
-    const text = JSON.stringify(Object.assign(this.state, { isOpen: this.more.open }, more));
-    [sessionStorage, localStorage].forEach((store) => store.setItem(this.name, text));
+    for (const field of fieldsOf(this.form)) {
+      if (field.value === field.dataset.usual) delete this.state.fields[field.id];
+      else this.state.fields[field.id] = field[content(field)];
+    }
+    Object.assign(this.state, { isOpen: this.details.open }, more);
+    try {
+      sessionStorage.setItem(this.name, JSON.stringify(this.state));
+      localStorage.setItem(this.name, JSON.stringify({ ...this.state, shown: this.isRunning ? null : this.state.shown }));
+    } catch { /* the browser has no room, or allows none */ }
   }
 
   /** Fills the form in its order, as a person does; returns a sentence where its plant is not there. */
   fill() {
     let gone = "";
     this.isFilling = true;
-    this.more.open = this.state.isOpen;
+    this.details.open = this.state.isOpen;
     for (const [id, before] of Object.entries(this.state.fields)) {
       const field = document.getElementById(id), is = field && content(field);
       if (!field || field[is] === before) continue;

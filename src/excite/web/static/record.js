@@ -5,7 +5,7 @@ import { digits, empty, Plot, range, shown } from "./plot.js";
 
 const section = document.getElementById("record"), form = section.querySelector("form");
 const at = (id) => document.getElementById(id);
-let catalogue, task, file = null, reading = 0, isKept = false;
+let catalogue, task, file = null, reading = 0;
 
 export function begin(known) {
   catalogue = known;
@@ -29,9 +29,8 @@ export function begin(known) {
 /** Shows again the file and the result that were shown before the page was loaded, or says what is gone. */
 async function again(gone) {
   const own = reading, { upload: name, shown: before } = task.kept.state;
-  isKept = name !== null;
   try {
-    const taken = isKept && await get(`api/uploads/${name}`);
+    const taken = name && await get(`api/uploads/${name}`);
     if (own === reading && taken) put(taken);
   } catch (error) {
     gone ||= error.message;
@@ -40,13 +39,13 @@ async function again(gone) {
   if (own === reading && gone) say(form, gone, true);
 }
 
-/** Shows a file that the server has read; its columns as they were assigned where the page was loaded again. */
+/** Shows a file that the server has read; its columns as they were assigned if it is the one before, by name and columns. */
 function put(taken) {
   file = taken;
+  const mapped = JSON.stringify([file.file, Object.keys(file.columns)]);
   showMapping();
-  if (isKept) task.kept.fill();
-  isKept = false;
-  task.kept.save({ upload: file.upload });
+  if (mapped === task.kept.state.mapped) task.kept.fill();
+  task.kept.save({ upload: file.upload, mapped });
   preview();
   task.refresh();
   const counts = Object.values(file.columns);
