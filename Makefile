@@ -21,11 +21,11 @@ demo: .venv/core ## the baseline rows of the paper's Table 1, with three estimat
 
 # The type checker has one thread: the tests begin on the other core.
 test: lint ## style, types, unit and command-line tests
-	$(MAKE) --jobs=2 types units
+	$(MAKE) --jobs=2 types units UNITS="$(UNITS)"
 
 # The tests of a file share their compiled programs: one process runs the file.
 units: .venv/dev ## unit and command-line tests
-	$(QUICK) $(PYTEST) --dist loadfile
+	$(QUICK) $(PYTEST) --dist loadfile $(UNITS)
 
 test-slow: .venv/dev ## the unit and command-line tests that take more than about three seconds
 	$(QUICK) $(PYTEST) --dist loadfile -m 'slow and not science'
@@ -39,7 +39,9 @@ test-science: .venv/dev ## promises of the shipped policies, baselines, training
 check-results: .venv/dev ## the committed results are what the documentation says of them
 	$(BIN)/python -m pytest tests/results
 
-test-all: test test-slow test-pages test-science check-results ## all tests
+# In one pass with the unit tests, the slow ones find compiled what they share with them.
+test-all: UNITS := -m 'not science'
+test-all: test test-pages test-science check-results ## all tests
 
 coverage: .venv/dev ## lines of the package that no unit or command-line test runs
 	$(QUICK) $(PYTEST) --dist loadfile -m 'not science' --cov=excite --cov-report=term-missing:skip-covered
