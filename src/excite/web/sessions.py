@@ -26,12 +26,12 @@ MAX_KEPT = 8
 UPLOADED = "file"
 """The folder of an uploaded file, in that of its upload."""
 GRACE = 10.0
-"""Seconds that a job goes on while no page follows it: its page may be loaded again."""
+"""A job that no page follows ends after so many seconds; loading a page again takes fewer."""
 GONE = {
     "upload": "this file is no longer on the server; choose it again",
     "result": "this result is no longer on the server, or was interrupted; run it again",
 }
-"""What is said of an upload or a result that a browser does not have."""
+"""The sentence for an upload or a result that this browser does not have, by its kind."""
 
 
 @dataclass(frozen=True)
