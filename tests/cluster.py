@@ -33,7 +33,9 @@ class Cluster:
             self.start_worker()
 
         def address() -> str:
-            return json.loads(file.read_text())["address"] if file.exists() else ""
+            # The scheduler opens its file before it fills it.
+            written = file.read_text() if file.exists() else ""
+            return json.loads(written)["address"] if written.endswith("}") else ""
 
         if not wait_for(address, PATIENCE):
             self.close()
