@@ -34,6 +34,9 @@ HERE = Path(__file__).parent
 EXAMPLES = HERE.parent.parent / "examples"
 NEAR_THE_POSTERIOR = {"plants": 2048, "samples": 100, "seed": 1}
 FROM_THE_PRIOR = {"plants": 256, "samples": 100_000, "from_prior": True, "seed": 1}
+# Of experiments that tell far more than a network's: a seed is one of designs, plants and noise.
+MYOPIC = {"plants": 667, "samples": 1_000_000, "from_prior": True}
+NEAR_MYOPIC = {"plants": 667, "samples": 1000}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,15 +152,16 @@ def policy_path(task, price, seed):
     return path_of(task, f"-{price:g}-{seed}.safetensors")
 
 
-def row(task, method, excitation, **about):
+def row(task, method, excitation, evaluation=None, also=None, **about):
     """What an excitation is expected to tell, on plants that no training has seen."""
     own = TASKS[task]
+    evaluation, also = evaluation or own.evaluation, also or own.also
     gain = partial(ex.information_gain, own.word, excitation, steps=own.steps, prior=own.prior)
-    found = gain(**own.evaluation)
+    found = gain(**evaluation)
     content = {"task": task, "method": method, **about, **found.to_dict()}
     content["gain_less_changes"] = found.lower.value - max(own.trainings) * found.changes.value
-    if own.also is not None:
-        near = gain(**own.also).to_dict()
+    if also is not None:
+        near = gain(**also).to_dict()
         kept = ("lower", "upper", "num_samples", "few_effective_samples")
         content["near_posterior"] = {name: near[name] for name in kept}
     return {k: v for k, v in content.items() if k not in ("plant", "excitation")}
@@ -191,6 +195,14 @@ def trained_rows(task, seed):
         policy.save(policy_path(task, price, seed), overwrite=True)
         told = {"price": price, "seed": seed, "train_cpu_seconds": seconds / len(best)}
         yield row(task, "gradient", policy, **told)
+
+
+def myopic_row(task, seed):
+    """Of designs chosen one after the other, without a training."""
+    start = time.process_time()
+    own = {"evaluation": {**MYOPIC, "seed": seed}, "also": {**NEAR_MYOPIC, "seed": seed}}
+    made = row(task, "myopic", "myopic", **own, seed=seed)
+    return made | {"evaluation_cpu_seconds": time.process_time() - start}
 
 
 def open_loop_row(task):
@@ -254,7 +266,11 @@ def main():
         if own.archive and asked.published is not None:
             module = module_at(EXAMPLES / "smc_policies.py")
             keep_input("published", module.RecurrentPolicy.read(asked.published / own.archive))
-        for seed in range(own.seeds if asked.seeds is None else asked.seeds):
+        seeds = range(own.seeds if asked.seeds is None else asked.seeds)
+        if own.memory:
+            for seed in seeds:
+                keep("myopic", lambda task=task, seed=seed: [myopic_row(task, seed)], seed)
+        for seed in seeds:
             keep("gradient", partial(trained_rows, task, seed), seed)
         print("\n".join(lines(task)))
 

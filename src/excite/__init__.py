@@ -56,6 +56,7 @@ _PLACES = {
     "Study": "study.spec",
     "read_study": "study.spec",
     "Identification": "estimation.result",
+    "Myopic": "estimation.myopic",
     "Campaign": "study.campaign",
     # what there is
     "plants": "plant.catalogue",
@@ -123,6 +124,7 @@ if TYPE_CHECKING:
     from .estimation.comparison import compare_plants as compare_plants
     from .estimation.identify import identify as identify
     from .estimation.information_gain import information_gain as information_gain
+    from .estimation.myopic import Myopic as Myopic
     from .estimation.result import Identification as Identification
     from .excitation.catalogue import excitations as excitations
     from .information import information as information

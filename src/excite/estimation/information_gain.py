@@ -32,12 +32,13 @@ from ..description import LARGEST_SEED, SpreadLike, require_whole
 from ..excitation import AbstractExcitation
 from ..excitation.catalogue import ExcitationLike
 from ..information import require_bound
-from ..plant.catalogue import PlantLike
+from ..plant.catalogue import PlantLike, plant_from, with_sensor
 from ..progress import SHOWN, Progress
 from ..report.tables import html_table, text_table
 from ..safety import safe_input
 from ..simulation import Experiment, predicted, run_episode
 from .evidence import Fit, nearest
+from .myopic import MYOPIC, Myopic
 from .prior import PriorPlants
 from .prior_knowledge import PriorLike, plants_of
 
@@ -121,7 +122,6 @@ def gains(
         roots = jnp.linalg.cholesky(inverse)
         # Flatter than the posterior's shares: a small mode costs few samples, a missed one the sum.
         modes = jax.nn.log_softmax(-0.25 * (costs + log_dets))
-        shares = (0.0, 0.0, 1.0) if from_prior else _SHARES
 
         def log_proposal(z: Array) -> Array:
             change = z[None] - ends
@@ -134,19 +134,26 @@ def gains(
                     -0.5 * z @ z,
                 ]
             )
-            return jax.nn.logsumexp(parts, b=jnp.array(shares))
+            return jax.nn.logsumexp(parts, b=jnp.array(_SHARES))
 
         def log_weight(z: Array) -> Array:
+            if from_prior:
+                return log_likelihood(z)
             return log_likelihood(z) - 0.5 * z @ z - log_proposal(z)
 
-        def block(carry: tuple[Array, Array], key: PRNGKeyArray) -> tuple[tuple, None]:
+        def samples(key: PRNGKeyArray) -> Array:
             kind_key, value_key = jax.random.split(key)
             z = jax.random.normal(value_key, (size, count), float)
-            kind = jax.random.choice(kind_key, 3, (size,), p=jnp.array(shares))
+            if from_prior:
+                return z
+            kind = jax.random.choice(kind_key, 3, (size,), p=jnp.array(_SHARES))
             mode = jax.random.categorical(jax.random.fold_in(kind_key, 1), modes, shape=(size,))
             far = jnp.where(kind == 1, _WIDE, 1.0)[:, None]
             near = ends[mode] + far * jnp.einsum("sij,sj->si", roots[mode], z)
-            weights = jax.vmap(log_weight)(jnp.where((kind == 2)[:, None], z, near))
+            return jnp.where((kind == 2)[:, None], z, near)
+
+        def block(carry: tuple[Array, Array], key: PRNGKeyArray) -> tuple[tuple, None]:
+            weights = jax.vmap(log_weight)(samples(key))
             total = jnp.logaddexp(carry[0], jax.nn.logsumexp(weights))
             squares = jnp.logaddexp(carry[1], jax.nn.logsumexp(2 * weights))
             return (total, squares), None
@@ -295,7 +302,8 @@ def information_gain(
 
     Args:
         plant: as for `simulate`, and so are `excitation`, `options`, `steps`, `noise` and
-            `resolution`. An encoder's step counts as noise of its own standard deviation.
+            `resolution`. An encoder's step counts as noise of its own standard deviation. For a
+            static task, the excitation `myopic` is `Myopic` for the prior.
         prior: distributions of parameters, as for `identify`, or an earlier run.
         spread: of parameters without such a distribution: uniform, in the logarithm for a factor
             (`factor:3`).
@@ -317,6 +325,8 @@ def information_gain(
     require_whole("plants", plants, 2, 1_000_000)
     require_whole("samples", samples, 1, 100_000_000)
     require_whole("seed", seed, 0, LARGEST_SEED)
+    if isinstance(excitation, str) and excitation == MYOPIC:
+        excitation = Myopic.of(with_sensor(plant_from(plant), noise, resolution), prior, spread)
     e = Experiment.of(
         plant, excitation, options=options, steps=steps, noise=noise, resolution=resolution,
         seed=seed,

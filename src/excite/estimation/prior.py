@@ -234,7 +234,7 @@ class PriorPlants(eqx.Module):
         names = () if self.normal is None else self.normal.names
         if self.normal is not None:
             index = np.array([names_of(d.parameters).index(name) for name in names])
-            drawn = self.normal.mean + jnp.linalg.solve(self.normal.root, z[index])
+            drawn = self.normal.mean + jnp.linalg.inv(self.normal.root) @ z[index]
             parts = zip(names, self.normal.logarithmic, drawn, strict=True)
             values = {n: jnp.exp(v) if is_log else v for n, is_log, v in parts}
         for name, low, high in self.ranges:

@@ -1,0 +1,263 @@
+"""Designs of a static task, each where its outcome is expected to tell most of the parameters.
+
+What is known is a set of particles: parameters as probable as the outcomes so far leave them.
+Each outcome weights the particles; they are drawn again, and moved without changing their
+distribution (sequential Monte Carlo; N. Chopin, A sequential particle filter method for static
+models, 2002; moves of C. ter Braak, A Markov chain Monte Carlo version of the genetic algorithm
+differential evolution, 2006). The next design has the largest expected information gain of its own
+outcome, by nested Monte Carlo, among designs at random: first anywhere and near the designs before,
+then near the best of these. It looks one outcome ahead, and is not trained.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from ..description import SpreadLike
+from ..excitation import AbstractExcitation
+from ..information import require_bound
+from ..plant import AbstractPlant, floats
+from ..plant.catalogue import PlantLike, plant_from
+from ..plant.static import AbstractStaticTask
+from .prior import PriorPlants
+from .prior_knowledge import PriorLike, plants_of
+
+MYOPIC = "myopic"
+"""Name of the excitation where a prior is given beside it."""
+
+_SMALLEST = 1e-3  # distance of a design near another, in half ranges; the largest is 1
+_BEST = 8  # designs near which those of the next round lie
+_JUMP = 0.2  # share of the moves by a whole difference of two particles, from mode to mode
+_FINE = 1e-3  # part of a move that no difference has, in the particles' standard deviations
+
+
+class Known(eqx.Module):
+    """What a static task's outcomes so far tell.
+
+    Attributes:
+        particles: normal coordinates of equally probable parameters.
+        designs: so far, by step; zero from step k.
+        outcomes: of these.
+        k: number of designs made.
+        key: of the particles and the designs that are tried.
+    """
+
+    particles: Float[Array, "particle param"]
+    designs: Float[Array, "time input"]
+    outcomes: Float[Array, "time output"]
+    k: Int[Array, ""]
+    key: PRNGKeyArray
+
+
+class Myopic(AbstractExcitation):
+    """Each design of a static task where its outcome is expected to tell most.
+
+        >>> import jax
+        >>> import excite as ex
+        >>> from excite.plant import AbstractStaticTask, static_description
+        >>> class Beacon(AbstractStaticTask):
+        ...     definition = static_description(
+        ...         "beacon",
+        ...         designs=(ex.Input("place", "m", -4.0, 4.0),),
+        ...         outcomes=(ex.Output("level", "", scale=1.0, noise_sd=0.1),),
+        ...         parameters=(ex.Parameter("at", "m", 0.0, scale=1.0, positive=False),),
+        ...     )
+        ...     def outcome(self, design, params):
+        ...         return 1 / (1 + (design - params.at) ** 2)
+        >>> chosen = ex.Myopic.of(Beacon, {"at": "normal:0:1"})
+        >>> state = chosen.init(Beacon(), 10, jax.random.key(0))
+        >>> state, first = chosen(state, jax.numpy.zeros(1))  # nothing is measured yet
+        >>> state, second = chosen(state, jax.numpy.array([0.4]))  # the outcome of the first
+        >>> second.shape
+        (1,)
+
+    Attributes:
+        prior: of the parameters.
+        pool: the only designs that are allowed [input units]; default all within the limits.
+        num_particles: of what is known.
+        num_moves: of each particle after an outcome.
+        num_tried: designs of each round.
+        num_rounds: of designs near earlier ones, after the first round.
+        num_outcomes: of a design that is tried, each averaged over four times as many particles.
+    """
+
+    prior: PriorPlants
+    pool: Float[Array, "design input"] | None = None
+    num_particles: int = eqx.field(static=True, default=1000)
+    num_moves: int = eqx.field(static=True, default=5)
+    num_tried: int = eqx.field(static=True, default=64)
+    num_rounds: int = eqx.field(static=True, default=3)
+    num_outcomes: int = eqx.field(static=True, default=16)
+
+    @classmethod
+    def of(
+        cls,
+        task: PlantLike,
+        prior: PriorLike | Sequence[PriorLike] | None = None,
+        spread: SpreadLike = 0.3,
+        pool: ArrayLike | None = None,
+    ) -> Myopic:
+        """For a task and what is known of its parameters before.
+
+        Args:
+            task: as for `simulate`.
+            prior, spread: as for `information_gain`.
+            pool: the only designs that are allowed, by row [input units].
+
+        Raises:
+            ValueError: for a plant that is no static task, a sensor without noise, or a pool of
+                another shape or outside the limits.
+        """
+        plant = plant_from(task)
+        _require_static(plant)
+        require_bound(plant)
+        if pool is None:
+            return cls(plants_of(plant, prior, spread))
+        rows, width = np.asarray(pool, float), len(plant.definition.inputs)
+        if rows.ndim != 2 or not len(rows) or rows.shape[1] != width:
+            raise ValueError(f"a pool has a row of {width} for each design: got shape {rows.shape}")
+        lower, upper = (np.asarray(limit) for limit in plant.input_limits)
+        if not np.all((rows >= lower) & (rows <= upper)):
+            raise ValueError(
+                f"the designs of a pool lie from {lower.tolist()} to {upper.tolist()}: got "
+                f"{rows[~np.all((rows >= lower) & (rows <= upper), axis=1)][0].tolist()}"
+            )
+        return cls(plants_of(plant, prior, spread), floats(rows))
+
+    def init(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> Known:
+        """The prior."""
+        _require_static(plant)
+        key, own = jax.random.split(key)
+        d = plant.definition
+        drawn = jax.random.normal(own, (self.num_particles, len(d.parameters)), float)
+        designs = jnp.zeros((num_steps, len(d.inputs)))
+        return Known(drawn, designs, jnp.zeros((num_steps, len(d.outputs))), jnp.asarray(0), key)
+
+    @eqx.filter_jit
+    def __call__(
+        self, state: Known, measurement: Float[Array, " output"]
+    ) -> tuple[Known, Float[Array, " input"]]:
+        """The next design, after the outcome of the last one; the first call has none yet."""
+        learnt = self._learnt(state, measurement)
+        known = jax.tree.map(lambda new, old: jnp.where(state.k > 0, new, old), learnt, state)
+        key, own = jax.random.split(known.key)
+        design = self._best(known, own)
+        designs = known.designs.at[known.k].set(design)
+        return Known(known.particles, designs, known.outcomes, known.k + 1, key), design
+
+    def applied(self, state: Known, input: Float[Array, " input"]) -> Known:
+        """The state after another design than the proposed one."""
+        designs = state.designs.at[state.k - 1].set(input)
+        return Known(state.particles, designs, state.outcomes, state.k, state.key)
+
+    def _outcomes(
+        self, z: Float[Array, "particle param"], design: Float[Array, " input"]
+    ) -> Float[Array, "particle output"]:
+        """The mean outcome of a design for each particle, in standard deviations of its noise."""
+        task = self.prior.plant
+        assert isinstance(task, AbstractStaticTask)
+        means = jax.vmap(lambda own: task.outcome(design, self.prior.params(own)))(z)
+        return means / task.sensor.sd[None]
+
+    def _misfits(
+        self,
+        z: Float[Array, "particle param"],
+        design: Float[Array, " input"],
+        outcome: Float[Array, " output"],
+    ) -> Float[Array, " particle"]:
+        """Squared distance of an outcome from its mean; infinite where there is none."""
+        expected = self._outcomes(z, design)
+        seen = outcome / self.prior.plant.sensor.sd
+        squares = jnp.sum((seen[None] - expected) ** 2, axis=1)
+        return jnp.where(jnp.isfinite(squares), squares, jnp.inf)
+
+    def _learnt(self, state: Known, outcome: Float[Array, " output"]) -> Known:
+        """What is known after the outcome of the last design."""
+        last, z, count = state.k - 1, state.particles, self.num_particles
+        outcomes = state.outcomes.at[last].set(outcome)
+        is_made = jnp.arange(len(outcomes)) <= last
+        key, draw_key, move_key = jax.random.split(state.key, 3)
+
+        def log_probability(z: Array) -> Array:
+            misfits = jax.vmap(lambda *made: self._misfits(z, *made))(state.designs, outcomes)
+            misfit = jnp.sum(jnp.where(is_made[:, None], misfits, 0.0), axis=0)
+            return -0.5 * (misfit + jnp.sum(z**2, axis=1))
+
+        weights = jax.nn.softmax(-0.5 * self._misfits(z, state.designs[last], outcome))
+        steps = (jnp.arange(count) + jax.random.uniform(draw_key)) / count
+        drawn = z[jnp.clip(jnp.searchsorted(jnp.cumsum(weights), steps), 0, count - 1)]
+        fine = _FINE * jnp.std(drawn, axis=0)
+
+        def move(now: tuple[Array, Array], key: PRNGKeyArray) -> tuple[tuple, None]:
+            z, log_p = now
+            pair_key, size_key, jump_key, fine_key, take_key = jax.random.split(key, 5)
+            one, other = jax.random.randint(pair_key, (2, count), 0, count)
+            is_jump = jax.random.bernoulli(jump_key, _JUMP, (count,))
+            part = jnp.where(is_jump, 1.0, jax.random.uniform(size_key, (count,)))
+            moved = z + part[:, None] * (drawn[one] - drawn[other])
+            moved = moved + fine[None] * jax.random.normal(fine_key, z.shape, float)
+            log_moved = log_probability(moved)
+            is_taken = jnp.log(jax.random.uniform(take_key, (count,))) < log_moved - log_p
+            taken = jnp.where(is_taken[:, None], moved, z)
+            return (taken, jnp.where(is_taken, log_moved, log_p)), None
+
+        keys = jax.random.split(move_key, self.num_moves)
+        (z, _), _ = jax.lax.scan(move, (drawn, log_probability(drawn)), keys)
+        return Known(z, state.designs, outcomes, state.k, key)
+
+    def _best(self, known: Known, key: PRNGKeyArray) -> Float[Array, " input"]:
+        """The design whose outcome is expected to tell most, of those tried."""
+        plant = self.prior.plant
+        lower, upper = plant.input_limits
+        any_key, noise_key, pick_key, *near_keys = jax.random.split(key, 3 + self.num_rounds)
+        count, outputs = self.num_outcomes, len(plant.definition.outputs)
+        noise = jax.random.normal(noise_key, (count, outputs), float)
+        # Neighbours have the same ancestor: some of all of them.
+        order = jax.random.permutation(pick_key, self.num_particles)
+        particles = known.particles[order[: 4 * count]]
+
+        def gain(design: Array) -> Array:
+            """Expected, but for a constant."""
+            means = self._outcomes(particles, design)
+            squares = jnp.sum(((means[:count] + noise)[:, None] - means[None]) ** 2, axis=2)
+            found = -jnp.mean(jax.nn.logsumexp(-0.5 * squares, axis=1))
+            return jnp.where(jnp.isfinite(found), found, -jnp.inf)
+
+        def near(designs: Array, key: PRNGKeyArray) -> Array:
+            pick_key, size_key, way_key = jax.random.split(key, 3)
+            shape = (self.num_tried, len(lower))
+            picked = designs[jax.random.randint(pick_key, shape[:1], 0, len(designs))]
+            least = math.log(_SMALLEST)
+            size = jnp.exp(jax.random.uniform(size_key, (shape[0], 1), float, least, 0.0))
+            way = size * jax.random.normal(way_key, shape, float)
+            return jnp.clip(picked + way * (upper - lower)[None] / 2, lower[None], upper[None])
+
+        if self.pool is not None:
+            return self.pool[jnp.argmax(jax.lax.map(gain, self.pool, batch_size=self.num_tried))]
+        shape = (max(self.num_tried, len(known.designs)), len(lower))
+        tried = jax.random.uniform(any_key, shape, float, lower[None], upper[None])
+        is_made = (jnp.arange(len(known.designs)) < known.k)[:, None]
+        places = jnp.where(is_made, known.designs, tried[: len(known.designs)])
+        gains = jax.vmap(gain)(tried)
+        for own in near_keys:
+            more = near(places, own)
+            tried = jnp.concatenate([tried, more])
+            gains = jnp.concatenate([gains, jax.vmap(gain)(more)])
+            places = tried[jax.lax.top_k(gains, _BEST)[1]]
+        return tried[jnp.argmax(gains)]
+
+
+def _require_static(plant: AbstractPlant) -> None:
+    if not isinstance(plant, AbstractStaticTask):
+        raise ValueError(
+            f"myopic designs are for tasks without memory (AbstractStaticTask): plant "
+            f"{plant.definition.name!r} has states; `excite next` chooses its next experiment"
+        )
