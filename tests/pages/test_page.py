@@ -850,6 +850,26 @@ def test_a_storage_that_is_damaged_or_full_stops_nothing(address: str, page: Pag
     expect(status(page)).to_have_text("Stopped.", timeout=WAIT)
 
 
+@pytest.mark.parametrize(
+    "kept",
+    ["x", "3", '{"column": null, "words": 5, "deletions": {}}'],
+    ids=["text", "number", "kinds"],
+)
+def test_a_storage_that_is_damaged_or_full_does_not_stop_the_list_of_runs(
+    kept: str, address: str, page: Page
+):
+    page.goto(f"{address}/static/first.json")  # where no script runs
+    page.add_init_script("Storage.prototype.setItem = () => { throw new Error('full'); }")
+    page.evaluate(
+        "text => ['runs', 'excite-runs'].forEach((name) => sessionStorage.setItem(name, text))",
+        kept,
+    )
+    page.goto(f"{address}/#runs")
+    expect(page.locator("#run-list tbody tr")).to_have_count(3)
+    page.get_by_label("Words of name").fill("study")
+    expect(page.locator("#run-list tbody th")).to_have_text(["a_study"])
+
+
 def test_an_experiment_that_runs_is_followed_again(address: str, page: Page):
     """And what was stopped is shown up to there."""
     ready(page, address)
