@@ -1024,6 +1024,32 @@ def test_a_campaign_is_followed_while_it_runs(address: str, folder: Path, page: 
     require_no_sideways_scroll(page)
 
 
+def test_the_form_of_a_training_comes_back_when_the_page_is_loaded_again(address: str, page: Page):
+    ready(page, address, "training")
+    page.locator("#training-plant").select_option("worst")
+    page.get_by_label("Name in the run folder").fill("cautious")
+    page.get_by_label("Objective").select_option("goals")
+    page.get_by_label("Updates").fill("120")
+    page.locator("#training-seeds").fill("3")
+    before = page.evaluate(FORM, "training")
+    assert (before["training-plant"], before["objective"]) == ("worst", "goals")
+    page.reload()
+    expect(page.locator("#training .primary")).to_be_enabled(timeout=WAIT)
+    expect(page.locator("#training")).to_be_visible()
+    expect(page.locator("#resources")).to_contain_text("11.5 million samples")
+    assert page.evaluate(FORM, "training") == before
+    # The tab is closed, and the address opened again.
+    later = ready(page.context.new_page(), address, "training")
+    page.close()
+    assert later.evaluate(FORM, "training") == before
+    # The server was started again, without this plant.
+    later.evaluate("""sessionStorage.setItem("excite-training",
+      JSON.stringify({ fields: { "training-plant": "my_own" } }))""")
+    later.reload()
+    gone = "the plant my_own is no longer on the server"
+    expect(status(later, "training")).to_have_text(gone, timeout=WAIT)
+
+
 def test_a_training_is_started_and_stopped(address: str, page: Page):
     ready(page, address, "training")
     page.get_by_label("Updates").fill("50000")

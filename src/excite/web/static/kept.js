@@ -26,7 +26,7 @@ export class Kept {
     Object.assign(this, { form, name: `excite-${form.parentElement.id}`, details: form.querySelector("details"), isFilling: false, isRunning: false });
     this.state = recall(this.name, { fields: {}, isOpen: false, shown: null, upload: null, mapped: null });
     ["input", "change", "click"].forEach((kind) => form.addEventListener(kind, () => this.save()));
-    this.details.addEventListener("toggle", () => this.save());
+    this.details?.addEventListener("toggle", () => this.save());
   }
 
   /** Keeps the form as it is now, and more of the state. What a form lacks for now, such as columns, stays; a new tab does not take over what runs. */
@@ -36,7 +36,7 @@ export class Kept {
       if (field.value === field.dataset.usual) delete this.state.fields[field.id];
       else this.state.fields[field.id] = field[content(field)];
     }
-    Object.assign(this.state, { isOpen: this.details.open }, more);
+    Object.assign(this.state, { isOpen: Boolean(this.details?.open) }, more);
     store("sessionStorage", this.name, this.state);
     store("localStorage", this.name, { ...this.state, shown: this.isRunning ? null : this.state.shown });
   }
@@ -45,7 +45,7 @@ export class Kept {
   fill() {
     let gone = "";
     this.isFilling = true;
-    this.details.open = this.state.isOpen;
+    if (this.details) this.details.open = this.state.isOpen;
     for (const [id, before] of Object.entries(this.state.fields)) {
       const field = document.getElementById(id), is = field && content(field);
       if (!field || field[is] === before) continue;
