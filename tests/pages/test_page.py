@@ -781,6 +781,7 @@ def seen(page: Page, part: str) -> tuple[Any, ...]:
 
 
 def test_an_experiment_comes_back_when_the_page_is_loaded_again(address: str, page: Page):
+    beside = [prepared(page.context.new_page(), address)]
     ready(page, address)
     page.locator("#plant").select_option("cart_pole")
     page.locator("#plant").select_option("worst")
@@ -791,6 +792,8 @@ def test_an_experiment_comes_back_when_the_page_is_loaded_again(address: str, pa
         page.locator(f"#{field}").fill(value)
     page.get_by_role("button", name="Draw within").click()
     page.get_by_label("Played in").select_option("0")
+    beside.append(prepared(page.context.new_page(), address))
+    assert beside[1].evaluate(FORM, "experiment") == page.evaluate(FORM, "experiment")
     page.get_by_role("button", name="Run", exact=True).click()
     expect(status(page)).to_have_text("Done.", timeout=WAIT)
     page.locator("#seed").fill("9")  # for the next one
@@ -803,6 +806,12 @@ def test_an_experiment_comes_back_when_the_page_is_loaded_again(address: str, pa
     with page.expect_download() as waiting:
         page.locator("#outcome a[href$='record.csv']").click()
     assert len(waiting.value.path().read_text().splitlines()) == 502
+    # The tabs beside it were open before: each has its own form, and no result.
+    for tab, plant in zip(beside, ("aero2", "worst"), strict=True):
+        prepared(tab, address)
+        expect(tab.locator("#plant")).to_have_value(plant)
+        expect(tab.locator("#seed")).to_have_value("0")
+        tab.close()
     # The tab is closed, and the address opened again.
     later = page.context.new_page()
     page.close()

@@ -5,13 +5,17 @@ const content = (field) => (field.type === "checkbox" ? "checked" : "value");
 
 const kind = (value) => Object.prototype.toString.call(value);
 
-/** What was kept under a name in this tab, or else in the tab that was used last, over `usual`; what this page cannot have written is left out. */
+/**
+ * What was kept under a name in this tab, over `usual`; what this page cannot have written is left out.
+ * A new tab begins with what the tab that was used last has kept, and then has its own.
+ */
 export function recall(name, usual) {
   const state = { ...usual };
   try {
     const before = JSON.parse(sessionStorage.getItem(name) ?? localStorage.getItem(name)) ?? {};
     for (const key of Object.keys(usual)) if (key in before && (usual[key] === null || kind(before[key]) === kind(usual[key]))) state[key] = before[key];
   } catch { /* damaged, or the browser allows none */ }
+  store("sessionStorage", name, state);
   return state;
 }
 
@@ -26,7 +30,7 @@ export class Kept {
     Object.assign(this, { form, name: `excite-${form.parentElement.id}`, details: form.querySelector("details"), isFilling: false, isRunning: false });
     this.state = recall(this.name, { fields: {}, isOpen: false, shown: null, upload: null, mapped: null });
     ["input", "change", "click"].forEach((kind) => form.addEventListener(kind, () => this.save()));
-    this.details?.addEventListener("toggle", () => this.save());
+    this.details?.addEventListener("toggle", () => { if (this.details.open !== this.state.isOpen) this.save(); }); // not when it is filled
   }
 
   /** Keeps the form as it is now, and more of the state. What a form lacks for now, such as columns, stays; a new tab does not take over what runs. */
