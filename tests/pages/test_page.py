@@ -590,9 +590,46 @@ def test_a_plot_is_saved_as_it_is_shown(address: str, page: Page, tmp_path: Path
     words = [text.text for text in drawing.iterfind(".//{*}text")]
     assert words[-2:] == ["high", "passed"]
     assert len(drawing.findall(".//{*}rect[@opacity='0.1']")) == 2
-    assert len(drawing.findall(".//{*}circle")) == 5
+    (dots,) = drawing.iterfind(".//{*}path[@stroke-width='5']")
+    assert dots.attrib["d"].count("h0") == 5
     lines = drawing.findall(".//{*}g/{*}polyline[@stroke-width='1.6']")
     assert [len(line.attrib["points"].split()) for line in lines] == [2, 3, 6, 11]
+
+
+def test_very_many_samples_are_saved_in_a_small_drawing(address: str, page: Page, tmp_path: Path):
+    """With the first, last, smallest and largest of them, as points and as a line."""
+    page.goto(address)
+    ends = page.evaluate("""async () => {
+      const { Plot } = await import("/static/plot.js"), { el } = await import("/static/api.js");
+      const place = el("div", { id: "place" }), x = Array.from({ length: 1e5 }, (_, k) => k);
+      const y = x.map((k) => Math.sin(k * k)), color = "output";
+      Object.assign(y, { 31414: 1.49, 31415: 1.5, 62831: -1.5, 62832: -1.49 });
+      document.querySelector("main").prepend(place);
+      const plot = new Plot(place, "many", "many samples");
+      const lines = [{ x, y, color, points: true }, { x, y, color: "simulated" }];
+      plot.show({ x: [0, 99999], y: [-2, 2], lines });
+      return [0, 31415, 62831, 99999].map((k) => [k / 99999, (y[k] + 2) / 4]);
+    }""")
+    poll(page, PLOT.format("#place .chart", 0) + ".u")
+    with page.expect_download() as waiting:
+        page.locator("#place").get_by_role("button", name="SVG").click()
+    waiting.value.save_as(tmp_path / "many.svg")
+    text = (tmp_path / "many.svg").read_text()
+    assert len(text) < 2_000_000
+    drawing = ElementTree.fromstring(text)
+    *_, width, height = map(float, drawing.attrib["viewBox"].split())
+    (points,) = drawing.iterfind(".//{*}path[@stroke-linecap='round']")
+    (line,) = drawing.iterfind(".//{*}g/{*}polyline[@stroke-width='1.6']")
+    drawn = points.attrib["d"].removeprefix("M").split("h0M"), line.attrib["points"].split()
+    assert all(re.fullmatch(r"[\d.]+[ ,][\d.]+(h0)?", at) for own in drawn for at in own)
+    assert len(drawn[1]) <= 4 * width
+    for own in drawn:
+        found = np.array([re.findall(r"\d+(?:\.\d{1,2})?(?!\d|\.)", at)[:2] for at in own], float)
+        assert len(np.unique(found.round(), axis=0)) > width
+        for x, y in ends:
+            at = 54 + x * (width - 18 - 54), height - 26 - y * (height - 26 - 8)
+            assert np.abs(found - at).max(axis=1).min() < 0.006
+        assert (np.diff(found[:, 0]) >= 0).all()
 
 
 def test_an_experiment_is_paused_and_played_again(address: str, page: Page):
