@@ -92,7 +92,7 @@ function preview() {
 function cell(text) {
   if (!/^-?\d*\.\d+(e[-+]?\d+)?$/i.test(text)) return el("td", {}, text);
   const value = +(+text).toPrecision(Math.max(6, String(Math.trunc(Math.abs(text))).length));
-  return el("td", { title: value !== +text && text }, String(value));
+  return el("td", { title: value !== +text && text }, value && Math.abs(value) < 1e-4 ? value.toExponential() : String(value));
 }
 
 const effects = () => at("effects").replaceChildren(...plant().effects.map((name) => el("label", {}, el("input", { id: `effect-${name}`, type: "checkbox", value: name }), name)));
