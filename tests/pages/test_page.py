@@ -590,9 +590,46 @@ def test_a_plot_is_saved_as_it_is_shown(address: str, page: Page, tmp_path: Path
     words = [text.text for text in drawing.iterfind(".//{*}text")]
     assert words[-2:] == ["high", "passed"]
     assert len(drawing.findall(".//{*}rect[@opacity='0.1']")) == 2
-    assert len(drawing.findall(".//{*}circle")) == 5
+    (dots,) = drawing.iterfind(".//{*}path[@stroke-width='5']")
+    assert dots.attrib["d"].count("h0") == 5
     lines = drawing.findall(".//{*}g/{*}polyline[@stroke-width='1.6']")
     assert [len(line.attrib["points"].split()) for line in lines] == [2, 3, 6, 11]
+
+
+def test_very_many_samples_are_saved_in_a_small_drawing(address: str, page: Page, tmp_path: Path):
+    """With the first, last, smallest and largest of them, as points and as a line."""
+    page.goto(address)
+    ends = page.evaluate("""async () => {
+      const { Plot } = await import("/static/plot.js"), { el } = await import("/static/api.js");
+      const place = el("div", { id: "place" }), x = Array.from({ length: 1e5 }, (_, k) => k);
+      const y = x.map((k) => Math.sin(k * k)), color = "output";
+      Object.assign(y, { 31414: 1.49, 31415: 1.5, 62831: -1.5, 62832: -1.49 });
+      document.querySelector("main").prepend(place);
+      const plot = new Plot(place, "many", "many samples");
+      const lines = [{ x, y, color, points: true }, { x, y, color: "simulated" }];
+      plot.show({ x: [0, 99999], y: [-2, 2], lines });
+      return [0, 31415, 62831, 99999].map((k) => [k / 99999, (y[k] + 2) / 4]);
+    }""")
+    poll(page, PLOT.format("#place .chart", 0) + ".u")
+    with page.expect_download() as waiting:
+        page.locator("#place").get_by_role("button", name="SVG").click()
+    waiting.value.save_as(tmp_path / "many.svg")
+    text = (tmp_path / "many.svg").read_text()
+    assert len(text) < 2_000_000
+    drawing = ElementTree.fromstring(text)
+    *_, width, height = map(float, drawing.attrib["viewBox"].split())
+    (points,) = drawing.iterfind(".//{*}path[@stroke-linecap='round']")
+    (line,) = drawing.iterfind(".//{*}g/{*}polyline[@stroke-width='1.6']")
+    drawn = points.attrib["d"].removeprefix("M").split("h0M"), line.attrib["points"].split()
+    assert all(re.fullmatch(r"[\d.]+[ ,][\d.]+(h0)?", at) for own in drawn for at in own)
+    assert len(drawn[1]) <= 4 * width
+    for own in drawn:
+        found = np.array([re.findall(r"\d+(?:\.\d{1,2})?(?!\d|\.)", at)[:2] for at in own], float)
+        assert len(np.unique(found.round(), axis=0)) > width
+        for x, y in ends:
+            at = 54 + x * (width - 18 - 54), height - 26 - y * (height - 26 - 8)
+            assert np.abs(found - at).max(axis=1).min() < 0.006
+        assert (np.diff(found[:, 0]) >= 0).all()
 
 
 def test_an_experiment_is_paused_and_played_again(address: str, page: Page):
@@ -682,6 +719,21 @@ def test_a_file_is_previewed_and_its_units_are_taken_from_the_names(address: str
     page.get_by_label("prior of Kpu").fill("wide")
     page.get_by_role("button", name="Identify").click()
     expect(status(page, "record")).to_contain_text("prior of 'K_pu' must be", timeout=WAIT)
+
+
+def test_the_preview_of_a_file_has_at_most_six_digits_of_a_fraction(address: str, page: Page):
+    """Of the digits before the point it has all, such as of seconds since 1970."""
+    page.goto(f"{address}/#record")
+    expect(page.locator("#record-plant option").first).to_be_attached(timeout=WAIT)
+    first = b"0.30000000000000004,-1.23456789e-5,1732718858.125,a1.23456789\n"
+    content = b"time,u,y,word\n" + first + b"0.5,7,-2.5,b\n"
+    page.locator("#file").set_input_files({"name": "a.csv", "mimeType": "", "buffer": content})
+    cells = page.locator("#first-rows tbody td")
+    shown = ["0.3", "-1.23457e-5", "1732718858", "a1.23456789", "0.5", "7", "-2.5", "b"]
+    expect(cells).to_have_text(shown, timeout=WAIT)
+    for i, title in enumerate(("0.30000000000000004", "-1.23456789e-05", "1732718858.125")):
+        expect(cells.nth(i)).to_have_attribute("title", title)
+    expect(page.locator("#first-rows [title]")).to_have_count(3)
 
 
 def test_a_file_that_fails_late_says_nothing_about_the_next(address: str, page: Page):
@@ -781,6 +833,7 @@ def seen(page: Page, part: str) -> tuple[Any, ...]:
 
 
 def test_an_experiment_comes_back_when_the_page_is_loaded_again(address: str, page: Page):
+    beside = [prepared(page.context.new_page(), address)]
     ready(page, address)
     page.locator("#plant").select_option("cart_pole")
     page.locator("#plant").select_option("worst")
@@ -791,6 +844,8 @@ def test_an_experiment_comes_back_when_the_page_is_loaded_again(address: str, pa
         page.locator(f"#{field}").fill(value)
     page.get_by_role("button", name="Draw within").click()
     page.get_by_label("Played in").select_option("0")
+    beside.append(prepared(page.context.new_page(), address))
+    assert beside[1].evaluate(FORM, "experiment") == page.evaluate(FORM, "experiment")
     page.get_by_role("button", name="Run", exact=True).click()
     expect(status(page)).to_have_text("Done.", timeout=WAIT)
     page.locator("#seed").fill("9")  # for the next one
@@ -803,6 +858,12 @@ def test_an_experiment_comes_back_when_the_page_is_loaded_again(address: str, pa
     with page.expect_download() as waiting:
         page.locator("#outcome a[href$='record.csv']").click()
     assert len(waiting.value.path().read_text().splitlines()) == 502
+    # The tabs beside it were open before: each has its own form, and no result.
+    for tab, plant in zip(beside, ("aero2", "worst"), strict=True):
+        prepared(tab, address)
+        expect(tab.locator("#plant")).to_have_value(plant)
+        expect(tab.locator("#seed")).to_have_value("0")
+        tab.close()
     # The tab is closed, and the address opened again.
     later = page.context.new_page()
     page.close()
@@ -848,6 +909,26 @@ def test_a_storage_that_is_damaged_or_full_stops_nothing(address: str, page: Pag
     expect(status(page)).to_have_text(re.compile("^Running"), timeout=WAIT)
     page.locator("#experiment .stop").click()
     expect(status(page)).to_have_text("Stopped.", timeout=WAIT)
+
+
+@pytest.mark.parametrize(
+    "kept",
+    ["x", "3", '{"column": null, "words": 5, "deletions": {}}'],
+    ids=["text", "number", "kinds"],
+)
+def test_a_storage_that_is_damaged_or_full_does_not_stop_the_list_of_runs(
+    kept: str, address: str, page: Page
+):
+    page.goto(f"{address}/static/first.json")  # where no script runs
+    page.add_init_script("Storage.prototype.setItem = () => { throw new Error('full'); }")
+    page.evaluate(
+        "text => ['runs', 'excite-runs'].forEach((name) => sessionStorage.setItem(name, text))",
+        kept,
+    )
+    page.goto(f"{address}/#runs")
+    expect(page.locator("#run-list tbody tr")).to_have_count(3)
+    page.get_by_label("Words of name").fill("study")
+    expect(page.locator("#run-list tbody th")).to_have_text(["a_study"])
 
 
 def test_an_experiment_that_runs_is_followed_again(address: str, page: Page):
@@ -1002,6 +1083,32 @@ def test_a_campaign_is_followed_while_it_runs(address: str, folder: Path, page: 
     expect(shown).to_have_count(2, timeout=WAIT)
     expect(page.get_by_role("link", name="Report")).to_be_visible()
     require_no_sideways_scroll(page)
+
+
+def test_the_form_of_a_training_comes_back_when_the_page_is_loaded_again(address: str, page: Page):
+    ready(page, address, "training")
+    page.locator("#training-plant").select_option("worst")
+    page.get_by_label("Name in the run folder").fill("cautious")
+    page.get_by_label("Objective").select_option("goals")
+    page.get_by_label("Updates").fill("120")
+    page.locator("#training-seeds").fill("3")
+    before = page.evaluate(FORM, "training")
+    assert (before["training-plant"], before["objective"]) == ("worst", "goals")
+    page.reload()
+    expect(page.locator("#training .primary")).to_be_enabled(timeout=WAIT)
+    expect(page.locator("#training")).to_be_visible()
+    expect(page.locator("#resources")).to_contain_text("11.5 million samples")
+    assert page.evaluate(FORM, "training") == before
+    # The tab is closed, and the address opened again.
+    later = ready(page.context.new_page(), address, "training")
+    page.close()
+    assert later.evaluate(FORM, "training") == before
+    # The server was started again, without this plant.
+    later.evaluate("""sessionStorage.setItem("excite-training",
+      JSON.stringify({ fields: { "training-plant": "my_own" } }))""")
+    later.reload()
+    gone = "the plant my_own is no longer on the server"
+    expect(status(later, "training")).to_have_text(gone, timeout=WAIT)
 
 
 def test_a_training_is_started_and_stopped(address: str, page: Page):

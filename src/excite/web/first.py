@@ -1,7 +1,8 @@
 """The experiment that the page shows before anything is run: the events of the default one.
 
 `python -m excite.web.first` writes them to `static/first.json`, with five digits a number,
-eight of an estimate, which is shown by its small distance from the true value.
+eight of an estimate, which is shown by its small distance from the true value, and four of
+information and bounds over time, as many as a plot tells.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from ..files import json_ready, write_bytes
 from . import jobs
 
 FILE = Path(__file__).with_name("static") / "first.json"
+DIGITS = {"estimate": 8, "log_det": 4, "bound_percent": 4}
 
 
 def events() -> list[dict[str, Any]]:
@@ -33,7 +35,7 @@ def _shortened(value: Any, digits: int = 5) -> Any:
     """The same with numbers of so many digits."""
     if isinstance(value, dict):
         return {
-            name: _shortened(part, 8 if name == "estimate" else digits)
+            name: _shortened(part, DIGITS.get(name, digits))
             for name, part in value.items()
             if name != "profiles"
         }

@@ -3,21 +3,34 @@
 const fieldsOf = (form) => [...form.elements].filter((field) => field.id && field.matches("select, input:not([type=file])"));
 const content = (field) => (field.type === "checkbox" ? "checked" : "value");
 
-/** What a storage has under a name; null where the browser allows none. */
-function stored(storage, name) {
-  try { return window[storage].getItem(name); } catch { return null; }
+const kind = (value) => Object.prototype.toString.call(value);
+
+/**
+ * What was kept under a name in this tab, over `usual`; what this page cannot have written is left out.
+ * A new tab begins with what the tab that was used last has kept, and then has its own.
+ */
+export function recall(name, usual) {
+  const state = { ...usual };
+  try {
+    const before = JSON.parse(sessionStorage.getItem(name) ?? localStorage.getItem(name)) ?? {};
+    for (const key of Object.keys(usual)) if (key in before && (usual[key] === null || kind(before[key]) === kind(usual[key]))) state[key] = before[key];
+  } catch { /* damaged, or the browser allows none */ }
+  store("sessionStorage", name, state);
+  return state;
+}
+
+/** Keeps a state in one of the browser's storages. */
+export function store(storage, name, state) {
+  try { window[storage].setItem(name, JSON.stringify(state)); } catch { /* there is no room, or the browser allows none */ }
 }
 
 export class Kept {
   /** What was kept for this form in this tab, or else in the tab that was used last. */
   constructor(form) {
     Object.assign(this, { form, name: `excite-${form.parentElement.id}`, details: form.querySelector("details"), isFilling: false, isRunning: false });
-    const before = stored("sessionStorage", this.name) ?? stored("localStorage", this.name);
-    this.state = { fields: {}, isOpen: false, shown: null, upload: null, mapped: null };
-    try { Object.assign(this.state, JSON.parse(before)); } catch { /* not written by this page */ }
-    this.state.fields ??= {};
+    this.state = recall(this.name, { fields: {}, isOpen: false, shown: null, upload: null, mapped: null });
     ["input", "change", "click"].forEach((kind) => form.addEventListener(kind, () => this.save()));
-    this.details.addEventListener("toggle", () => this.save());
+    this.details?.addEventListener("toggle", () => { if (this.details.open !== this.state.isOpen) this.save(); }); // not when it is filled
   }
 
   /** Keeps the form as it is now, and more of the state. What a form lacks for now, such as columns, stays; a new tab does not take over what runs. */
@@ -27,18 +40,16 @@ export class Kept {
       if (field.value === field.dataset.usual) delete this.state.fields[field.id];
       else this.state.fields[field.id] = field[content(field)];
     }
-    Object.assign(this.state, { isOpen: this.details.open }, more);
-    try {
-      sessionStorage.setItem(this.name, JSON.stringify(this.state));
-      localStorage.setItem(this.name, JSON.stringify({ ...this.state, shown: this.isRunning ? null : this.state.shown }));
-    } catch { /* the browser has no room, or allows none */ }
+    Object.assign(this.state, { isOpen: Boolean(this.details?.open) }, more);
+    store("sessionStorage", this.name, this.state);
+    store("localStorage", this.name, { ...this.state, shown: this.isRunning ? null : this.state.shown });
   }
 
   /** Fills the form in its order, as a person does; returns a sentence where its plant is not there. */
   fill() {
     let gone = "";
     this.isFilling = true;
-    this.details.open = this.state.isOpen;
+    if (this.details) this.details.open = this.state.isOpen;
     for (const [id, before] of Object.entries(this.state.fields)) {
       const field = document.getElementById(id), is = field && content(field);
       if (!field || field[is] === before) continue;

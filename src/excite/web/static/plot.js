@@ -121,6 +121,22 @@ const pathsOf = ({ points, step, width }) => (u, series, first, last) => {
   return points ? scattered(u, series, first, last) : { ...(step ? held : joined)(u, series, first, last), fill: null };
 };
 
+/** Of the samples [x, y] in a column of pixels the first, lowest, highest and last; of points one a pixel, too. */
+function thinned(samples, arePoints) {
+  const columns = new Map();
+  for (const sample of samples) {
+    const column = Math.round(sample[0]);
+    if (columns.has(column)) columns.get(column).push(sample);
+    else columns.set(column, [sample]);
+  }
+  return [...columns.values()].flatMap((column) => {
+    if (column.length <= 4) return column;
+    const rising = [...column].sort(([, a], [, b]) => a - b), enough = new Set([column[0], rising[0], rising.at(-1), column.at(-1)]);
+    if (arePoints) new Map(rising.map((sample) => [Math.round(sample[1]), sample])).forEach((sample) => enough.add(sample));
+    return column.filter((sample) => enough.has(sample));
+  });
+}
+
 /** What the plots of one view share: the cross-hair, and the part of the axis that is shown. */
 class Group {
   constructor() {
@@ -428,17 +444,18 @@ export class Plot {
         + (word && Math.abs(end - at) > 14 ? text(right - 4, at + (y > 0 ? -3 : 13), "end", word, color) : "");
     };
     const drawn = ({ x, y, color, step, dash, points, dots, width: thick }) => {
-      const paths = [[]], circles = []; // a path ends at a gap
+      const paths = [[]], samples = []; // a path ends at a gap
       x.forEach((v, i) => {
         if ((x[i + 1] ?? v) < x0 || (x[i - 1] ?? v) > x1) return;
         if (!isNumber(y[i])) { paths.push([]); return; }
         const path = paths.at(-1), at = [X(v), Y(y[i])];
         if (step && path.length) path.push([at[0], path.at(-1)[1]]);
         path.push(at);
-        if (dots || points) circles.push(`<circle cx="${at[0]}" cy="${at[1]}" r="${points ? 1.75 : 2.5}" fill="${colour(color)}"/>`);
+        samples.push(at);
       });
       const how = `stroke-width="${thick ?? 1.6}"${dash ? ` stroke-dasharray="${dash.join(" ")}"` : ""}`;
-      return [...(points ? [] : paths.filter((path) => path.length > 1).map((path) => line(path, color, how))), ...circles].join("");
+      const spots = () => `<path d="${thinned(samples, true).map(([cx, cy]) => `M${cx} ${cy}h0`).join("")}" fill="none" stroke="${colour(color)}" stroke-width="${points ? DOT : 5}" stroke-linecap="round"/>`;
+      return [...(points ? [] : paths.filter((path) => path.length > 1).map((path) => line(thinned(path), color, how))), points || dots ? spots() : ""].join("");
     };
     const mark = ({ x, color, word }) => {
       const at = X(x), [anchor, by] = at > (left + right) / 2 ? ["end", -4] : ["start", 4];

@@ -77,7 +77,7 @@ function preview() {
   at("preview").querySelector("h2").textContent = `The file: ${file.file}`;
   at("first-rows").replaceChildren(
     el("thead", {}, el("tr", {}, ...names.map((name) => el("th", { scope: "col" }, name)))),
-    el("tbody", {}, ...Array.from({ length: rows }, (_, k) => el("tr", {}, ...names.map((name) => el("td", {}, file.previews[name].first[k] ?? ""))))));
+    el("tbody", {}, ...Array.from({ length: rows }, (_, k) => el("tr", {}, ...names.map((name) => cell(file.previews[name].first[k] ?? ""))))));
   empty(at("columns"));
   for (const name of names) {
     const { index: x, values: y } = file.previews[name];
@@ -86,6 +86,13 @@ function preview() {
     plot.note.textContent = file.previews[name].note;
     plot.show({ x: [0, x.at(-1)], y: range(y, y[0] ?? 0), unit: "row", lines: [{ x, y, color: "output" }] });
   }
+}
+
+/** A cell of the file: a number with a fraction has six digits, or all before the point; its title is the whole of it. */
+function cell(text) {
+  if (!/^-?\d*\.\d+(e[-+]?\d+)?$/i.test(text)) return el("td", {}, text);
+  const value = +(+text).toPrecision(Math.max(6, String(Math.trunc(Math.abs(text))).length));
+  return el("td", { title: value !== +text && text }, value && Math.abs(value) < 1e-4 ? value.toExponential() : String(value));
 }
 
 const effects = () => at("effects").replaceChildren(...plant().effects.map((name) => el("label", {}, el("input", { id: `effect-${name}`, type: "checkbox", value: name }), name)));

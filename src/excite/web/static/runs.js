@@ -2,6 +2,7 @@
 
 import { el, get, post, remove, say } from "./api.js";
 import { compare } from "./compared.js";
+import { recall, store } from "./kept.js";
 import { show } from "./run.js";
 import { clear } from "./view.js";
 
@@ -10,7 +11,7 @@ const filter = document.getElementById("run-filter"), body = table.querySelector
 const date = ({ changed }) => changed && new Date(changed).toLocaleString("sv").slice(0, 16); // 2026-11-27 08:15
 const COLUMNS = { run: ({ name }) => name, date, plant: ({ plant }) => plant, kind: ({ kind }) => kind, "key figures": figures };
 /** What stays in this tab of the browser, also after the page is loaded again. */
-const state = { column: "date", isDescending: true, words: "", deletions: [], ...JSON.parse(sessionStorage.getItem("runs")) };
+const state = recall("excite-runs", { column: "date", isDescending: true, words: "", deletions: [] });
 const beside = document.getElementById("run-compare"), drop = document.getElementById("run-delete"), undo = document.getElementById("run-undo");
 const everyBox = el("input", { type: "checkbox", change: () => {
   boxes().forEach((box) => { box.checked = everyBox.checked; });
@@ -65,7 +66,7 @@ export async function open(place) {
 
 /** Shows the runs in which each word of the filter occurs, in the chosen order. */
 function list() {
-  sessionStorage.setItem("runs", JSON.stringify(state));
+  store("sessionStorage", "excite-runs", state);
   const words = state.words.toLowerCase().split(/\s+/).filter(Boolean), sign = state.isDescending ? -1 : 1;
   const text = (run) => [run.title, ...Object.values(COLUMNS).map((cell) => cell(run))].join(" ").toLowerCase();
   const order = (a, b) => a.localeCompare(b, "en", { numeric: true }), key = COLUMNS[state.column] ?? date;

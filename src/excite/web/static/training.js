@@ -2,6 +2,7 @@
 
 import { el, get, options, post, remove, say } from "./api.js";
 import { curves } from "./curves.js";
+import { Kept } from "./kept.js";
 import { shown } from "./plot.js";
 
 const section = document.getElementById("training"), form = section.querySelector("form");
@@ -13,6 +14,8 @@ export function begin(catalogue) {
   form.querySelector(".primary").disabled = false;
   form.addEventListener("input", tellResources);
   form.addEventListener("submit", (event) => { event.preventDefault(); start(); });
+  const gone = new Kept(form).fill();
+  if (gone) say(form, gone, true);
 }
 
 async function start() {
