@@ -1,8 +1,9 @@
-"""Finding two sources by the intensity that they cause where it is measured.
+"""Finding sources by the intensity that they cause where it is measured.
 
-A benchmark of adaptive experiment design: A. Foster et al., Deep adaptive design, ICML 2021;
-T. Blau et al., Optimizing sequential experimental design with deep reinforcement learning, ICML
-2022, whose box of designs this is. Their figures are for 30 measurements.
+Benchmarks of adaptive experiment design with 30 measurements. Two sources: A. Foster et al., Deep
+adaptive design, ICML 2021; T. Blau et al., Optimizing sequential experimental design with deep
+reinforcement learning, ICML 2022, whose box of designs this is. One source, uniform in the unit
+square as are the designs: D. Huang et al., ALINE, NeurIPS 2025.
 """
 
 import jax.numpy as jnp
@@ -11,6 +12,11 @@ from excite.description import Input, Output, Parameter
 from excite.plant import AbstractStaticTask, static_description
 
 BACKGROUND, NEAREST = 0.1, 1e-4
+
+
+def intensity(design, x, y):
+    """That a source causes at a design."""
+    return 1 / (NEAREST + (design[0] - x) ** 2 + (design[1] - y) ** 2)
 
 
 class TwoSources(AbstractStaticTask):
@@ -27,8 +33,22 @@ class TwoSources(AbstractStaticTask):
     )
 
     def outcome(self, design, params):
-        x, y = design
-        first = (params.x_1 - x) ** 2 + (params.y_1 - y) ** 2
-        second = (params.x_2 - x) ** 2 + (params.y_2 - y) ** 2
-        intensity = BACKGROUND + 1 / (NEAREST + first) + 1 / (NEAREST + second)
-        return jnp.log(intensity)[None]
+        first = intensity(design, params.x_1, params.y_1)
+        second = intensity(design, params.x_2, params.y_2)
+        return jnp.log(BACKGROUND + first + second)[None]
+
+
+class OneSource(AbstractStaticTask):
+    """One source, anywhere in the unit square."""
+
+    definition = static_description(
+        "one_source",
+        designs=(Input("x", "", 0.0, 1.0), Input("y", "", 0.0, 1.0)),
+        outcomes=(Output("log_intensity", "", scale=2.0, noise_sd=0.5),),
+        parameters=tuple(
+            Parameter(name, "", 0.5, scale=1.0, positive=False) for name in ("x_1", "y_1")
+        ),
+    )
+
+    def outcome(self, design, params):
+        return jnp.log(BACKGROUND + intensity(design, params.x_1, params.y_1))[None]

@@ -62,7 +62,7 @@ def played(chosen: Myopic, outcomes, count: int = 6):
 
 
 def test_what_is_known_of_a_linear_task_is_its_normal_posterior():
-    chosen = dataclasses.replace(Myopic.of(Line, PRIOR), num_particles=4000)
+    chosen = dataclasses.replace(Myopic.of(Line, PRIOR), num_particles=4000, num_tried=16)
     state, designs = played(chosen, OUTCOMES)
     X = np.column_stack([np.ones(len(OUTCOMES)), designs[:-1, 0]]) / SD
     covariance = np.linalg.inv(X.T @ X + np.eye(2))
@@ -105,11 +105,15 @@ def test_another_design_than_the_proposed_one_is_learnt_from():
     assert abs(slope) < 0.1
 
 
+@pytest.mark.slow
 def test_it_tells_more_than_designs_at_random():
     prior = {"at": "normal:0:1"}
+    few = {"num_particles": 200, "num_moves": 2, "num_tried": 32, "num_rounds": 1}
     found = {
-        name: ex.information_gain(Beacon, name, options=options, steps=5, prior=prior, plants=64)
-        for name, options in (("myopic", {}), ("random", {"hold": 1}))
+        name: ex.information_gain(
+            Beacon, name, options=options, steps=4, prior=prior, plants=48, samples=100
+        )
+        for name, options in (("myopic", few), ("random", {"hold": 1}))
     }
     best, random = found["myopic"], found["random"]
     assert best.excitation == "Myopic"

@@ -3,15 +3,15 @@
     python results/oed/compute.py [--seeds N] [--published FOLDER] [TASK ...]
 
 Trains one policy for each task, price of the squared input changes and seed, and evaluates it, the
-published policies (archives in FOLDER), a designed signal and simple inputs on other plants. Rows
-that are in a task's table already are not computed again.
+published policies (archives in FOLDER), a designed signal, designs chosen one after the other and
+simple inputs on other plants. Rows that are in a task's table already are not computed again.
 """
 
 import argparse
 import json
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -34,9 +34,6 @@ HERE = Path(__file__).parent
 EXAMPLES = HERE.parent.parent / "examples"
 NEAR_THE_POSTERIOR = {"plants": 2048, "samples": 100, "seed": 1}
 FROM_THE_PRIOR = {"plants": 256, "samples": 100_000, "from_prior": True, "seed": 1}
-# Of experiments that tell far more than a network's: a seed is one of designs, plants and noise.
-MYOPIC = {"plants": 667, "samples": 1_000_000, "from_prior": True}
-NEAR_MYOPIC = {"plants": 667, "samples": 1000}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,11 +52,14 @@ class Task:
         chains: trainings side by side of a seed; for each price the best on validation is kept.
         evaluation: of every row.
         also: another evaluation of every row, near the posterior.
+        myopic, near_myopic: the evaluations of designs chosen one after the other, for each seed;
+            none for a plant with states.
+        pool: number of designs, drawn at random, that are allowed to these; 0 for all.
     """
 
     plant: str
     prior: Mapping[str, str]
-    trainings: Mapping[float, GradientSettings]
+    trainings: Mapping[float, GradientSettings] = field(default_factory=dict)
     archive: str = ""
     steps: int = 50
     memory: int = 0
@@ -67,6 +67,9 @@ class Task:
     chains: int = 1
     evaluation: Mapping[str, object]
     also: Mapping[str, object] | None = None
+    myopic: Mapping[str, object] | None = None
+    near_myopic: Mapping[str, object] | None = None
+    pool: int = 0
 
     @property
     def word(self):
@@ -138,6 +141,19 @@ TASKS = {
         seeds=3,
         evaluation=FROM_THE_PRIOR,
         also={"plants": 256, "samples": 5000, "seed": 1},
+        myopic={"plants": 667, "samples": 1_000_000, "from_prior": True},
+        near_myopic={"plants": 667, "samples": 1000},
+    ),
+    "one source": Task(
+        plant="location_finding.py:OneSource",
+        prior={"x_1": "uniform:0:1", "y_1": "uniform:0:1"},
+        steps=30,
+        seeds=1,
+        evaluation=FROM_THE_PRIOR,
+        also={"plants": 256, "samples": 5000, "seed": 1},
+        myopic={"plants": 256, "samples": 1_000_000, "from_prior": True},
+        near_myopic={"plants": 256, "samples": 1000},
+        pool=2000,
     ),
 }  # fmt: skip
 
@@ -159,7 +175,8 @@ def row(task, method, excitation, evaluation=None, also=None, **about):
     gain = partial(ex.information_gain, own.word, excitation, steps=own.steps, prior=own.prior)
     found = gain(**evaluation)
     content = {"task": task, "method": method, **about, **found.to_dict()}
-    content["gain_less_changes"] = found.lower.value - max(own.trainings) * found.changes.value
+    price = max(own.trainings, default=0.0)
+    content["gain_less_changes"] = found.lower.value - price * found.changes.value
     if also is not None:
         near = gain(**also).to_dict()
         kept = ("lower", "upper", "num_samples", "few_effective_samples")
@@ -198,11 +215,13 @@ def trained_rows(task, seed):
 
 
 def myopic_row(task, seed):
-    """Of designs chosen one after the other, without a training."""
-    start = time.process_time()
-    own = {"evaluation": {**MYOPIC, "seed": seed}, "also": {**NEAR_MYOPIC, "seed": seed}}
-    made = row(task, "myopic", "myopic", **own, seed=seed)
-    return made | {"evaluation_cpu_seconds": time.process_time() - start}
+    """Of designs chosen one after the other; the seed is that of plants, noise and designs."""
+    own, start = TASKS[task], time.process_time()
+    pool = np.random.default_rng(seed).uniform(size=(own.pool, 2)) if own.pool else None
+    chosen = ex.Myopic.of(own.word, own.prior, pool=pool)
+    asked = [{**evaluation, "seed": seed} for evaluation in (own.myopic, own.near_myopic)]
+    made = row(task, "myopic", chosen, *asked, seed=seed)
+    return made | {"cpu_seconds": time.process_time() - start}
 
 
 def open_loop_row(task):
@@ -267,10 +286,10 @@ def main():
             module = module_at(EXAMPLES / "smc_policies.py")
             keep_input("published", module.RecurrentPolicy.read(asked.published / own.archive))
         seeds = range(own.seeds if asked.seeds is None else asked.seeds)
-        if own.memory:
+        if own.myopic is not None:
             for seed in seeds:
                 keep("myopic", lambda task=task, seed=seed: [myopic_row(task, seed)], seed)
-        for seed in seeds:
+        for seed in seeds if own.trainings else ():
             keep("gradient", partial(trained_rows, task, seed), seed)
         print("\n".join(lines(task)))
 

@@ -67,7 +67,8 @@ def gain(
     """What an experiment on PLANT is expected to tell of its parameters, in nats.
 
     For an excitation, a policy, or the recorded or designed input in INPUT_FILE. The bounds are
-    means over plants drawn from the prior.
+    means over plants drawn from the prior. For a task without memory, the excitation "myopic"
+    chooses each design where its outcome is expected to tell most.
     """
     from ..estimation.information_gain import information_gain
 

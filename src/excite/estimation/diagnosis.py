@@ -291,21 +291,21 @@ class Autoregression:
 
         By the recursion of N. Levinson and J. Durbin; `autocovariance` begins with lag zero.
         """
-        found = cls(np.zeros(0), float(autocovariance[0]), count)
-        best, least = found, math.inf
+        a, variance = np.zeros(0), float(autocovariance[0])
+        best, least = (a, variance), math.inf
         for order in range(len(autocovariance)):
             if order:
-                known, a = autocovariance[order - 1 : 0 : -1], found.coefficients
-                partial = (autocovariance[order] - a @ known) / found.variance
+                known = autocovariance[order - 1 : 0 : -1]
+                partial = (autocovariance[order] - a @ known) / variance
                 if not abs(partial) < 1:  # these are the autocovariances of no process
                     break
                 partial = float(np.clip(partial, -_STATIONARY, _STATIONARY))
                 a = np.append(a - partial * a[::-1], partial)
-                found = cls(a, found.variance * (1 - partial**2), count)
-            criterion = count * math.log(max(found.variance, 1e-300)) + order * math.log(count)
+                variance = variance * (1 - partial**2)
+            criterion = count * math.log(max(variance, 1e-300)) + order * math.log(count)
             if criterion < least:
-                best, least = found, criterion
-        return best
+                best, least = (a, variance), criterion
+        return cls(*best, count)
 
     def transfer(self, length: int) -> Complex[np.ndarray, " frequency"]:
         """1 / A(w) at the frequencies of a real Fourier transform of `length` values."""

@@ -27,6 +27,7 @@ from ..information import require_bound
 from ..plant import AbstractPlant, floats
 from ..plant.catalogue import PlantLike, plant_from
 from ..plant.static import AbstractStaticTask
+from ..simulation import response
 from .prior import PriorPlants
 from .prior_knowledge import PriorLike, plants_of
 
@@ -162,10 +163,9 @@ class Myopic(AbstractExcitation):
         self, z: Float[Array, "particle param"], design: Float[Array, " input"]
     ) -> Float[Array, "particle output"]:
         """The mean outcome of a design for each particle, in standard deviations of its noise."""
-        task = self.prior.plant
-        assert isinstance(task, AbstractStaticTask)
-        means = jax.vmap(lambda own: task.outcome(design, self.prior.params(own)))(z)
-        return means / task.sensor.sd[None]
+        plant, designs = self.prior.plant, design[None]
+        means = jax.vmap(lambda own: response(plant, self.prior.params(own), designs)[1])(z)
+        return means / plant.sensor.sd[None]
 
     def _misfits(
         self,
