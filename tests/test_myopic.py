@@ -6,13 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from commands import excite
 
 import excite as ex
 from excite.estimation.information_gain import gains
 from excite.estimation.myopic import Myopic
 from excite.excitation import Random
 from excite.plant import AbstractStaticTask, static_description
-from excite.plant.catalogue import plant_named
 
 SD = 0.5
 
@@ -149,8 +149,28 @@ def test_a_plant_with_states_is_refused():
         Myopic.of("aero2")
     with pytest.raises(ValueError, match="tasks without memory"):
         ex.information_gain("aero2", "myopic")
-    with pytest.raises(ValueError, match="tasks without memory"):
-        Myopic.of(Line, PRIOR).init(plant_named("aero2"), 5, jax.random.key(0))
+    assert excite("gain", "aero2", "--excitation", "myopic").returncode == 2
+
+
+def test_another_task_is_refused():
+    with pytest.raises(ValueError, match="for the task 'line': got 'beacon'"):
+        ex.information_gain(Beacon, Myopic.of(Line, PRIOR), steps=2)
+
+
+@pytest.mark.parametrize(
+    ("option", "allowed"),
+    [
+        ({"num_outcomes": 0}, "num_outcomes must be a whole number from 1 "),
+        ({"num_particles": 63}, "num_particles must be a whole number from 64 "),
+        ({"num_tried": 7}, "num_tried must be a whole number from 8 "),
+        ({"num_rounds": -1}, "num_rounds must be a whole number from 0 "),
+        ({"num_moves": 1.5}, "num_moves"),
+        ({"moves": 5}, "moves"),
+    ],
+)
+def test_an_option_that_is_not_allowed_is_refused(option, allowed):
+    with pytest.raises(ValueError, match=allowed):
+        ex.information_gain(Line, "myopic", options=option, prior=PRIOR)
 
 
 def test_a_task_without_noise_is_refused():

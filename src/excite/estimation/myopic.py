@@ -21,7 +21,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from ..description import SpreadLike
+from ..description import SpreadLike, require_whole
 from ..excitation import AbstractExcitation
 from ..information import require_bound
 from ..plant import AbstractPlant, floats
@@ -98,6 +98,14 @@ class Myopic(AbstractExcitation):
     num_rounds: int = eqx.field(static=True, default=3)
     num_outcomes: int = eqx.field(static=True, default=16)
 
+    def __check_init__(self) -> None:
+        """Raises ValueError for numbers that are too small."""
+        require_whole("num_outcomes", self.num_outcomes, 1)
+        require_whole("num_particles", self.num_particles, 4 * self.num_outcomes)
+        require_whole("num_moves", self.num_moves, 0)
+        require_whole("num_tried", self.num_tried, _BEST)
+        require_whole("num_rounds", self.num_rounds, 0)
+
     @classmethod
     def of(
         cls,
@@ -134,11 +142,12 @@ class Myopic(AbstractExcitation):
         return cls(plants_of(plant, prior, spread), floats(rows))
 
     def init(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> Known:
-        """The prior."""
-        _require_static(plant)
-        key, own = jax.random.split(key)
-        d = plant.definition
-        drawn = jax.random.normal(own, (self.num_particles, len(d.parameters)), float)
+        """The prior; for at most `num_steps` designs. ValueError for another task."""
+        d, own = plant.definition, self.prior.plant.definition
+        if d.name != own.name:
+            raise ValueError(f"these designs are for the task {own.name!r}: got {d.name!r}")
+        key, draw_key = jax.random.split(key)
+        drawn = jax.random.normal(draw_key, (self.num_particles, len(d.parameters)), float)
         designs = jnp.zeros((num_steps, len(d.inputs)))
         return Known(drawn, designs, jnp.zeros((num_steps, len(d.outputs))), jnp.asarray(0), key)
 
