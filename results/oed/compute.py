@@ -244,7 +244,7 @@ def lines(task):
         gains = [r["lower"]["nats"] for r in own]
         less = [r["gain_less_changes"] for r in own]
         changes = np.mean([r["input_changes"]["value"] for r in own])
-        cells = [task, method[0] if len(own) == 1 else f"gradient, price {method[1]:g}"]
+        cells = [task, method[0] + ("" if method[1] is None else f", price {method[1]:g}")]
         if len(own) == 1:
             cells += [f"{gains[0]:.2f} ± {own[0]['lower']['std_error']:.2f}", f"{changes:.1f}"]
             cells += [f"{less[0]:.2f}"]
