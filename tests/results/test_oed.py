@@ -108,7 +108,7 @@ def test_what_finds_sources_tells_again_what_its_row_says(method):
     row = [r for r in COMPUTED.rows_of(task) if r["method"] == method][-1]
     policy = COMPUTED.policy_path(task, 0.0, row["seed"]) if method == "gradient" else method
     found = ex.information_gain(
-        own.word, policy, steps=own.steps, prior=own.prior, plants=192, samples=10, from_prior=True,
+        own.word, policy, steps=own.steps, prior=own.prior, plants=64, samples=10, from_prior=True,
         seed=7,
     )  # fmt: skip
     error = math.hypot(found.laplace.std_error, row["laplace"]["std_error"])
