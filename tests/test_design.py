@@ -114,11 +114,11 @@ def test_the_best_input_of_an_amplifier_is_its_limit():
 @pytest.mark.science
 @pytest.mark.parametrize("name", [*sorted(EXCITATIONS), LOOP + "square"])
 def test_tuning_finds_options_that_are_allowed_and_the_same_again(name):
-    env = signal_env(Limited(), STEPS, 0.3)
-    tuned = tuned_signal(env, name, trials=3)
-    assert tuned.trials == 3
+    env = signal_env(Aero2(), STEPS, 0.3)
+    tuned = tuned_signal(env, name, trials=4)
+    assert tuned.trials == 4
     assert np.isfinite(tuned.value)
-    again = tuned_signal(env, name, trials=3)
+    again = tuned_signal(env, name, trials=4)
     assert dict(again.options) == dict(tuned.options)
 
 
