@@ -142,7 +142,8 @@ class Myopic(AbstractExcitation):
 
         Args:
             task: as for `simulate`.
-            prior, spread: as for `information_gain`.
+            prior: as for `information_gain`.
+            spread: as for `information_gain`.
             pool: the only designs that are allowed, by row [input units].
 
         Raises:
