@@ -25,7 +25,7 @@ from .excitation.catalogue import ExcitationLike, excitation_and_origin, name_of
 from .files import json_ready
 from .plant import AbstractPlant, Params, params_from
 from .plant.catalogue import PlantLike, plant_from, with_sensor
-from .plant.static import AbstractStaticTask
+from .plant.static import AbstractStaticTask, has_own_noise, require_sensor_noise
 from .record import Record
 
 _State = TypeVar("_State")
@@ -224,6 +224,7 @@ def predicted(
 
 def require_likelihood(plant: AbstractPlant) -> bool:
     """Whether the state is observed; ValueError for process noise where it is not."""
+    require_sensor_noise(plant)
     d = plant.definition
     if d.is_disturbed and not d.observes_state:
         raise ValueError(
@@ -298,7 +299,7 @@ def run_episode(
     def advance(carry: tuple, now: tuple) -> tuple[tuple, tuple]:
         (state, past, memory), (noise, k) = carry, now
         output, shown = plant.true_and_shown(state, params)
-        measured = sensed(plant, shown, noise)
+        measured = _measured(plant, state, params, shown, noise)
         memory, input = excitation(memory, measured)
         input = jnp.clip(input, lower, upper)
         state, past = moved(state, past, input, k)
@@ -313,9 +314,26 @@ def run_episode(
     return Trajectory(
         time=jnp.arange(num_steps + 1) * plant.dt,
         inputs=inputs,
-        measured=jnp.concatenate([measured, sensed(plant, shown, noise[-1])[None]]),
+        measured=jnp.concatenate(
+            [measured, _measured(plant, state, params, shown, noise[-1])[None]]
+        ),
         outputs=jnp.concatenate([outputs, last[None]]),
     )
+
+
+def _measured(
+    plant: AbstractPlant,
+    state: Float[Array, " state"],
+    params: Params,
+    shown: Float[Array, " output"],
+    noise: Float[Array, " output"],
+) -> Float[Array, " output"]:
+    """What is measured in a state, of a static task by its own noise."""
+    if isinstance(plant, AbstractStaticTask) and has_own_noise(plant):
+        *design, is_made = state
+        measured = plant.measured(jnp.stack(design), params, noise)
+        return jnp.where(is_made > 0.5, measured, 0.0)
+    return sensed(plant, shown, noise)
 
 
 @eqx.filter_jit

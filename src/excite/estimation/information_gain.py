@@ -17,7 +17,7 @@ stochastic gradient approach to designing Bayesian-optimal experiments, 2020).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -33,17 +33,20 @@ from ..excitation import AbstractExcitation
 from ..excitation.catalogue import ExcitationLike
 from ..information import require_bound
 from ..plant.catalogue import PlantLike, plant_from, with_sensor
+from ..plant.static import AbstractStaticTask, has_own_noise
 from ..progress import SHOWN, Progress
 from ..report.tables import html_table, text_table
 from ..safety import safe_input
-from ..simulation import Experiment, predicted, run_episode
+from ..simulation import Experiment, Trajectory, predicted, run_episode
 from .evidence import Fit, nearest
-from .myopic import MYOPIC, Myopic
+from .myopic import MYOPIC, Myopic, posterior_particles
 from .prior import PriorPlants
 from .prior_knowledge import PriorLike, plants_of
 
 _STEPS, _STARTS, _SIDE_BY_SIDE = 30, 16, 8  # of the searches for probable parameters
 _WIDE, _SHARES = 2.0, (0.5, 0.375, 0.125)  # of the proposal: normal, a wider one, the prior
+_PARTICLES, _MOVES = 1000, 5  # of the posterior of a task with its own noise
+_ENDS, _PART = 200, 0.5  # of these in the proposal, and the deviation of each, in that of all
 _CHUNK = 16  # records at a time
 _BLOCK = 1000  # samples at a time
 _NEAR_CAP = 1.0  # nats below the largest value of a lower bound, at which it says little
@@ -70,6 +73,65 @@ class Gains(eqx.Module):
     controls: Float[Array, "*record control"]
 
 
+class _Near(eqx.Module):
+    """Normal distributions near a posterior, in coordinates in which the prior is standard normal.
+
+    Attributes:
+        ends: their centres.
+        information: inverses of their covariances.
+        log_dets: logarithms of the determinants of these.
+        modes: logarithm of the share of each.
+        laplace: see `Gains`.
+    """
+
+    ends: Float[Array, "end param"]
+    information: Float[Array, "end param param"]
+    log_dets: Float[Array, " end"]
+    modes: Float[Array, " end"]
+    laplace: Float[Array, ""]
+
+
+def _divergence(center: Array, covariance: Array, log_det: Array) -> Array:
+    """Of a normal distribution from the prior; `log_det` is that of its information."""
+    return 0.5 * (jnp.trace(covariance) + center @ center - len(center) + log_det)
+
+
+def _near_modes(
+    residual: Callable[[Float[Array, " param"]], Float[Array, " value"]],
+    log_likelihood: Callable[[Float[Array, " param"]], Float[Array, ""]],
+    drawn: Float[Array, "draw param"],
+) -> _Near:
+    """At the most probable parameters, from several starts: the likeliest of the prior."""
+    count = drawn.shape[1]
+    unknown = Fit(jnp.zeros(count), jnp.eye(count), jnp.zeros(()), jnp.zeros(()))
+    likely = jax.lax.top_k(jax.lax.map(log_likelihood, drawn, batch_size=64), _STARTS - 1)[1]
+    starts = jnp.concatenate([unknown.z[None], drawn[likely]])
+    search = partial(nearest, residual, unknown, num_steps=_STEPS)
+    ends, costs = jax.lax.map(search, starts, batch_size=_SIDE_BY_SIDE)
+    best = jnp.argmin(costs)
+    S = jax.vmap(jax.jacfwd(residual))(ends)
+    information = jnp.einsum("eoi,eoj->eij", S, S) + unknown.information[None]
+    log_dets = jnp.linalg.slogdet(information)[1]
+    laplace = _divergence(ends[best], jnp.linalg.inv(information[best]), log_dets[best])
+    # Flatter than the posterior's shares: a small mode costs few samples, a missed one the sum.
+    modes = jax.nn.log_softmax(-0.25 * (costs + log_dets))
+    return _Near(ends, information, log_dets, modes, laplace)
+
+
+def _near_particles(prior: PriorPlants, run: Trajectory, key: PRNGKeyArray) -> _Near:
+    """At particles of the posterior of a static task, each with a part of their covariance."""
+    z = posterior_particles(prior, run.inputs, run.measured[1:], _PARTICLES, _MOVES, key)
+    covariance = jnp.cov(z.T).reshape(2 * z.shape[1:])
+    information = jnp.linalg.inv(covariance)
+    log_det = jnp.linalg.slogdet(information)[1]
+    laplace = _divergence(jnp.mean(z, axis=0), covariance, log_det)
+    ends = z[:: _PARTICLES // _ENDS]
+    shape = (len(ends),)
+    own = jnp.broadcast_to(information / _PART**2, shape + information.shape)
+    log_dets = jnp.full(shape, log_det - 2 * z.shape[1] * math.log(_PART))
+    return _Near(ends, own, log_dets, jnp.full(shape, -math.log(len(ends))), laplace)
+
+
 @eqx.filter_jit
 def gains(
     prior: PriorPlants,
@@ -91,7 +153,6 @@ def gains(
     """
     plant = prior.plant
     count = len(plant.nominal)
-    unknown = Fit(jnp.zeros(count), jnp.eye(count), jnp.zeros(()), jnp.zeros(()))
     size = min(num_samples, _BLOCK)
 
     def of(key: PRNGKeyArray) -> Gains:
@@ -104,24 +165,20 @@ def gains(
             return ((run.measured - outputs) / sd[None]).ravel()
 
         def log_likelihood(z: Array) -> Array:
-            found = -0.5 * jnp.sum(residual(z) ** 2)
+            if isinstance(plant, AbstractStaticTask):
+                own = partial(plant.log_likelihood, params=prior.params(z))
+                found = jnp.sum(jax.vmap(own)(run.measured[1:], run.inputs))
+            else:
+                found = -0.5 * jnp.sum(residual(z) ** 2)
             return jnp.where(jnp.isfinite(found), found, -jnp.inf)
 
-        drawn = jax.random.normal(start_key, (max(size, _STARTS), count), float)
-        likely = jax.lax.top_k(jax.lax.map(log_likelihood, drawn, batch_size=64), _STARTS - 1)[1]
-        starts = jnp.concatenate([unknown.z[None], drawn[likely]])
-        search = partial(nearest, residual, unknown, num_steps=_STEPS)
-        ends, costs = jax.lax.map(search, starts, batch_size=_SIDE_BY_SIDE)
-        best = jnp.argmin(costs)
-        S = jax.vmap(jax.jacfwd(residual))(ends)
-        information = jnp.einsum("eoi,eoj->eij", S, S) + unknown.information[None]
-        log_dets = jnp.linalg.slogdet(information)[1]
-        inverse = jnp.linalg.inv(information)
-        trace, center = jnp.trace(inverse[best]), ends[best]
-        laplace = 0.5 * (trace + center @ center - count + log_dets[best])
-        roots = jnp.linalg.cholesky(inverse)
-        # Flatter than the posterior's shares: a small mode costs few samples, a missed one the sum.
-        modes = jax.nn.log_softmax(-0.25 * (costs + log_dets))
+        if has_own_noise(plant):
+            near = _near_particles(prior, run, start_key)
+        else:
+            drawn = jax.random.normal(start_key, (max(size, _STARTS), count), float)
+            near = _near_modes(residual, log_likelihood, drawn)
+        ends, information, log_dets, modes = near.ends, near.information, near.log_dets, near.modes
+        roots = jnp.linalg.cholesky(jnp.linalg.inv(information))
 
         def log_proposal(z: Array) -> Array:
             change = z[None] - ends
@@ -149,8 +206,8 @@ def gains(
             kind = jax.random.choice(kind_key, 3, (size,), p=jnp.array(_SHARES))
             mode = jax.random.categorical(jax.random.fold_in(kind_key, 1), modes, shape=(size,))
             far = jnp.where(kind == 1, _WIDE, 1.0)[:, None]
-            near = ends[mode] + far * jnp.einsum("sij,sj->si", roots[mode], z)
-            return jnp.where((kind == 2)[:, None], z, near)
+            about = ends[mode] + far * jnp.einsum("sij,sj->si", roots[mode], z)
+            return jnp.where((kind == 2)[:, None], z, about)
 
         def block(carry: tuple[Array, Array], key: PRNGKeyArray) -> tuple[tuple, None]:
             weights = jax.vmap(log_weight)(samples(key))
@@ -169,7 +226,7 @@ def gains(
         steps = jnp.diff(jnp.concatenate([rest[None], run.inputs]), axis=0)
         controls = jnp.concatenate([true, true**2 - 1])
         effective = jnp.exp(2 * total - squares)
-        return Gains(laplace, lower, upper, effective, jnp.sum(steps**2), controls)
+        return Gains(near.laplace, lower, upper, effective, jnp.sum(steps**2), controls)
 
     return jax.lax.map(of, keys, batch_size=_CHUNK)
 
@@ -331,7 +388,8 @@ def information_gain(
         plant, excitation, options=options, steps=steps, noise=noise, resolution=resolution,
         seed=seed,
     )  # fmt: skip
-    require_bound(e.plant)
+    if not has_own_noise(e.plant):
+        require_bound(e.plant)
     population = plants_of(e.plant, prior, spread)
     keys = jax.random.split(jax.random.key(seed), plants)
     parts = []

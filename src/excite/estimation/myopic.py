@@ -2,17 +2,19 @@
 
 What is known is a set of particles: parameters as probable as the outcomes so far leave them.
 Each outcome weights the particles; they are drawn again, and moved without changing their
-distribution (sequential Monte Carlo; N. Chopin, A sequential particle filter method for static
-models, 2002; moves of C. ter Braak, A Markov chain Monte Carlo version of the genetic algorithm
-differential evolution, 2006). The next design has the largest expected information gain of its own
-outcome, by nested Monte Carlo, among designs at random: first anywhere and near the designs before,
-then near the best of these. It looks one outcome ahead, and is not trained.
+distribution, in several stages where it tells much (sequential Monte Carlo; N. Chopin, A sequential
+particle filter method for static models, 2002; moves of C. ter Braak, A Markov chain Monte Carlo
+version of the genetic algorithm differential evolution, 2006). The next design has the largest
+expected information gain of its own outcome, by nested Monte Carlo, among designs at random: first
+anywhere and near the designs before, then near the best of these. It looks one outcome ahead, and
+is not trained.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import cast
 
 import equinox as eqx
 import jax
@@ -26,8 +28,7 @@ from ..excitation import AbstractExcitation
 from ..information import require_bound
 from ..plant import AbstractPlant, floats
 from ..plant.catalogue import PlantLike, plant_from
-from ..plant.static import AbstractStaticTask
-from ..simulation import response
+from ..plant.static import AbstractStaticTask, has_own_noise
 from .prior import PriorPlants
 from .prior_knowledge import PriorLike, plants_of
 
@@ -35,6 +36,8 @@ MYOPIC = "myopic"
 """Name of the excitation where a prior is given beside it."""
 
 _SMALLEST = 1e-3  # distance of a design near another, in half ranges; the largest is 1
+_HALVINGS = 25  # of the search for a power
+_IMPOSSIBLE = -1e10  # logarithm of the likelihood where it is none
 _BEST = 8  # designs near which those of the next round lie
 _JUMP = 0.2  # share of the moves by a whole difference of two particles, from mode to mode
 _FINE = 1e-3  # part of a move that no difference has, in the particles' standard deviations
@@ -56,6 +59,27 @@ class Known(eqx.Module):
     outcomes: Float[Array, "time output"]
     k: Int[Array, ""]
     key: PRNGKeyArray
+
+
+@eqx.filter_jit
+def posterior_particles(
+    prior: PriorPlants,
+    designs: Float[Array, "time input"],
+    outcomes: Float[Array, "time output"],
+    num_particles: int,
+    num_moves: int,
+    key: PRNGKeyArray,
+) -> Float[Array, "particle param"]:
+    """Normal coordinates of parameters as probable as the outcomes of these designs leave them."""
+    chosen = Myopic(prior, num_particles=num_particles, num_moves=num_moves, num_outcomes=1)
+    state = chosen.init(prior.plant, len(designs), key)
+    state = eqx.tree_at(lambda known: known.designs, state, designs)
+
+    def learn(state: Known, outcome: Array) -> tuple[Known, None]:
+        made = eqx.tree_at(lambda known: known.k, state, state.k + 1)
+        return chosen.learnt(made, outcome), None
+
+    return jax.lax.scan(learn, state, outcomes)[0].particles
 
 
 class Myopic(AbstractExcitation):
@@ -128,7 +152,8 @@ class Myopic(AbstractExcitation):
         """
         plant = plant_from(task)
         _require_static(plant)
-        require_bound(plant)
+        if not has_own_noise(plant):
+            require_bound(plant)
         if pool is None:
             return cls(plants_of(plant, prior, spread))
         rows, width = np.asarray(pool, float), len(plant.definition.inputs)
@@ -157,7 +182,7 @@ class Myopic(AbstractExcitation):
         self, state: Known, measurement: Float[Array, " output"]
     ) -> tuple[Known, Float[Array, " input"]]:
         """The next design, after the outcome of the last one; the first call has none yet."""
-        learnt = self._learnt(state, measurement)
+        learnt = self.learnt(state, measurement)
         known = jax.tree.map(lambda new, old: jnp.where(state.k > 0, new, old), learnt, state)
         key, own = jax.random.split(known.key)
         design = self._best(known, own)
@@ -169,59 +194,39 @@ class Myopic(AbstractExcitation):
         designs = state.designs.at[state.k - 1].set(input)
         return Known(state.particles, designs, state.outcomes, state.k, state.key)
 
-    def _outcomes(
-        self, z: Float[Array, "particle param"], design: Float[Array, " input"]
-    ) -> Float[Array, "particle output"]:
-        """The mean outcome of a design for each particle, in standard deviations of its noise."""
-        plant, designs = self.prior.plant, design[None]
-        means = jax.vmap(lambda own: response(plant, self.prior.params(own), designs)[1])(z)
-        return means / plant.sensor.sd[None]
+    def learnt(self, state: Known, outcome: Float[Array, " output"]) -> Known:
+        """What is known after the outcome of the last design."""
+        last = state.k - 1
+        outcomes = state.outcomes.at[last].set(outcome)
+        is_before = jnp.arange(len(outcomes)) < last
+        key, own = jax.random.split(state.key)
 
-    def _misfits(
+        def log_before(z: Array) -> Array:
+            found = jax.vmap(lambda *made: self._log_likelihoods(z, *made))(outcomes, state.designs)
+            told = jnp.sum(jnp.where(is_before[:, None], found, 0.0), axis=0)
+            return told - 0.5 * jnp.sum(z**2, axis=1)
+
+        def log_now(z: Array) -> Array:
+            return self._log_likelihoods(z, outcome, state.designs[last])
+
+        particles = _weighted(state.particles, log_before, log_now, self.num_moves, own)
+        return Known(particles, state.designs, outcomes, state.k, key)
+
+    def _log_likelihoods(
         self,
         z: Float[Array, "particle param"],
+        measured: Float[Array, " output"],
         design: Float[Array, " input"],
-        outcome: Float[Array, " output"],
     ) -> Float[Array, " particle"]:
-        """Squared distance of an outcome from its mean; infinite where there is none."""
-        expected = self._outcomes(z, design)
-        seen = outcome / self.prior.plant.sensor.sd
-        squares = jnp.sum((seen[None] - expected) ** 2, axis=1)
-        return jnp.where(jnp.isfinite(squares), squares, jnp.inf)
+        """Of what was measured of a design, by particle."""
+        found = jax.vmap(
+            lambda own: self._task.log_likelihood(measured, design, self.prior.params(own))
+        )(z)
+        return jnp.where(jnp.isfinite(found), found, _IMPOSSIBLE)
 
-    def _learnt(self, state: Known, outcome: Float[Array, " output"]) -> Known:
-        """What is known after the outcome of the last design."""
-        last, z, count = state.k - 1, state.particles, self.num_particles
-        outcomes = state.outcomes.at[last].set(outcome)
-        is_made = jnp.arange(len(outcomes)) <= last
-        key, draw_key, move_key = jax.random.split(state.key, 3)
-
-        def log_probability(z: Array) -> Array:
-            misfits = jax.vmap(lambda *made: self._misfits(z, *made))(state.designs, outcomes)
-            misfit = jnp.sum(jnp.where(is_made[:, None], misfits, 0.0), axis=0)
-            return -0.5 * (misfit + jnp.sum(z**2, axis=1))
-
-        weights = jax.nn.softmax(-0.5 * self._misfits(z, state.designs[last], outcome))
-        steps = (jnp.arange(count) + jax.random.uniform(draw_key)) / count
-        drawn = z[jnp.clip(jnp.searchsorted(jnp.cumsum(weights), steps), 0, count - 1)]
-        fine = _FINE * jnp.std(drawn, axis=0)
-
-        def move(now: tuple[Array, Array], key: PRNGKeyArray) -> tuple[tuple, None]:
-            z, log_p = now
-            pair_key, size_key, jump_key, fine_key, take_key = jax.random.split(key, 5)
-            one, other = jax.random.randint(pair_key, (2, count), 0, count)
-            is_jump = jax.random.bernoulli(jump_key, _JUMP, (count,))
-            part = jnp.where(is_jump, 1.0, jax.random.uniform(size_key, (count,)))
-            moved = z + part[:, None] * (drawn[one] - drawn[other])
-            moved = moved + fine[None] * jax.random.normal(fine_key, z.shape, float)
-            log_moved = log_probability(moved)
-            is_taken = jnp.log(jax.random.uniform(take_key, (count,))) < log_moved - log_p
-            taken = jnp.where(is_taken[:, None], moved, z)
-            return (taken, jnp.where(is_taken, log_moved, log_p)), None
-
-        keys = jax.random.split(move_key, self.num_moves)
-        (z, _), _ = jax.lax.scan(move, (drawn, log_probability(drawn)), keys)
-        return Known(z, state.designs, outcomes, state.k, key)
+    @property
+    def _task(self) -> AbstractStaticTask:
+        return cast(AbstractStaticTask, self.prior.plant)
 
     def _best(self, known: Known, key: PRNGKeyArray) -> Float[Array, " input"]:
         """The design whose outcome is expected to tell most, of those tried."""
@@ -235,10 +240,14 @@ class Myopic(AbstractExcitation):
         particles = known.particles[order[: 4 * count]]
 
         def gain(design: Array) -> Array:
-            """Expected, but for a constant."""
-            means = self._outcomes(particles, design)
-            squares = jnp.sum(((means[:count] + noise)[:, None] - means[None]) ** 2, axis=2)
-            found = -jnp.mean(jax.nn.logsumexp(-0.5 * squares, axis=1))
+            """Expected, by outcomes of some particles, each as likely for all of them."""
+            params = jax.vmap(self.prior.params)(particles)
+            some = jax.tree.map(lambda values: values[:count], params)
+            seen = jax.vmap(lambda own, noise: self._task.measured(design, own, noise))(some, noise)
+            likely = jax.vmap(lambda measured: self._log_likelihoods(particles, measured, design))
+            of_all = likely(seen)
+            own = of_all[np.arange(count), np.arange(count)]
+            found = jnp.mean(own - jax.nn.logsumexp(of_all, axis=1))
             return jnp.where(jnp.isfinite(found), found, -jnp.inf)
 
         def near(designs: Array, key: PRNGKeyArray) -> Array:
@@ -263,6 +272,78 @@ class Myopic(AbstractExcitation):
             gains = jnp.concatenate([gains, jax.vmap(gain)(more)])
             places = tried[jax.lax.top_k(gains, _BEST)[1]]
         return tried[jnp.argmax(gains)]
+
+
+def _weighted(
+    particles: Float[Array, "particle param"],
+    log_before: Callable[[Float[Array, "particle param"]], Float[Array, " particle"]],
+    log_now: Callable[[Float[Array, "particle param"]], Float[Array, " particle"]],
+    num_moves: int,
+    key: PRNGKeyArray,
+) -> Float[Array, "particle param"]:
+    """Particles of one distribution as those of the same times a likelihood.
+
+    The likelihood comes in by powers, each as large as half of the particles remain (adaptive
+    tempering; P. Del Moral, A. Doucet, A. Jasra, Sequential Monte Carlo samplers, 2006).
+    """
+    count = len(particles)
+
+    def next_power(log_p: Array, power: Array) -> Array:
+        def is_small(step: Array) -> Array:
+            weights = jax.nn.softmax(step * log_p)
+            return jnp.sum(weights**2) <= 2 / count
+
+        def halve(_: int, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+            middle = (ends[0] + ends[1]) / 2
+            small = is_small(middle)
+            return jnp.where(small, middle, ends[0]), jnp.where(small, ends[1], middle)
+
+        rest = 1 - power
+        step = jax.lax.fori_loop(0, _HALVINGS, halve, (jnp.zeros_like(rest), rest))[0]
+        return jnp.where(is_small(rest), 1.0, jnp.minimum(power + jnp.maximum(step, 1e-9), 1.0))
+
+    def stage(now: tuple[Array, Array, PRNGKeyArray]) -> tuple[Array, Array, PRNGKeyArray]:
+        z, power, key = now
+        key, draw_key, move_key = jax.random.split(key, 3)
+        log_p = log_now(z)
+        new = next_power(log_p, power)
+        weights = jax.nn.softmax((new - power) * log_p)
+        places = (jnp.arange(count) + jax.random.uniform(draw_key)) / count
+        drawn = z[jnp.clip(jnp.searchsorted(jnp.cumsum(weights), places), 0, count - 1)]
+
+        def target(z: Array) -> Array:
+            return log_before(z) + new * log_now(z)
+
+        return _moved(drawn, target, num_moves, move_key), new, key
+
+    start = particles, jnp.zeros(()), key
+    return jax.lax.while_loop(lambda now: now[1] < 1, stage, start)[0]
+
+
+def _moved(
+    drawn: Float[Array, "particle param"],
+    log_target: Callable[[Float[Array, "particle param"]], Float[Array, " particle"]],
+    num_moves: int,
+    key: PRNGKeyArray,
+) -> Float[Array, "particle param"]:
+    """Particles after moves that leave their distribution as it is."""
+    count, fine = len(drawn), _FINE * jnp.std(drawn, axis=0)
+
+    def move(now: tuple[Array, Array], key: PRNGKeyArray) -> tuple[tuple, None]:
+        z, log_p = now
+        pair_key, size_key, jump_key, fine_key, take_key = jax.random.split(key, 5)
+        one, other = jax.random.randint(pair_key, (2, count), 0, count)
+        is_jump = jax.random.bernoulli(jump_key, _JUMP, (count,))
+        part = jnp.where(is_jump, 1.0, jax.random.uniform(size_key, (count,)))
+        moved = z + part[:, None] * (drawn[one] - drawn[other])
+        moved = moved + fine[None] * jax.random.normal(fine_key, z.shape, float)
+        log_moved = log_target(moved)
+        is_taken = jnp.log(jax.random.uniform(take_key, (count,))) < log_moved - log_p
+        taken = jnp.where(is_taken[:, None], moved, z)
+        return (taken, jnp.where(is_taken, log_moved, log_p)), None
+
+    keys = jax.random.split(key, num_moves)
+    return jax.lax.scan(move, (drawn, log_target(drawn)), keys)[0][0]
 
 
 def _require_static(plant: AbstractPlant) -> None:

@@ -70,6 +70,25 @@ class AbstractStaticTask(AbstractPlant):
     def outcome(self, design: Float[Array, " input"], params: Params) -> Float[Array, " output"]:
         """Mean of what is measured of a design; the sensor's noise is added to it."""
 
+    def measured(
+        self, design: Float[Array, " input"], params: Params, noise: Float[Array, " output"]
+    ) -> Float[Array, " output"]:
+        """What is measured of a design: its outcome, and the sensor's noise.
+
+        A task whose noise is another one defines this and `log_likelihood`.
+
+        Args:
+            noise: standard normal, one number for each output.
+        """
+        return self.outcome(design, params) + self.sensor.sd * noise
+
+    def log_likelihood(
+        self, measured: Float[Array, " output"], design: Float[Array, " input"], params: Params
+    ) -> Float[Array, ""]:
+        """Logarithm of the density of what is measured of a design, but for a constant."""
+        misses = (measured - self.outcome(design, params)) / self.sensor.sd
+        return -0.5 * jnp.sum(misses**2)
+
     def after(self, design: Float[Array, " input"]) -> Float[Array, " state"]:
         """The state after a design, whatever time it took: the design, and that one was made."""
         return jnp.append(design, 1.0)
@@ -88,3 +107,18 @@ class AbstractStaticTask(AbstractPlant):
         # An outcome that is not finite at zero would spoil the gradient of the others.
         design = jnp.where(made > 0.5, jnp.stack(last), (lower + upper) / 2)
         return jnp.where(made > 0.5, self.outcome(design, params), 0.0)
+
+
+def has_own_noise(plant: AbstractPlant) -> bool:
+    """Whether a plant is a static task with another noise than its sensor's."""
+    usual = AbstractStaticTask.log_likelihood
+    return isinstance(plant, AbstractStaticTask) and type(plant).log_likelihood is not usual
+
+
+def require_sensor_noise(plant: AbstractPlant) -> None:
+    """Raises ValueError for a static task with another noise than its sensor's."""
+    if has_own_noise(plant):
+        raise ValueError(
+            f"plant {plant.definition.name!r} has its own log_likelihood: it has expected "
+            "information gains and myopic designs (`excite gain`), but no fit, training or study"
+        )
