@@ -32,7 +32,7 @@ from excite.information import experiment_information, relative_size
 from excite.plant import AbstractPlant, Aero2
 from excite.plant.contract import Sensor
 from excite.policy import Layout
-from excite.simulation import measure, response
+from excite.simulation import response, sensed
 
 KEY = jax.random.key(5)
 AERO2 = Aero2()
@@ -86,8 +86,8 @@ def test_the_process_is_that_of_plain_numpy(name, noisy):
     plant = AERO2 if noisy else SILENT
     env, actions = Env.of(plant), ACTIONS[name][:, None]
     first, states, transitions = episode(env, KEY, jnp.asarray(actions))
-    at = range(501)
-    noise = [measure(plant, jnp.zeros(1), jax.random.fold_in(first.key, k))[0] for k in at]
+    keys = [jax.random.fold_in(first.key, k) for k in range(501)]
+    noise = [sensed(plant, jnp.zeros(1), jax.random.normal(key, (1,)))[0] for key in keys]
     assert (np.std(noise) > 1e-4) == noisy
     plain = PlainAero2Env()
     options = {"params": np.array(first.params), "noise": np.array(noise)}

@@ -106,7 +106,7 @@ def test_the_error_of_the_output_error_estimate_is_that_of_nls(seed):
     outputs = response(plant, params, inputs)
     noise = plant.sensor.sd[None] * jax.random.normal(jax.random.key(seed), outputs.shape)
     measured = outputs + noise
-    memory = objective.init(plant, measured[0])
+    memory = objective.init(plant, measured[0], KEYS[1])
 
     def advance(carry: tuple, now: tuple) -> tuple[tuple, None]:
         (memory, state), (k, input, seen) = carry, now
@@ -136,7 +136,7 @@ def test_sensitivities_are_held_to_their_limit_and_below_it_left_alone():
             size = jnp.abs(memory.sensitivity[0]).max()
             return (memory, step(plant, state, input, plant.nominal)), size
 
-        start = objective.init(plant, jnp.zeros(1)), plant.initial_state
+        start = objective.init(plant, jnp.zeros(1), KEYS[1]), plant.initial_state
         samples = jnp.arange(len(inputs)), inputs
         sizes = eqx.filter_jit(jax.lax.scan)(advance, start, samples)[1]
         return float(jnp.max(sizes) / (plant.definition.outputs[0].critical_level or 0.0))

@@ -10,7 +10,7 @@ from catalogue import PLANTS, TwoMasses
 
 from excite.excitation import AbstractExcitation, Chirp, Multisine, Random, Replay
 from excite.plant import Aero2, CartPole, Sensor
-from excite.simulation import measure, response, run_episode, step
+from excite.simulation import response, run_episode, sensed, step
 
 plants = pytest.mark.parametrize("plant", PLANTS.values(), ids=PLANTS)
 KEY = jax.random.key(5)
@@ -179,7 +179,8 @@ def test_noise_is_added_before_the_encoder_rounds():
     rough = plant.changed(sensor=Sensor(jnp.array([0.3]), jnp.array([0.0])))
     keys = jax.random.split(KEY, 200)
     shown, before = (
-        jax.vmap(lambda key, p=p: measure(p, jnp.array([0.77]), key))(keys) for p in (plant, rough)
+        jax.vmap(lambda key, p=p: sensed(p, jnp.array([0.77]), jax.random.normal(key, (1,))))(keys)
+        for p in (plant, rough)
     )
     np.testing.assert_allclose(shown, np.round(before / 0.1) * 0.1, atol=1e-12)
 

@@ -152,6 +152,18 @@ TASKS = {
         myopic={"plants": 256, "samples": 1_000_000, "from_prior": True},
         pool=2000,
     ),
+    "elasticity": Task(
+        plant="constant_elasticity.py:Elasticity",
+        prior={
+            "rho": "uniform:0.01:1", "v_1": "uniform:0:1", "v_2": "uniform:0:1",
+            "u": "lognormal:2.718281828:3",
+        },
+        steps=10,
+        seeds=1,
+        evaluation=FROM_THE_PRIOR,
+        also={"plants": 256, "samples": 5000, "seed": 1},
+        myopic={"plants": 667, "samples": 10_000_000, "from_prior": True},
+    ),
 }  # fmt: skip
 
 
@@ -218,7 +230,9 @@ def myopic_row(task, seed):
     chosen = ex.Myopic.of(own.word, own.prior, pool=pool)
     near = {"plants": own.myopic["plants"], "samples": 1000, "seed": seed}
     made = row(task, "myopic", chosen, {**own.myopic, "seed": seed}, near, seed=seed)
-    return made | {"cpu_seconds": time.process_time() - start}
+    device = jax.devices()[0].device_kind
+    told = {} if device == "cpu" else {"device": device}
+    return made | {"cpu_seconds": time.process_time() - start} | told
 
 
 def open_loop_row(task):

@@ -235,11 +235,25 @@ def require_likelihood(plant: AbstractPlant) -> bool:
     return d.observes_state
 
 
+@eqx.filter_jit
 def measure(
-    plant: AbstractPlant, output: Float[Array, " output"], key: PRNGKeyArray
+    plant: AbstractPlant,
+    state: Float[Array, " state"],
+    params: Params,
+    output: Float[Array, " output"],
+    noise: Float[Array, " output"],
 ) -> Float[Array, " output"]:
-    """Measurement of the outputs: noise is added, then an encoder rounds to its step."""
-    return sensed(plant, output, jax.random.normal(key, output.shape, float))
+    """Measurement in a state, of a static task with its own noise.
+
+    Args:
+        output: what the sensor is shown.
+        noise: standard normal.
+    """
+    if isinstance(plant, AbstractStaticTask) and has_own_noise(plant):
+        *design, is_made = state
+        measured = plant.measured(jnp.stack(design), params, noise)
+        return jnp.where(is_made > 0.5, measured, 0.0)
+    return sensed(plant, output, noise)
 
 
 @eqx.filter_jit
@@ -299,7 +313,7 @@ def run_episode(
     def advance(carry: tuple, now: tuple) -> tuple[tuple, tuple]:
         (state, past, memory), (noise, k) = carry, now
         output, shown = plant.true_and_shown(state, params)
-        measured = _measured(plant, state, params, shown, noise)
+        measured = measure(plant, state, params, shown, noise)
         memory, input = excitation(memory, measured)
         input = jnp.clip(input, lower, upper)
         state, past = moved(state, past, input, k)
@@ -314,26 +328,9 @@ def run_episode(
     return Trajectory(
         time=jnp.arange(num_steps + 1) * plant.dt,
         inputs=inputs,
-        measured=jnp.concatenate(
-            [measured, _measured(plant, state, params, shown, noise[-1])[None]]
-        ),
+        measured=jnp.concatenate([measured, measure(plant, state, params, shown, noise[-1])[None]]),
         outputs=jnp.concatenate([outputs, last[None]]),
     )
-
-
-def _measured(
-    plant: AbstractPlant,
-    state: Float[Array, " state"],
-    params: Params,
-    shown: Float[Array, " output"],
-    noise: Float[Array, " output"],
-) -> Float[Array, " output"]:
-    """What is measured in a state, of a static task by its own noise."""
-    if isinstance(plant, AbstractStaticTask) and has_own_noise(plant):
-        *design, is_made = state
-        measured = plant.measured(jnp.stack(design), params, noise)
-        return jnp.where(is_made > 0.5, measured, 0.0)
-    return sensed(plant, shown, noise)
 
 
 @eqx.filter_jit

@@ -5,7 +5,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from ..estimation import ARX
 from ..estimation.arx import RLSState, physical_params, regressor
@@ -41,12 +41,15 @@ class EstimationError(AbstractError):
 
     estimator: ARX = eqx.field(default_factory=ARX)
 
-    def init(self, plant: AbstractPlant, measured: Float[Array, " output"]) -> ARXMemory:
+    def init(
+        self, plant: AbstractPlant, measured: Float[Array, " output"], key: PRNGKeyArray
+    ) -> ARXMemory:
         """No coefficients yet.
 
         Raises:
             ValueError: for a plant without inverse mapping from ARX.
         """
+        del key
         _require_arx(plant)
         zero = jnp.zeros(())
         return ARXMemory(self.estimator.init(), measured[0], zero, zero)
@@ -101,9 +104,11 @@ class OutputError(AbstractError):
     prior_sd: Float[Array, ""] = eqx.field(converter=floats, default=0.3)
     max_sensitivity: Float[Array, ""] = eqx.field(converter=floats, default=MAX_SENSITIVITY)
 
-    def init(self, plant: AbstractPlant, measured: Float[Array, " output"]) -> OutputErrorMemory:
+    def init(
+        self, plant: AbstractPlant, measured: Float[Array, " output"], key: PRNGKeyArray
+    ) -> OutputErrorMemory:
         """The prior's information; the initial state is known."""
-        del measured
+        del measured, key
         num_params = len(self.targets)
         known = prior_knowledge(plant, num_params, self.prior_sd)
         return OutputErrorMemory(*known, jnp.zeros(num_params))

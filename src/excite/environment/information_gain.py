@@ -5,7 +5,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from ..estimation.prior import PriorPlants
 from ..information import relative_size
@@ -66,9 +66,11 @@ class InformationGain(AbstractObjective):
         if self.criterion not in ("D", "A", "E"):
             raise ValueError(f"criterion must be D, A or E: got {self.criterion!r}")
 
-    def init(self, plant: AbstractPlant, measured: Float[Array, " output"]) -> InformationMemory:
+    def init(
+        self, plant: AbstractPlant, measured: Float[Array, " output"], key: PRNGKeyArray
+    ) -> InformationMemory:
         """The prior's information; the initial state is known."""
-        del measured
+        del measured, key
         sd = 1.0 if self.prior is not None else self.prior_sd
         known = prior_knowledge(plant, len(self.targets), jnp.asarray(sd))
         rest = jnp.asarray(safe_input(plant.definition))

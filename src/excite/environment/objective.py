@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from ..description import PlantDescription, names_of
 from ..estimation.prior import PriorPlants
@@ -49,8 +49,10 @@ class AbstractObjective(eqx.Module):
     """What an experiment is rewarded for."""
 
     @abc.abstractmethod
-    def init(self, plant: AbstractPlant, measured: Float[Array, " output"]) -> PyTree:
-        """Memory at the first measurement."""
+    def init(
+        self, plant: AbstractPlant, measured: Float[Array, " output"], key: PRNGKeyArray
+    ) -> PyTree:
+        """Memory at the first measurement; `key` is for what an objective draws at random."""
 
     @abc.abstractmethod
     def update(

@@ -153,14 +153,15 @@ class Env(eqx.Module):
         else:
             params = self.prior.draw(params_key)
         output = plant.output(plant.initial_state, params)
-        measured = measure(plant, output, jax.random.fold_in(key, 0))
+        noise = jax.random.normal(jax.random.fold_in(key, 0), output.shape, float)
+        measured = measure(plant, plant.initial_state, params, output, noise)
         window = with_measurement(jnp, self.layout, empty_window(jnp, self.layout), measured)
         state = EnvState(
             params=params,
             constants=constants,
             plant_state=plant.initial_state,
             window=window,
-            memory=self.objective.init(plant, measured),
+            memory=self.objective.init(plant, measured, jax.random.fold_in(params_key, 2)),
             k=jnp.asarray(0),
             max_abs_output=jnp.abs(plant.true_output(plant.initial_state, params)),
             is_finite=jnp.asarray(True),
@@ -187,7 +188,8 @@ class Env(eqx.Module):
         is_finite = is_finite & state.is_finite
         after = jnp.where(is_finite, after, state.plant_state)
         output, shown = plant.true_and_shown(after, state.params)
-        measured = measure(plant, shown, jax.random.fold_in(state.key, k))
+        noise = jax.random.normal(jax.random.fold_in(state.key, k), shown.shape, float)
+        measured = measure(plant, after, state.params, shown, noise)
         sample = StepData(state.params, state.plant_state, input, measured)
         memory, gain = self.objective.update(plant, state.memory, sample, state.k)
         window = with_input(jnp, self.layout, state.window, input)

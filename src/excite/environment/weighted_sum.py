@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from ..plant import AbstractPlant, Params
 from .objective import AbstractObjective, StepData
@@ -31,9 +32,13 @@ class WeightedSum(AbstractObjective):
         if not self.terms:
             raise ValueError("a sum of objectives needs at least one")
 
-    def init(self, plant: AbstractPlant, measured: Float[Array, " output"]) -> SumMemory:
+    def init(
+        self, plant: AbstractPlant, measured: Float[Array, " output"], key: PRNGKeyArray
+    ) -> SumMemory:
         """Memory of every term."""
-        memories = tuple(term.init(plant, measured) for term in self.terms)
+        keys = jax.random.split(key, len(self.terms))
+        pairs = zip(self.terms, keys, strict=True)
+        memories = tuple(term.init(plant, measured, own) for term, own in pairs)
         return SumMemory(memories, jnp.zeros(len(memories)))
 
     def update(

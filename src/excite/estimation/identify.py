@@ -27,6 +27,7 @@ from ..information.identifiability import UNSEEN_SD, identifiability
 from ..plant import AbstractPlant, Params, params_from
 from ..plant.catalogue import PLANTS, PlantLike, plant_from
 from ..plant.extension import plain_kind
+from ..plant.static import require_sensor_noise
 from ..progress import SHOWN, Progress
 from ..record import (
     DataFrame,
@@ -193,6 +194,7 @@ def identify(
         raise ValueError("validate_columns need a held-out record (--validate)")
     plant = plant_from(plant_named_by(given[0]) if plant is None else plant)
     estimator, begin = _chosen(estimator, plant, start, hold)
+    require_sensor_noise(plant)
     by_steps = plant.definition.observes_state and isinstance(estimator, NLS)
     if plant.definition.is_disturbed and not (by_steps or isinstance(estimator, PEM)):
         raise ValueError(

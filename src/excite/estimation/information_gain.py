@@ -47,8 +47,7 @@ _STEPS, _STARTS, _SIDE_BY_SIDE = 30, 16, 8  # of the searches for probable param
 _WIDE, _SHARES = 2.0, (0.5, 0.375, 0.125)  # of the proposal: normal, a wider one, the prior
 _PARTICLES, _MOVES = 1000, 5  # of the posterior of a task with its own noise
 _ENDS, _PART = 200, 0.5  # of these in the proposal, and the deviation of each, in that of all
-_CHUNK = 16  # records at a time
-_BLOCK = 1000  # samples at a time
+_AT_A_TIME = {True: (16, 1000), False: (256, 20_000)}  # records and samples, on a CPU or not
 _NEAR_CAP = 1.0  # nats below the largest value of a lower bound, at which it says little
 _FEW = 10.0  # effective samples
 
@@ -153,7 +152,8 @@ def gains(
     """
     plant = prior.plant
     count = len(plant.nominal)
-    size = min(num_samples, _BLOCK)
+    chunk, block_size = _at_a_time()
+    size = min(num_samples, block_size)
 
     def of(key: PRNGKeyArray) -> Gains:
         true_key, run_key, start_key, sample_key = jax.random.split(key, 4)
@@ -228,7 +228,12 @@ def gains(
         effective = jnp.exp(2 * total - squares)
         return Gains(near.laplace, lower, upper, effective, jnp.sum(steps**2), controls)
 
-    return jax.lax.map(of, keys, batch_size=_CHUNK)
+    return jax.lax.map(of, keys, batch_size=chunk)
+
+
+def _at_a_time() -> tuple[int, int]:
+    """Records, and samples of each, that are computed side by side."""
+    return _AT_A_TIME[jax.default_backend() == "cpu"]
 
 
 @dataclass(frozen=True)
@@ -393,13 +398,14 @@ def information_gain(
     population = plants_of(e.plant, prior, spread)
     keys = jax.random.split(jax.random.key(seed), plants)
     parts = []
-    for first in range(0, plants, 4 * _CHUNK):
+    chunk, block = _at_a_time()
+    for first in range(0, plants, 4 * chunk):
         progress(f"{first} of {plants} plants", first, plants)
-        own = keys[first : first + 4 * _CHUNK]
+        own = keys[first : first + 4 * chunk]
         parts.append(gains(population, e.excitation, e.num_steps, own, samples, from_prior))
     progress("done", plants, plants)
     found = jax.tree.map(lambda *rows: np.concatenate([np.asarray(r) for r in rows]), *parts)
-    number = -(-samples // min(samples, _BLOCK)) * min(samples, _BLOCK)
+    number = -(-samples // min(samples, block)) * min(samples, block)
     lower, upper, laplace, changes = (
         Mean.of(v, found.controls) for v in (found.lower, found.upper, found.laplace, found.changes)
     )

@@ -293,7 +293,7 @@ def _weighted(
             weights = jax.nn.softmax(step * log_p)
             return jnp.sum(weights**2) <= 2 / count
 
-        def halve(_: int, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+        def halve(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
             middle = (ends[0] + ends[1]) / 2
             small = is_small(middle)
             return jnp.where(small, middle, ends[0]), jnp.where(small, ends[1], middle)

@@ -15,6 +15,7 @@ from ..description import SpreadLike, names_of, prior_sd_of, unknown
 from ..environment import (
     MAX_SENSITIVITY,
     AbstractObjective,
+    ContrastiveGain,
     Env,
     EstimationError,
     InformationGain,
@@ -25,6 +26,7 @@ from ..environment import (
 from ..estimation import ARX, NLS
 from ..estimation.catalogue import estimator_named
 from ..estimation.prior import PriorPlants
+from ..estimation.prior_knowledge import plants_of
 from ..plant import AbstractARXPlant, AbstractPlant
 from ..plant.uncertainty import Range, Uncertainty
 from ..policy import Layout
@@ -49,25 +51,28 @@ class RewardSettings(Settings):
 
     Attributes:
         reward: of the experiment: `relative` errors (Eq. 4), `log` of them, the largest over
-            its goal (`goals`), or `information`; the default depends on the plant.
-        dense: whether information is rewarded at every step, by default for PPO alone.
+            its goal (`goals`), `information`, or the `contrast` with other plants of the prior (see
+            `ContrastiveGain`); the default depends on the plant.
+        dense: whether information or contrast is rewarded at every step, by default for PPO alone.
         weight: factor of that reward.
         criterion, max_sensitivity: of the information, see `InformationGain`.
         goals: by parameter, the relative error that is scaled to one, default one.
         estimator: in the reward, by its name in the study or a shipped name; an ARX estimator,
             or `nls` to first order in the noise, for any plant.
         change_price: of the squared change of an input [1 / input unit²], subtracted from
-            information at every step.
+            information or contrast at every step.
+        contrast_plants: with which the true one is compared.
         start_covariance: replaces that of the estimator; with a smaller one its bias, which
             is a smooth function of the inputs, is larger than the effect of sensor noise.
     """
 
-    reward: Literal["relative", "log", "goals", "information"] | None = None
+    reward: Literal["relative", "log", "goals", "information", "contrast"] | None = None
     dense: Annotated[bool, Field(strict=True)] | None = None
     weight: Positive = 1.0
     criterion: Literal["D", "A", "E"] = "D"
     max_sensitivity: Positive = MAX_SENSITIVITY
     change_price: Magnitude = 0.0
+    contrast_plants: Annotated[Count, Field(le=1_000_000)] = 255
     goals: dict[str, Positive] = {}
     estimator: str = "arx-rls"
     start_covariance: Positive | None = None
@@ -263,6 +268,18 @@ class Agent:
         if chosen.reward is None or chosen is not self.decision:  # the others were checked
             _require_used(_kind(form, chosen, self.estimators), chosen.model_fields_set)
         targets = target_mask(plant.definition, self.targets)
+        # A gradient needs no reward before the last step.
+        dense = self.method == "ppo" if chosen.dense is None else chosen.dense
+        if form == "contrast":
+            if self.targets is not None and not all(targets):
+                raise ValueError("the reward 'contrast' is of all parameters: leave targets out")
+            return ContrastiveGain(
+                plants_of(plant, None, spread) if prior is None else prior,
+                chosen.contrast_plants,
+                chosen.weight,
+                dense=dense,
+                change_price=chosen.change_price,
+            )
         if form == "information":
             in_nats = prior is not None and chosen.criterion == "D"  # half of log det
             return InformationGain(
@@ -271,8 +288,7 @@ class Agent:
                 chosen.weight / 2 if in_nats else chosen.weight,
                 criterion=chosen.criterion,
                 max_sensitivity=chosen.max_sensitivity,
-                # A gradient needs no reward before the last step.
-                dense=self.method == "ppo" if chosen.dense is None else chosen.dense,
+                dense=dense,
                 prior=prior,
                 change_price=chosen.change_price,
             )
@@ -327,11 +343,11 @@ class Agent:
         # Settings that were added later enter only where they are used, so that the
         # fingerprints of earlier trainings stay valid.
         later = {"clocks", "criterion", "max_sensitivity", "input_amplitude", "spread", "dense"}
-        later |= {"constants", "terms", "uncertainty", "memory", "change_price"}
+        later |= {"constants", "terms", "uncertainty", "memory", "change_price", "contrast_plants"}
         process = self.decision.model_dump(exclude=later - self.decision.model_fields_set)
         for term, own in zip(process.get("terms", ()), self.decision.terms, strict=False):
-            if "change_price" not in own.model_fields_set:
-                del term["change_price"]
+            for name in {"change_price", "contrast_plants"} - own.model_fields_set:
+                del term[name]
         return {
             "method": self.method,
             "targets": [name for name, chosen in zip(names, mask, strict=True) if chosen],
@@ -371,6 +387,7 @@ def _require_one_reward(process: DecisionSettings) -> None:
 
 _USED = {
     "information": {"dense", "criterion", "max_sensitivity", "change_price"},
+    "contrast": {"dense", "change_price", "contrast_plants"},
     "errors of nls": {"goals", "estimator", "max_sensitivity"},
     "errors of an ARX estimator": {"goals", "estimator", "start_covariance"},
 }
@@ -378,8 +395,8 @@ _USED = {
 
 
 def _kind(form: str, chosen: RewardSettings, estimators: Mapping[str, EstimatorSettings]) -> str:
-    if form == "information":
-        return "information"
+    if form in ("information", "contrast"):
+        return form
     is_nls = _estimator(chosen, estimators).kind == "nls"
     return "errors of nls" if is_nls else "errors of an ARX estimator"
 

@@ -13,12 +13,13 @@ OBJECTIVES: Mapping[str, Mapping[str, str]] = {
     "D": {"reward": "information", "criterion": "D"},
     "A": {"reward": "information", "criterion": "A"},
     "E": {"reward": "information", "criterion": "E"},
+    "sPCE": {"reward": "contrast"},
     "goals": {"reward": "goals"},
     "relative": {"reward": "relative"},
     "log": {"reward": "log"},
     "nls": {"reward": "relative", "estimator": "nls"},
 }
-"""Settings of a reward: criteria of the Fisher information, or errors of an estimator."""
+"""Settings of a reward: criteria of the Fisher information, contrast, errors of an estimator."""
 
 
 def rewards_of(
@@ -43,7 +44,7 @@ def rewards_of(
             raise unknown("objective", name, OBJECTIVES)
     if len(set(names)) < len(names) or not names:
         raise ValueError(f"objectives must differ from each other, got {', '.join(names)}")
-    with_goals = [name for name in names if not is_information(name)] or names
+    with_goals = [name for name in names if is_error(name)] or names
     return {
         name: {
             **OBJECTIVES[name],
@@ -57,6 +58,11 @@ def rewards_of(
 def is_information(name: str) -> bool:
     """Whether an objective is a criterion of the Fisher information."""
     return OBJECTIVES[name]["reward"] == "information"
+
+
+def is_error(name: str) -> bool:
+    """Whether an objective is the errors of an estimator."""
+    return OBJECTIVES[name]["reward"] not in ("information", "contrast")
 
 
 def _weighted(word: str) -> tuple[str, float | None]:

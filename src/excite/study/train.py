@@ -14,7 +14,7 @@ from ..plant.uncertainty import Range
 from ..policy import Policy, read_policy
 from ..progress import SHOWN, Progress
 from .folder import seed_folder
-from .objectives import decision_of, is_information, rewards_of
+from .objectives import decision_of, is_error, rewards_of
 from .run import run_study
 from .spec import Study, of_prior, plant_tables, study_from
 from .table import best_seeds
@@ -62,9 +62,11 @@ def train(
         plant: its name, `path/to/file.py:ClassName`, the plant or its class.
         out: run folder of the study; without one only the policy is kept.
         method: `gradient` of the simulated experiment, or `ppo`.
-        objective: criterion of the Fisher information (`D`, `A`, `E`), or errors of the ARX
-            estimator (`relative`, `log`, `goals`) or of nonlinear least squares (`nls`);
-            several are added, with weights (`["D", "log=0.1"]` or `{"D": 1, "log": 0.1}`).
+        objective: criterion of the Fisher information (`D`, `A`, `E`), a lower bound of the
+            expected information gain without approximation of the posterior (`sPCE`), or errors
+            of the ARX estimator (`relative`, `log`, `goals`) or of nonlinear least squares
+            (`nls`); several are added, with weights (`["D", "log=0.1"]` or
+            `{"D": 1, "log": 0.1}`).
         target: parameters in the objective, default the plant's targets.
         goal: relative error that is scaled to one, by parameter.
         window: number of samples observed, default 80.
@@ -110,11 +112,11 @@ def train(
         own["num_updates"] = updates
     rewards = rewards_of(objective, by_name("goal", goal, "a dict by parameter"))
     if change_price:
-        priced = next((name for name in rewards if is_information(name)), None)
+        priced = next((name for name in rewards if not is_error(name)), None)
         if priced is None:
             raise ValueError(
-                "change_price is subtracted from information: it needs the objective D, A or E, "
-                f"got {', '.join(rewards)}"
+                "change_price is subtracted from information: it needs the objective D, A, E or "
+                f"sPCE, got {', '.join(rewards)}"
             )
         rewards[priced]["change_price"] = change_price
     decision = {

@@ -1,0 +1,127 @@
+"""How much likelier an experiment's outcomes make the true plant than others of the prior."""
+
+from __future__ import annotations
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from ..estimation.prior import PriorPlants
+from ..plant import AbstractPlant, Params
+from ..plant.fields import floats
+from ..plant.static import AbstractStaticTask
+from ..safety import safe_input
+from ..simulation import require_likelihood, step
+from .objective import AbstractObjective, StepData
+
+_IMPOSSIBLE = -1e6  # logarithm of a likelihood where it is smaller, or not a number
+
+
+class ContrastMemory(eqx.Module):
+    """The other plants, and what the outcomes so far tell.
+
+    Attributes:
+        params: of the other plants.
+        states: of these under the same inputs.
+        log_likelihoods: of the outcomes so far; the true plant's is the last.
+        value: the bound at the last reward [nats].
+        input: the last one.
+    """
+
+    params: Params
+    states: Float[Array, "plant state"]
+    log_likelihoods: Float[Array, " compared"]
+    value: Float[Array, ""]
+    input: Float[Array, " input"]
+
+
+class ContrastiveGain(AbstractObjective):
+    """A lower bound of the expected information gain in nats: sPCE.
+
+    The likelihood of the outcomes for the true plant, over its mean for this one and `num_plants`
+    others of the prior, which are drawn for every experiment (sequential prior contrastive
+    estimation; A. Foster et al., Deep adaptive design, ICML 2021). It needs no approximation of
+    the posterior, and no derivative of the plant by its parameters, and is at most
+    log(num_plants + 1).
+
+    Attributes:
+        prior: of the parameters.
+        num_plants: that are compared with the true one.
+        weight: factor of the reward.
+        dense: whether every step is rewarded by its increment, or the last by the total
+            (T. Blau et al., Optimizing sequential experimental design with deep reinforcement
+            learning, ICML 2022).
+        change_price: of the squared change of the input, subtracted at every step.
+    """
+
+    prior: PriorPlants
+    num_plants: int = eqx.field(static=True, default=255)
+    weight: Float[Array, ""] = eqx.field(converter=floats, default=1.0)
+    dense: bool = eqx.field(static=True, default=True)
+    change_price: Float[Array, ""] = eqx.field(converter=floats, default=0.0)
+
+    def __check_init__(self) -> None:
+        """Raises ValueError without another plant."""
+        if self.num_plants < 1:
+            raise ValueError(f"num_plants must be at least 1: got {self.num_plants}")
+
+    def init(
+        self, plant: AbstractPlant, measured: Float[Array, " output"], key: PRNGKeyArray
+    ) -> ContrastMemory:
+        """Other plants at the initial state, which is known."""
+        del measured
+        count = self.num_plants
+        params = jax.vmap(self.prior.draw)(jax.random.split(key, count))
+        states = jnp.broadcast_to(plant.initial_state, (count, len(plant.initial_state)))
+        rest = jnp.asarray(safe_input(plant.definition))
+        return ContrastMemory(params, states, jnp.zeros(count + 1), jnp.zeros(()), rest)
+
+    def update(
+        self, plant: AbstractPlant, memory: ContrastMemory, sample: StepData, k: Int[Array, ""]
+    ) -> tuple[ContrastMemory, Float[Array, ""]]:
+        """The likelihood of one more outcome, for every plant."""
+        del k
+        is_task = isinstance(plant, AbstractStaticTask)
+        observes_state = not is_task and require_likelihood(plant)
+
+        def likely(state: Array, params: Params) -> tuple[Array, Array]:
+            if is_task:
+                return state, plant.log_likelihood(sample.measured, sample.input, params)
+            after = step(plant, sample.state if observes_state else state, sample.input, params)
+            expected = after if observes_state else plant.output(after, params)
+            sd = plant.process_noise_sd if observes_state else plant.sensor.sd
+            found = -0.5 * jnp.sum(((sample.measured - expected) / sd) ** 2)
+            return jnp.where(jnp.all(jnp.isfinite(after)), after, state), found
+
+        states, of_others = jax.vmap(likely)(memory.states, memory.params)
+        own = likely(sample.state, sample.params)[1]
+        found = jnp.append(of_others, own)
+        found = jnp.where(found > _IMPOSSIBLE, found, _IMPOSSIBLE)  # also for NaN
+        total = memory.log_likelihoods + found
+        cost = self.change_price * jnp.sum((sample.input - memory.input) ** 2)
+        value = self._bound(total) if self.dense else memory.value
+        gain = self.weight * (value - memory.value) - cost
+        return ContrastMemory(memory.params, states, total, value, sample.input), gain
+
+    def final(
+        self, plant: AbstractPlant, memory: ContrastMemory, params: Params
+    ) -> Float[Array, ""]:
+        """The bound, unless it was rewarded at every step."""
+        del plant, params
+        return jnp.zeros(()) if self.dense else self.weight * self._bound(memory.log_likelihoods)
+
+    def relative_errors(
+        self, plant: AbstractPlant, memory: ContrastMemory, params: Params
+    ) -> Float[Array, " param"]:
+        """Root mean square of the compared plants' relative differences, by their probability."""
+        del plant
+        probable = jax.nn.softmax(memory.log_likelihoods)[:-1]
+        differences = jnp.stack(memory.params) - jnp.stack(params)[:, None]
+        return jnp.sqrt(differences**2 @ probable) / jnp.abs(jnp.stack(params))
+
+    def _bound(self, log_likelihoods: Float[Array, " compared"]) -> Float[Array, ""]:
+        others = jax.nn.logsumexp(log_likelihoods) - math.log(self.num_plants + 1)
+        return log_likelihoods[-1] - others
