@@ -15,8 +15,9 @@ import torch
 import excite as ex
 from excite.cli import main
 from excite.environment import Env, InformationGain
+from excite.estimation.prior_knowledge import plants_of
 from excite.excitation import PolicyExcitation
-from excite.plant import Aero2
+from excite.plant import AbstractStaticTask, Aero2, static_description
 from excite.policy import (
     Layout,
     Policy,
@@ -27,33 +28,59 @@ from excite.policy import (
     with_input,
     with_measurement,
 )
-from excite.policy.contract import remembered
+from excite.policy.contract import added, gated
 from excite.rig.player import PolicyPlayer
 from excite.simulation import run_episode
-from excite.training.gradient import Network, experiments, started, train
+from excite.study.agent import Agent, AgentSettings
+from excite.training.gradient import (
+    Network,
+    Optimisation,
+    experiments,
+    started,
+    train,
+    update_all,
+)
 from excite.training.settings import GradientSettings
 
 MEMORY, STEPS = 5, 12
 LAYOUT = Layout.of(Aero2.definition, window=1, num_steps=STEPS, memory=MEMORY)
+SUM = dataclasses.replace(LAYOUT, window=2, clocks=(0.1,), memory_kind="sum")
+BOTH = pytest.mark.parametrize("layout", [LAYOUT, SUM], ids=["gru", "sum"])
 SMALL: dict[str, Any] = {"num_plants": 2, "hidden": [4], "watch_episodes": 2}
 
 
-def weights(seed: int = 0, memory: int = MEMORY) -> Any:
-    rng = np.random.default_rng(seed)
-    shapes = [(3 * memory, LAYOUT.size), (3 * memory, memory), (4, memory + LAYOUT.size), (1, 4)]
+def weights(seed: int = 0, layout: Layout = LAYOUT) -> Any:
+    rng, size = np.random.default_rng(seed), layout.size
+    unit = [(3 * MEMORY, size), (3 * MEMORY, MEMORY)]
+    if layout.memory_kind == "sum":
+        unit = [(7, 2), (MEMORY, 7)]
     return tuple(
         (rng.normal(size=s).astype(np.float32), rng.normal(size=s[0]).astype(np.float32))
-        for s in shapes
+        for s in [*unit, (4, MEMORY + size), (1, 4)]
     )
 
 
-def policy(seed: int = 0) -> Policy:
-    return Policy(Aero2().description, LAYOUT, weights(seed))
+def policy(seed: int = 0, layout: Layout = LAYOUT) -> Policy:
+    return Policy(Aero2().description, layout, weights(seed, layout))
 
 
-def env(**options: Any) -> Env:
+def env(layout: Layout = LAYOUT, **options: Any) -> Env:
     objective = InformationGain((True,) * 3, 1.0)
-    return Env.of(Aero2(), objective=objective, layout=LAYOUT, **options)
+    return Env.of(Aero2(), objective=objective, layout=layout, **options)
+
+
+def after(layout: Layout, samples: np.ndarray) -> tuple[np.ndarray, float]:
+    """Memory and action after these inputs, each with the measurement that follows it."""
+    window, action = empty_window(np, layout), np.zeros(1)
+    for k, (input, measured) in enumerate([(0.0, 0.7), *samples]):
+        if k:
+            window = with_input(np, layout, window, np.array([input]))
+        window = with_measurement(np, layout, window, np.array([measured]))
+        window, action = act(np, layout, weights(0, layout), window, k)
+    return window.memory, float(action[0])
+
+
+SAMPLES = np.random.default_rng(5).normal(size=(6, 2)) * [10, 0.3]
 
 
 def test_the_unit_is_that_of_torch():
@@ -69,14 +96,62 @@ def test_the_unit_is_that_of_torch():
         theirs = torch.zeros(1, MEMORY)
         for _ in range(20):
             seen = rng.normal(size=LAYOUT.size).astype(np.float32)
-            ours = remembered(np, weights()[:2], ours, seen)
+            ours = gated(np, LAYOUT, weights()[:2], ours, seen)
             theirs = cell(torch.from_numpy(seen)[None], theirs)
             np.testing.assert_allclose(ours, theirs[0].numpy(), atol=1e-6)
 
 
-def test_numpy_on_a_rig_and_jax_in_a_simulation_give_the_same_inputs():
-    rng, player = np.random.default_rng(2), PolicyPlayer(policy())
-    excitation = PolicyExcitation.of(policy())
+def test_a_sum_is_that_of_the_encoded_samples():
+    """Of every sample once; the measurement before the first input is none."""
+    (inner, inner_bias), (outer, bias), *_ = weights(0, SUM)
+    total = np.zeros(MEMORY)
+    for input, measured in SAMPLES:
+        seen = np.array([measured / SUM.output_scale[0], input / SUM.input_half[0]])
+        total += outer @ np.tanh(inner @ seen + inner_bias) + bias
+    np.testing.assert_allclose(after(SUM, SAMPLES)[0], total / np.sqrt(STEPS), atol=1e-5)
+    np.testing.assert_array_equal(after(SUM, SAMPLES[:0])[0], 0)
+
+
+def test_the_gradient_of_a_sum_is_that_of_differences():
+    """With respect to all weights of the encoder, along one direction."""
+    own, changes = weights(0, SUM), weights(1, SUM)
+    whole, changes = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), (own, changes))
+
+    @jax.jit
+    @jax.value_and_grad
+    def actions(step: jax.Array) -> jax.Array:
+        moved = jax.tree.map(lambda leaf, by: leaf + step * by, whole[:2], changes[:2])
+        window, total = empty_window(jnp, SUM), jnp.zeros(())
+        for k, (input, measured) in enumerate(SAMPLES):
+            window = with_input(jnp, SUM, window, input[None])
+            window = with_measurement(jnp, SUM, window, measured[None])
+            window, action = act(jnp, SUM, (*moved, *whole[2:]), window, jnp.asarray(k))
+            total += action[0]
+        return total
+
+    with jax.enable_x64():
+        (low, _), (_, slope), (high, _) = (actions(x) for x in (-1e-3, 0.0, 1e-3))
+    assert abs(slope) > 1e-2
+    np.testing.assert_allclose(slope, (high - low) / 2e-3, rtol=1e-2)
+
+
+def test_a_sum_does_not_depend_on_the_order_of_the_samples_and_a_unit_does():
+    """The action depends on the window, too: here of the newest two samples."""
+    orders = [[3, 0, 2, 1, 4, 5], [2, 3, 1, 0, 4, 5]]
+    kept, changed = (
+        [after(layout, SAMPLES[order]) for order in orders] for layout in (SUM, LAYOUT)
+    )
+    np.testing.assert_allclose(kept[0][0], kept[1][0], atol=1e-5)
+    assert kept[0][1] == pytest.approx(kept[1][1], abs=1e-5)
+    assert abs(changed[0][0] - changed[1][0]).max() > 1e-3
+    assert abs(changed[0][1] - changed[1][1]) > 1e-4
+    np.testing.assert_allclose(after(SUM, SAMPLES[::-1])[0], kept[0][0], atol=1e-5)
+
+
+@BOTH
+def test_numpy_on_a_rig_and_jax_in_a_simulation_give_the_same_inputs(layout):
+    rng, player = np.random.default_rng(2), PolicyPlayer(policy(0, layout))
+    excitation = PolicyExcitation.of(policy(0, layout))
     state = excitation.init(Aero2(), STEPS, jax.random.key(0))
     for k in range(STEPS):
         measured = rng.normal(size=1) * 0.3
@@ -121,15 +196,21 @@ def test_the_training_plays_what_the_simulation_plays():
     assert not np.allclose(experiments(process, without, keys, 0.9).nearness, sizes, rtol=1e-3)
 
 
-def test_it_travels_in_its_file_and_others_keep_theirs(tmp_path):
-    policy().save(tmp_path / "p.safetensors")
+@BOTH
+def test_it_travels_in_its_file_and_others_keep_theirs(tmp_path, layout):
+    policy(0, layout).save(tmp_path / "p.safetensors")
     read = ex.read_policy(tmp_path / "p.safetensors")
-    assert read.layout.memory == MEMORY
-    assert read.hash == policy().hash
+    assert read.layout == layout
+    assert read.hash == policy(0, layout).hash
     assert "5-4-1" in repr(read)
     run = run_episode(Aero2(), Aero2().nominal, PolicyExcitation.of(read), STEPS, jax.random.key(0))
     assert np.isfinite(run.inputs).all()
-    assert b'"memory' not in ex.read_policy("aero2").to_bytes()
+    assert b"memory" not in ex.read_policy("aero2").to_bytes()
+    assert (b"memory_kind" in read.to_bytes()) == (layout is SUM)
+
+
+def test_a_policy_with_a_unit_has_the_hash_it_had_before_there_were_sums():
+    assert policy().hash == "9848a71004145e5a38037aa1f013aaee99b96cb2bcd0f729208d11a39ccb5a94"
 
 
 def test_a_new_memory_keeps_most_of_what_it_holds():
@@ -140,8 +221,24 @@ def test_a_new_memory_keeps_most_of_what_it_holds():
     np.testing.assert_array_equal(bias[0], np.repeat([0, 1, 0], MEMORY))
     unit = tuple((np.zeros((3 * MEMORY, n)), np.asarray(b)) for n, b in
                  ((LAYOUT.size, into_bias[0]), (MEMORY, bias[0])))  # fmt: skip
-    after = remembered(np, unit, np.ones(MEMORY), np.zeros(LAYOUT.size))
+    after = gated(np, LAYOUT, unit, np.ones(MEMORY), np.zeros(LAYOUT.size))
     np.testing.assert_allclose(after, 1 / (1 + np.exp(-1)))
+
+
+def test_a_new_sum_is_of_the_size_of_its_terms_however_many_there_are():
+    for steps in (12, 1200):
+        layout = dataclasses.replace(SUM, num_steps=steps)
+        first: Any = started(env(layout), GradientSettings(hidden=(9,)), [0])[0].best.weights
+        (inner, _), (outer, _), (matrix, _), _ = unit = tuple(
+            tuple(p[0] for p in layer) for layer in first
+        )
+        assert (inner.shape, outer.shape, matrix.shape) == ((9, 2), (MEMORY, 9), (9, 5 + SUM.size))
+        memory, seen = np.zeros(MEMORY), np.ones(layout.size)
+        rng = np.random.default_rng(0)
+        for _ in range(steps):
+            seen[list(layout.newest)] = rng.normal(size=2)
+            memory = added(np, layout, unit[:2], memory, seen)
+        assert 0.1 < np.sqrt((memory**2).mean()) < 2
 
 
 def test_trainers_refuse_what_they_cannot_train():
@@ -151,12 +248,14 @@ def test_trainers_refuse_what_they_cannot_train():
         gymnasium.make("excite.environment.gymnasium:excite/Aero2-v0", layout=LAYOUT)
 
 
+@BOTH
 @pytest.mark.parametrize("part", range(4))
-def test_a_unit_that_does_not_fit_is_refused(part):
-    wrong = [list(layer) for layer in weights()]
+def test_a_unit_that_does_not_fit_is_refused(part, layout):
+    wrong = [list(layer) for layer in weights(0, layout)]
     wrong[part // 2][part % 2] = wrong[part // 2][part % 2][:-1]
-    with pytest.raises(ValueError, match="the unit of a memory of 5 numbers has other weights"):
-        Policy(Aero2().description, LAYOUT, tuple(map(tuple, wrong)))  # pyright: ignore[reportArgumentType]
+    for layers in (tuple(map(tuple, wrong)), ()):
+        with pytest.raises(ValueError, match="the unit of a memory of 5 numbers has other weights"):
+            Policy(Aero2().description, layout, layers)  # pyright: ignore[reportArgumentType]
 
 
 def test_a_unit_whose_weights_are_not_finite_and_a_negative_memory_are_refused():
@@ -168,13 +267,24 @@ def test_a_unit_whose_weights_are_not_finite_and_a_negative_memory_are_refused()
         Layout.of(Aero2.definition, memory=-1)
 
 
+def test_a_kind_of_memory_that_does_not_exist_or_is_of_none_is_refused():
+    with pytest.raises(ValueError, match="memory_kind must be 'gru' or 'sum': got 'lstm'"):
+        Layout.of(Aero2.definition, memory=3, memory_kind="lstm")
+    with pytest.raises(ValueError, match="memory_kind needs a memory: set memory, or"):
+        Layout.of(Aero2.definition, memory_kind="sum")
+    content = dataclasses.replace(policy(), layout=dataclasses.replace(LAYOUT, memory_kind="lstm"))
+    with pytest.raises(ValueError, match="policy: memory_kind must be 'gru' or 'sum': got 'lstm'"):
+        Policy.from_bytes(content.to_bytes())
+
+
 def test_one_observation_is_not_enough_for_an_action():
     with pytest.raises(ValueError, match="this policy has a memory of 5 numbers"):
         policy()(np.zeros(LAYOUT.size, np.float32))
 
 
-def test_other_runtimes_play_it_with_its_memory(tmp_path, monkeypatch, capsys):
-    policy().save(tmp_path / "p.safetensors")
+@BOTH
+def test_other_runtimes_play_it_with_its_memory(tmp_path, monkeypatch, capsys, layout):
+    policy(0, layout).save(tmp_path / "p.safetensors")
     words = "export", str(tmp_path / "p.safetensors"), "--onnx", str(tmp_path / "p.onnx")
     monkeypatch.setattr(sys, "argv", ["excite", *words])
     with pytest.raises(SystemExit, match="0"):
@@ -183,21 +293,24 @@ def test_other_runtimes_play_it_with_its_memory(tmp_path, monkeypatch, capsys):
     assert shown in capsys.readouterr().out
     path: Any = tmp_path / "p.onnx"
     session: Any = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
-    rng, window = np.random.default_rng(4), empty_window(np, LAYOUT)
-    seen, memory = np.zeros((2, LAYOUT.size), np.float32), np.zeros((2, MEMORY))
+    own, newest = weights(0, layout), layout.newest[0]
+    rng, window = np.random.default_rng(4), empty_window(np, layout)
+    seen, memory = np.zeros((2, layout.size), np.float32), np.zeros((2, MEMORY))
     for k in range(STEPS):
-        window = with_measurement(np, LAYOUT, window, rng.normal(size=1))
-        seen = np.repeat(observe(np, LAYOUT, window, k)[None], 2, axis=0)
+        window = with_input(np, layout, window, 10 * rng.normal(size=1))
+        window = with_measurement(np, layout, window, rng.normal(size=1))
+        seen = np.repeat(observe(np, layout, window, k)[None], 2, axis=0)
         action, memory = session.run(None, {"observation": seen, "memory": np.float32(memory)})
-        window, ours = act(np, LAYOUT, policy().weights, window, k)
+        window, ours = act(np, layout, own, window, k)
         np.testing.assert_allclose(action, [ours, ours], atol=1e-5)
         np.testing.assert_allclose(memory, [window.memory] * 2, atol=1e-5)
     for bad in (np.nan, np.inf):
-        seen[1, 0] = bad
+        seen[1, newest] = bad
         action, kept = session.run(None, {"observation": seen, "memory": np.float32(memory)})
-        spoilt = with_measurement(np, LAYOUT, window, np.array([bad]))
+        before = window._replace(outputs=np.roll(window.outputs, 1, axis=0))
+        spoilt = with_measurement(np, layout, before, np.array([bad]))
         with np.errstate(invalid="ignore"):
-            after, ours = act(np, LAYOUT, policy().weights, spoilt, STEPS - 1)
+            after, ours = act(np, layout, own, spoilt, STEPS - 1)
         np.testing.assert_allclose(action[1], ours, atol=1e-5)
         assert (float(ours[0]) == 0) == np.isnan(bad)
         np.testing.assert_array_equal(kept[1], np.asarray(memory, np.float32)[1])
@@ -206,13 +319,15 @@ def test_other_runtimes_play_it_with_its_memory(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.slow
-def test_it_is_trained_by_one_argument():
+def test_it_is_trained_by_its_arguments():
     made = ex.train(
-        "dc_motor", steps=20, window=1, memory=3, episodes=2, updates=2,
+        "dc_motor", steps=20, window=1, memory=3, memory_kind="sum", episodes=2, updates=2,
         training={**SMALL, "through_measurements": False},
     )  # fmt: skip
-    assert (made.layout.memory, made.layout.window) == (3, 1)
-    assert made.provenance["decision"]["memory"] == 3
+    assert (made.layout.memory, made.layout.window, made.layout.memory_kind) == (3, 1, "sum")
+    own = made.provenance["decision"]
+    assert (own["memory"], own["memory_kind"]) == (3, "sum")
+    assert [matrix.shape for matrix, _ in made.weights[:2]] == [(4, 3), (3, 4)]
     assert np.isfinite(ex.simulate("dc_motor", made).outputs).all()
 
 
@@ -221,11 +336,44 @@ def test_it_is_trained_by_one_argument():
     [
         ({"method": "ppo"}, "ppo trains policies without a memory"),
         ({"training": {"starts": 4}}, "several starts are for policies without a memory"),
+        ({"memory_kind": "lstm"}, "memory_kind must be 'gru' or 'sum', got \"lstm\""),
+        ({"memory": None, "memory_kind": "sum"}, "memory_kind needs a memory: set memory, or"),
+        ({"memory": 0, "memory_kind": "gru"}, "memory_kind needs a memory: set memory, or"),
     ],
 )
 def test_trainings_that_cannot_be_are_one_sentence(options, message):
     with pytest.raises(ValueError, match=message):
-        ex.train("dc_motor", steps=20, memory=3, **options)
+        ex.train("dc_motor", **{"steps": 20, "memory": 3, **options})
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--memory", "3", "--memory-kind", "lstm"], "'lstm' is not one of 'gru', 'sum'"),
+        (["--memory-kind", "sum"], "memory_kind needs a memory: set memory, or"),
+    ],
+)
+def test_kinds_that_cannot_be_are_refused_by_the_command(
+    words, message, tmp_path, monkeypatch, capsys
+):
+    own = ["excite", "train", "dc_motor", "--out", str(tmp_path / "run"), *words]
+    monkeypatch.setattr(sys, "argv", own)
+    with pytest.raises(SystemExit, match="2"):
+        main()
+    assert message in capsys.readouterr().err
+
+
+def test_an_agent_without_a_memory_has_no_kind_of_it_from_the_study():
+    shared, nothing = {"memory": 3, "memory_kind": "sum"}, {"window": 1}
+    own = {memory: AgentSettings(method="gradient", decision={"memory": memory, **nothing})
+           for memory in (0, 5)}  # fmt: skip
+    kinds = {m: Agent.of(a, shared, {}, {}).decision.memory_kind for m, a in own.items()}
+    assert kinds == {0: "gru", 5: "sum"}
+    marks = [
+        Agent.of(own[5], kind, {}, {}).settings(Aero2())
+        for kind in ({}, {"memory_kind": "gru"}, {"memory_kind": "sum"})
+    ]
+    assert marks[0] == marks[1] != marks[2]
 
 
 @pytest.mark.slow
@@ -247,11 +395,50 @@ def test_without_the_part_through_measurements_the_gradient_is_that_of_fixed_one
     assert not np.allclose(gradient(seeing, True), gradient(seeing, False), rtol=1e-3)
 
 
+class Beacon(AbstractStaticTask):
+    """Its outcome tells most of where it is beside it."""
+
+    definition = static_description(
+        "beacon",
+        designs=(ex.Input("place", "m", -4.0, 4.0),),
+        outcomes=(ex.Output("level", "", scale=1.0, noise_sd=0.1),),
+        parameters=(ex.Parameter("at", "m", 0.0, scale=1.0, positive=False),),
+    )
+
+    def outcome(self, design, params):
+        return 1 / (1 + (design - params.at) ** 2)
+
+
+@pytest.mark.slow
+def test_a_sum_learns_what_helps_to_choose_the_next_design():
+    """In nats, more than at first, and more than with an encoder of nothing."""
+    prior = plants_of(Beacon(), {"at": "normal:0:1.5"})
+    objective = InformationGain((True,), 1.0, 0.5, dense=False, prior=prior)
+    layout = Layout.of(Beacon.definition, 1, 8, memory=8, memory_kind="sum")
+    process = Env.of(Beacon(), objective=objective, layout=layout, prior=prior)
+    settings = GradientSettings(
+        num_updates=100, num_plants=64, learning_rate=1e-2, hidden=(16,), last_gain=0.3,
+        through_measurements=False,
+    )  # fmt: skip
+    course, keys = started(process, settings, [0])
+
+    def worth(now: Optimisation) -> float:
+        batches = [update_all(process, settings, now, keys(i), False, None)[1] for i in range(8)]
+        return float(np.mean([batch.worth for batch in batches]))
+
+    now = course.now
+    for i in range(settings.num_updates):
+        now, _ = update_all(process, settings, now, keys(i), False, None)
+    (first, last, *rest), zeros = now.player.weights, jnp.zeros_like
+    deaf = dataclasses.replace(now.player, weights=(first, jax.tree.map(zeros, last), *rest))
+    without = dataclasses.replace(now, player=deaf)
+    assert worth(now) > max(worth(course.now), worth(without)) + 0.2
+
+
 @pytest.mark.science
 def test_a_memory_finds_a_source_that_a_window_of_one_sample_does_not():
     from test_static_tasks import EXAMPLE
 
-    from excite.estimation.prior_knowledge import plants_of
     from excite.plant.catalogue import plant_named
 
     plant = plant_named(f"{EXAMPLE}:TwoSources")

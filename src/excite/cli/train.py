@@ -44,6 +44,9 @@ def _options(command: Any) -> Any:
                          help="Number of samples observed; default 80."),
             click.option("--memory", type=WholeNumber(0, 10_000),
                          help="Numbers that the policy carries from step to step; default none."),
+            click.option("--memory-kind", type=click.Choice(["gru", "sum"]),
+                         help="Gated recurrent unit (default), or sum of the encoded samples, "
+                         "whatever their order."),
             click.option("--clock", type=Number(), multiple=True, metavar="HZ",
                          help="Also observe sine and cosine of this frequency."),
             click.option("--change-price", type=Number(min=0), default=0.0, metavar="PRICE",

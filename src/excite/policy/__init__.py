@@ -1,6 +1,7 @@
 """Policies: a network and its contract (`contract`), in one file (`file`), or as ONNX (`onnx`)."""
 
 from .contract import FORMAT as FORMAT
+from .contract import NO_MEMORY as NO_MEMORY
 from .contract import AnyArray as AnyArray
 from .contract import Layout as Layout
 from .contract import Policy as Policy

@@ -39,7 +39,7 @@ AnyArray: TypeAlias = Any
 
 Weights: TypeAlias = tuple[tuple[AnyArray, AnyArray], ...]
 """Matrix [out, in] and bias [out] of every layer. Of a policy with a memory, the first two are its
-unit: gates from the observation and from the memory."""
+unit: gates from the observation and from the memory, or the encoder of a sample."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,9 @@ class Layout:
         input_middle, input_half: middle of each input's limits, and the largest distance
             from it: half their width, or less.
         clocks: frequencies of the clocks, in cycles a step, at most one half.
-        memory: numbers that the policy carries from step to step, by a gated recurrent unit.
+        memory: numbers that the policy carries from step to step.
+        memory_kind: how: `gru`, by a gated recurrent unit, or `sum`, as the sum of the encoded
+            samples.
     """
 
     window: int
@@ -68,6 +70,7 @@ class Layout:
     input_half: tuple[float, ...]
     clocks: tuple[float, ...] = ()
     memory: int = 0
+    memory_kind: str = "gru"
 
     @classmethod
     def of(
@@ -76,14 +79,22 @@ class Layout:
         window: int = 80,
         num_steps: int = 500,
         memory: int = 0,
+        memory_kind: str = "gru",
     ) -> Layout:
         """The layout for a plant, scaled by its outputs' scales and its input limits.
 
         Raises:
-            ValueError: where a length is below one, or the memory's below zero.
+            ValueError: where a length is below one, or the memory's below zero; for a kind of
+                memory that does not exist, or of none.
         """
         if memory < 0:
             raise ValueError(f"memory must not be negative: got {memory}")
+        if memory_kind not in MEMORIES:
+            raise ValueError(
+                f"memory_kind must be {' or '.join(map(repr, MEMORIES))}: got {memory_kind!r}"
+            )
+        if memory_kind != "gru" and not memory:
+            raise ValueError(NO_MEMORY)
         if window < 1 or num_steps < 1:
             raise ValueError(
                 f"window and num_steps must be at least 1: got {window} and {num_steps}"
@@ -95,13 +106,25 @@ class Layout:
             input_middle=tuple((i.lower + i.upper) / 2 for i in description.inputs),
             input_half=tuple((i.upper - i.lower) / 2 for i in description.inputs),
             memory=memory,
+            memory_kind=memory_kind,
         )
 
     @property
     def size(self) -> int:
         """Numbers in an observation."""
-        width = len(self.output_scale) + len(self.input_half)
-        return self.window * width + 1 + 2 * len(self.clocks)
+        return self.progress + 1 + 2 * len(self.clocks)
+
+    @property
+    def progress(self) -> int:
+        """Where an observation has k / num_steps: after the window."""
+        return self.window * (len(self.output_scale) + len(self.input_half))
+
+    @property
+    def newest(self) -> tuple[int, ...]:
+        """Where an observation has the newest sample: the measurement, and the input before it."""
+        first = self.window * len(self.output_scale)
+        outputs = range(first - len(self.output_scale), first)
+        return (*outputs, *range(self.progress - len(self.input_half), self.progress))
 
 
 class Window(NamedTuple):
@@ -160,19 +183,39 @@ def forward(
     return xp.where(xp.isfinite(action), xp.clip(action, -1.0, 1.0), if_not_finite)
 
 
-def remembered(
-    xp: ModuleType, weights: Weights, memory: AnyArray, observation: AnyArray
+def gated(
+    xp: ModuleType, layout: Layout, weights: Weights, memory: AnyArray, observation: AnyArray
 ) -> AnyArray:
     """The memory after one more observation: a gated recurrent unit.
 
     K. Cho et al., Learning phrase representations using RNN encoder-decoder, EMNLP 2014. The reset
     gate acts on what the memory's matrix made of the memory.
     """
+    del layout
     (into, into_bias), (back, back_bias) = weights
     new = xp.split(into @ observation + into_bias, 3)
     old = xp.split(back @ memory + back_bias, 3)
     reset, keep = (0.5 + 0.5 * xp.tanh((new[i] + old[i]) / 2) for i in (0, 1))
     return (1 - keep) * xp.tanh(new[2] + reset * old[2]) + keep * memory
+
+
+def added(
+    xp: ModuleType, layout: Layout, weights: Weights, memory: AnyArray, observation: AnyArray
+) -> AnyArray:
+    """The memory after one more sample: the sum of all encoded ones, whatever their order.
+
+    M. Zaheer et al., Deep sets, NeurIPS 2017. A sample is a measurement and the input before it;
+    the measurement of step 0 has none. The sum over the root of num_steps does not grow with it.
+    """
+    encoded = network(xp, weights, observation[np.array(layout.newest)])
+    is_sample = observation[layout.progress] > 0
+    return memory + xp.where(is_sample, encoded / math.sqrt(layout.num_steps), 0.0)
+
+
+MEMORIES = {"gru": gated, "sum": added}
+"""Kinds of memory, and how each goes on with one more observation."""
+
+NO_MEMORY = "memory_kind needs a memory: set memory, or leave memory_kind out"
 
 
 def act(
@@ -192,7 +235,8 @@ def act(
     """
     seen = observe(xp, layout, window, k)
     if layout.memory:
-        memory = remembered(xp, weights[:2], window.memory, seen)
+        remembered = MEMORIES[layout.memory_kind]
+        memory = remembered(xp, layout, weights[:2], window.memory, seen)
         action = network(xp, weights[2:], xp.concatenate([memory, seen]))
         memory = xp.where(xp.all(xp.isfinite(seen)), memory, window.memory)
         action = xp.where(xp.isfinite(action), xp.tanh(action), if_not_finite)
@@ -405,9 +449,9 @@ class Policy:
 
 
 def _layout_data(layout: Layout) -> dict[str, Any]:
-    """The layout as JSON-ready data; without a memory as before there were any, so is the hash."""
-    content = dataclasses.asdict(layout)
-    return content if layout.memory else {k: v for k, v in content.items() if k != "memory"}
+    """The layout as JSON-ready data; as before there were any without a memory or its kind."""
+    unused = ("memory", 0), ("memory_kind", "gru")
+    return {k: v for k, v in dataclasses.asdict(layout).items() if (k, v) not in unused}
 
 
 def _check_layout(layout: Layout, plant: PlantDescription) -> None:
@@ -415,7 +459,7 @@ def _check_layout(layout: Layout, plant: PlantDescription) -> None:
     whole = layout.window, layout.num_steps, layout.memory
     if not all(type(n) is int and n < _MAX_COUNT for n in whole):
         raise ValueError("window, num_steps and memory of a layout are whole numbers")
-    usual = Layout.of(plant, *whole)
+    usual = Layout.of(plant, *whole, layout.memory_kind)
     free = {n: getattr(layout, n) for n in ("output_scale", "input_half", "clocks")}
     if layout != dataclasses.replace(usual, **free) or not all(math.isfinite(n) for n in numbers):
         raise ValueError("the observation layout does not belong to the policy's plant")
@@ -467,8 +511,12 @@ def _check_layers(weights: Weights, layout: Layout) -> None:
     """Raises ValueError where the layers do not fit each other, the layout or the plant."""
     width, first = layout.size, 0
     if layout.memory:
-        gates = 3 * layout.memory
-        shapes = [(gates, width), (gates,), (gates, layout.memory), (gates,)]
+        if layout.memory_kind == "sum":
+            inner = weights[0][1].size if weights else 0
+            matrices = (inner, len(layout.newest)), (layout.memory, inner)
+        else:
+            matrices = (3 * layout.memory, width), (3 * layout.memory, layout.memory)
+        shapes = [shape for matrix in matrices for shape in (matrix, matrix[:1])]
         if [part.shape for layer in weights[:2] for part in layer] != shapes:
             raise ValueError(f"the unit of a memory of {layout.memory} numbers has other weights")
         width, first = width + layout.memory, 2

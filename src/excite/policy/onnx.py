@@ -7,6 +7,7 @@ the window; it is in the model's metadata as JSON, as in the policy's file.
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -118,7 +119,48 @@ def _network(policy: Policy) -> tuple[list[NodeProto], dict[str, np.ndarray]]:
 
 
 def _unit(policy: Policy) -> tuple[list[NodeProto], dict[str, np.ndarray]]:
-    """Nodes and constants of `policy.remembered`; ONNX has the gates keep, reset, candidate."""
+    """Nodes and constants of the memory, and of what the layers after it see."""
+    nodes, constants = _sum(policy) if policy.layout.memory_kind == "sum" else _gru(policy)
+    nodes += [
+        helper.make_node("Concat", ["new", "observation"], ["seen"], axis=1),
+        # Zero times what is not finite is NaN: such an observation is not remembered.
+        helper.make_node("Mul", ["observation", "zero"], ["nothing"]),
+        helper.make_node("ReduceSum", ["nothing", "last"], ["sum"]),
+        helper.make_node("IsNaN", ["sum"], ["is_unseen"]),
+        helper.make_node("Where", ["is_unseen", "memory", "new"], ["next_memory"]),
+    ]
+    return nodes, {"last": np.array([1], np.int64)} | constants
+
+
+def _sum(policy: Policy) -> tuple[list[NodeProto], dict[str, np.ndarray]]:
+    """Nodes and constants of `policy.contract.added`."""
+    layout, ((first, first_bias), (last, last_bias)) = policy.layout, policy.weights[:2]
+    root = np.float32(math.sqrt(layout.num_steps))
+    constants = {
+        "newest": np.array(layout.newest, np.int64),
+        "progress": np.array([layout.progress], np.int64),
+        "encoder.0.weight": first,
+        "encoder.0.bias": first_bias,
+        "encoder.1.weight": last / root,
+        "encoder.1.bias": last_bias / root,
+    }
+    hidden = ["sample", "encoder.0.weight", "encoder.0.bias"]
+    encoded = ["inner", "encoder.1.weight", "encoder.1.bias"]
+    nodes = [
+        helper.make_node("Gather", ["observation", "newest"], ["sample"], axis=1),
+        helper.make_node("Gemm", hidden, ["inner_sum"], transB=1),
+        helper.make_node("Tanh", ["inner_sum"], ["inner"]),
+        helper.make_node("Gemm", encoded, ["encoded"], transB=1),
+        helper.make_node("Gather", ["observation", "progress"], ["done"], axis=1),
+        helper.make_node("Greater", ["done", "zero"], ["is_sample"]),
+        helper.make_node("Where", ["is_sample", "encoded", "zero"], ["more"]),
+        helper.make_node("Add", ["memory", "more"], ["new"]),
+    ]
+    return nodes, constants
+
+
+def _gru(policy: Policy) -> tuple[list[NodeProto], dict[str, np.ndarray]]:
+    """Nodes and constants of `policy.contract.gated`; ONNX has the gates keep, reset, candidate."""
     memory = policy.layout.memory
 
     def ordered(array: np.ndarray) -> np.ndarray:
@@ -128,7 +170,6 @@ def _unit(policy: Policy) -> tuple[list[NodeProto], dict[str, np.ndarray]]:
     (into, into_bias), (back, back_bias) = policy.weights[:2]
     constants = {
         "first": np.array([0], np.int64),
-        "last": np.array([1], np.int64),
         "unit.W": ordered(into),
         "unit.R": ordered(back),
         "unit.B": np.concatenate([ordered(into_bias), ordered(back_bias)], axis=1),
@@ -139,11 +180,5 @@ def _unit(policy: Policy) -> tuple[list[NodeProto], dict[str, np.ndarray]]:
         helper.make_node("Unsqueeze", ["memory", "first"], ["before"]),
         helper.make_node("GRU", words, ["", "after"], hidden_size=memory, linear_before_reset=1),
         helper.make_node("Squeeze", ["after", "first"], ["new"]),
-        helper.make_node("Concat", ["new", "observation"], ["seen"], axis=1),
-        # Zero times what is not finite is NaN: such an observation is not remembered.
-        helper.make_node("Mul", ["observation", "zero"], ["nothing"]),
-        helper.make_node("ReduceSum", ["nothing", "last"], ["sum"]),
-        helper.make_node("IsNaN", ["sum"], ["is_unseen"]),
-        helper.make_node("Where", ["is_unseen", "memory", "new"], ["next_memory"]),
     ]
     return nodes, constants

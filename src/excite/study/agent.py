@@ -29,7 +29,7 @@ from ..estimation.prior import PriorPlants
 from ..estimation.prior_knowledge import plants_of
 from ..plant import AbstractARXPlant, AbstractPlant
 from ..plant.uncertainty import Range, Uncertainty
-from ..policy import Layout
+from ..policy import NO_MEMORY, Layout
 from ..safety import watched_levels
 from ..training.settings import AGAINST_UNCERTAINTY, ONE_START, GradientSettings, PPOSettings
 from .settings import (
@@ -89,6 +89,7 @@ class DecisionSettings(RewardSettings):
         terms: several rewards instead of one, which are added.
         window: number of samples observed.
         memory: numbers that the policy carries from step to step (by gradient), beside the window.
+        memory_kind: `gru`, a gated recurrent unit, or `sum`, of the encoded samples.
         clocks: frequencies [Hz] whose sine and cosine are observed too.
         output_scale: y_max by output, in its unit, where it differs from the output's scale.
         input_amplitude: by input, in its unit, how far from the middle of its limits the
@@ -102,6 +103,7 @@ class DecisionSettings(RewardSettings):
     terms: Annotated[list[RewardSettings], Field(min_length=1)] = []
     window: Annotated[Count, Field(le=10_000)] = 80
     memory: Annotated[int, Field(ge=0, le=10_000, strict=True)] = 0
+    memory_kind: Literal["gru", "sum"] = "gru"
     clocks: list[Positive] = []
     output_scale: dict[str, Positive] = {}
     input_amplitude: dict[str, Positive] = {}
@@ -160,6 +162,8 @@ class Agent:
         replaced = {"terms"} if "reward" in own.decision else set()
         if "terms" in own.decision:
             replaced = set(RewardSettings.model_fields)
+        if own.decision.get("memory") == 0:  # the kind is for the other agents
+            replaced.add("memory_kind")
         shared = {name: value for name, value in decision.items() if name not in replaced}
         process = checked(DecisionSettings, {**shared, **own.decision}, "decision", REWARD_TABLES)
         _require_one_reward(process)
@@ -170,6 +174,8 @@ class Agent:
         if len(set(targets)) < len(targets):
             raise ValueError(f"targets must differ from each other, got {', '.join(targets)}")
         chosen = checked(METHODS[own.method], {**training, **own.training}, "training")
+        if "memory_kind" in process.model_fields_set and not process.memory:
+            raise ValueError(NO_MEMORY)
         if process.memory and own.method == "ppo":
             raise ValueError("ppo trains policies without a memory: take the method gradient")
         if process.memory and isinstance(chosen, GradientSettings) and chosen.starts > 1:
@@ -231,7 +237,8 @@ class Agent:
 
     def _layout(self, plant: AbstractPlant, num_steps: int) -> Layout:
         decision, outputs = self.decision, plant.definition.outputs
-        usual = Layout.of(plant.description, decision.window, num_steps, decision.memory)
+        remembers = decision.memory, decision.memory_kind
+        usual = Layout.of(plant.description, decision.window, num_steps, *remembers)
         halves = dict(zip(names_of(plant.definition.inputs), usual.input_half, strict=True))
         for name in decision.output_scale:
             if name not in names_of(outputs):
@@ -343,8 +350,11 @@ class Agent:
         # Settings that were added later enter only where they are used, so that the
         # fingerprints of earlier trainings stay valid.
         later = {"clocks", "criterion", "max_sensitivity", "input_amplitude", "spread", "dense"}
-        later |= {"constants", "terms", "uncertainty", "memory", "change_price", "contrast_plants"}
+        later |= {"constants", "terms", "uncertainty", "memory", "memory_kind", "change_price"}
+        later |= {"contrast_plants"}
         process = self.decision.model_dump(exclude=later - self.decision.model_fields_set)
+        if self.decision.memory_kind == "gru":
+            process.pop("memory_kind", None)
         for term, own in zip(process.get("terms", ()), self.decision.terms, strict=False):
             for name in {"change_price", "contrast_plants"} - own.model_fields_set:
                 del term[name]

@@ -30,6 +30,7 @@ def train(
     goal: Mapping[str, float] | None = None,
     window: int | None = None,
     memory: int | None = None,
+    memory_kind: str | None = None,
     clock: float | Sequence[float] = (),
     change_price: float = 0.0,
     training: Mapping[str, object] | None = None,
@@ -70,8 +71,10 @@ def train(
         target: parameters in the objective, default the plant's targets.
         goal: relative error that is scaled to one, by parameter.
         window: number of samples observed, default 80.
-        memory: numbers that the policy carries from step to step, by a gated recurrent unit;
-            default none. With a memory, a window of one sample is enough. By gradient only.
+        memory: numbers that the policy carries from step to step; default none. With a memory, a
+            window of one sample is enough. By gradient only.
+        memory_kind: `gru` (default), a gated recurrent unit, or `sum`, of the encoded samples,
+            which does not depend on their order: for tasks without memory.
         clock: frequencies [Hz] whose sine and cosine are observed too.
         change_price: of the squared change of an input from step to step [1 / input unit²],
             subtracted from the objective, which must be information.
@@ -124,6 +127,7 @@ def train(
         "output_scale": by_name("output_scale", output_scale, "a dict by output"),
         "window": window,
         "memory": memory,
+        "memory_kind": memory_kind,
         "clocks": _several("clock", clock, Real, "a frequency in Hz, or several"),
         "uncertainty": by_name("uncertainty", uncertainty, "a dict of ranges by name"),
     }

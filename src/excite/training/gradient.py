@@ -444,6 +444,10 @@ def _first_weights(env: Env, settings: GradientSettings, key: PRNGKeyArray) -> W
     if not memory:
         return layers
     into_key, back_key = jax.random.split(jax.random.fold_in(key, 1))
+    if layout.memory_kind == "sum":
+        inner = settings.hidden[0]
+        encoder = _layer(into_key, len(layout.newest), inner), _layer(back_key, inner, memory)
+        return *encoder, *layers
     into = _layer(into_key, layout.size, 3 * memory)
     back = jax.nn.initializers.orthogonal(column_axis=0)(
         back_key, (3 * memory, memory), jnp.float32
@@ -495,11 +499,8 @@ def _linear_start(env: Env, settings: GradientSettings, key: PRNGKeyArray) -> We
     """
     weights_key, gain_key, direction_key = jax.random.split(key, 3)
     weights = list(_first_weights(env, settings, weights_key))
-    layout, width = env.layout, len(env.layout.output_scale)
-    count = len(layout.input_half)
-    outputs = (layout.window - 1) * width + np.arange(width)
-    inputs = layout.window * width + (layout.window - 1) * count + np.arange(count)
-    newest, own = np.concatenate([outputs, inputs]), np.arange(count)
+    newest, count = np.array(env.layout.newest), len(env.layout.input_half)
+    own = np.arange(count)
     low, high = np.log(_GAINS)
     gain = jnp.exp(jax.random.uniform(gain_key, (count, 1), jnp.float32, low, high))
     direction = jax.random.normal(direction_key, (count, len(newest)), jnp.float32)

@@ -57,7 +57,8 @@ class GradientSettings(_Checked):
         num_plants: plants of each step.
         learning_rate: of Adam, decaying to zero by a cosine.
         max_grad_norm: a longer gradient is scaled down to this norm.
-        hidden: widths of the hidden layers, tanh.
+        hidden: widths of the hidden layers, tanh; the first is also that of the encoder of a
+            memory that is a sum.
         last_gain: scale of the last layer's initial weights; with large ones training diverges.
         starts: first policies that are compared, of which the best is trained: with more than one
             they begin as random linear feedbacks of the newest measurement and the last input.
