@@ -49,7 +49,7 @@ class Probe(AbstractObjective):
     first: float = 0.5
     later: float = 0.5
 
-    def init(self, plant, measured):
+    def init(self, plant, measured, key):
         return jnp.zeros(())
 
     def update(self, plant, memory, sample, k):

@@ -31,9 +31,10 @@ def _options(command: Any) -> Any:
             click.option("--method", type=click.Choice(["gradient", "ppo"]), default="gradient",
                          show_default=True, help="Gradient of the simulated experiment, or PPO."),
             click.option("--objective", multiple=True, metavar="NAME[=WEIGHT]",
-                         help="Criterion of the Fisher information (D, A, E), or errors of the ARX "
-                         "estimator (relative, log, goals) or of nonlinear least squares (nls); "
-                         "repeated, a sum with these weights. Default D."),
+                         help="Criterion of the Fisher information (D, A, E), a lower bound of the "
+                         "expected information gain (sPCE), or errors of the ARX estimator "
+                         "(relative, log, goals) or of nonlinear least squares (nls); repeated, a "
+                         "sum with these weights. Default D."),
             click.option("--target", multiple=True, metavar="NAME",
                          help="Parameter in the objective; default the plant's targets."),
             click.option("--goal", type=NUMBERS, multiple=True,
