@@ -176,3 +176,9 @@ def test_an_option_that_is_not_allowed_is_refused(option, allowed):
 def test_a_task_without_noise_is_refused():
     with pytest.raises(ValueError, match="noise"):
         ex.information_gain(Line, "myopic", prior=PRIOR, noise={"height": 0.0})
+
+
+def test_more_designs_than_asked_for_are_refused():
+    chosen = Myopic.of(Line, PRIOR)
+    with pytest.raises(ValueError, match="all 3 designs are chosen: make a state for more"):
+        played(chosen, OUTCOMES[:3], count=3)

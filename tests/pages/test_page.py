@@ -596,6 +596,36 @@ def test_a_plot_is_saved_as_it_is_shown(address: str, page: Page, tmp_path: Path
     assert [len(line.attrib["points"].split()) for line in lines] == [2, 3, 6, 11]
 
 
+def test_labels_of_an_axis_differ_and_the_last_one_is_not_cut(
+    address: str, page: Page, tmp_path: Path
+):
+    """Also of seconds since 1970, of which six digits are equal."""
+    page.goto(address)
+    page.evaluate("""async () => {
+      const { Plot } = await import("/static/plot.js"), { el } = await import("/static/api.js");
+      const place = el("div", { id: "place" }), x = [0, 0.5, 1, 1.5, 2];
+      for (const i in x) x[i] += 1732718858;
+      document.querySelector("main").prepend(place);
+      const plot = new Plot(place, "Volt", "a");
+      const lines = [{ x, y: [5000, 5000.1, 5000.2, 5000.3, 5000.4], name: "u", color: "output" }];
+      plot.show({ x: [x[0], x[4]], y: [5000, 5000.4], unit: "s", lines });
+    }""")
+    poll(page, PLOT.format("#place .chart", 0) + ".u?.scales.x.max === 1732718860")
+    with page.expect_download() as waiting:
+        page.locator("#place").get_by_role("button", name="SVG").click()
+    waiting.value.save_as(tmp_path / "SVG")
+    drawing = ElementTree.fromstring((tmp_path / "SVG").read_text())
+    texts = list(drawing.iterfind(".//{*}text[@text-anchor='middle']"))
+    words = [str(text.text) for text in texts]
+    assert len(set(words)) == len(words) > 1
+    assert words[-1] == "1732718860 s"
+    width = float(drawing.attrib["viewBox"].split()[2])
+    for text in texts:  # a character is about 6.7 px wide
+        assert float(text.attrib["x"]) + 3.4 * len(str(text.text)) <= width
+    heights = [text.text for text in drawing.iterfind(".//{*}text[@text-anchor='end']")]
+    assert len(set(heights)) == len(heights) > 1
+
+
 def test_very_many_samples_are_saved_in_a_small_drawing(address: str, page: Page, tmp_path: Path):
     """With the first, last, smallest and largest of them, as points and as a line."""
     page.goto(address)

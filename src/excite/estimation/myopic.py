@@ -177,11 +177,23 @@ class Myopic(AbstractExcitation):
         designs = jnp.zeros((num_steps, len(d.inputs)))
         return Known(drawn, designs, jnp.zeros((num_steps, len(d.outputs))), jnp.asarray(0), key)
 
-    @eqx.filter_jit
     def __call__(
         self, state: Known, measurement: Float[Array, " output"]
     ) -> tuple[Known, Float[Array, " input"]]:
-        """The next design, after the outcome of the last one; the first call has none yet."""
+        """The next design, after the outcome of the last one; the first call has none yet.
+
+        Raises:
+            ValueError: for more designs than the state was made for.
+        """
+        count = len(state.designs)
+        if not isinstance(state.k, jax.core.Tracer) and int(state.k) >= count:
+            raise ValueError(f"all {count} designs are chosen: make a state for more (init)")
+        return self._next(state, measurement)
+
+    @eqx.filter_jit
+    def _next(
+        self, state: Known, measurement: Float[Array, " output"]
+    ) -> tuple[Known, Float[Array, " input"]]:
         learnt = self.learnt(state, measurement)
         known = jax.tree.map(lambda new, old: jnp.where(state.k > 0, new, old), learnt, state)
         key, own = jax.random.split(known.key)

@@ -37,7 +37,13 @@ export function digits(value, uncertainty) {
   return Number.isFinite(count) ? Math.min(12, Math.max(3, count)) : 5;
 }
 
-const label = (value) => String(+value.toPrecision(6)).replace("-", "−");
+/** Labels of ticks, with so many digits that they differ. */
+function labels(found) {
+  const size = Math.max(...found.map(Math.abs)), digits = Math.ceil(Math.log10(size / (found[1] - found[0]))) + 2;
+  return found.map((value) => String(+value.toPrecision(Math.min(15, Math.max(6, digits || 6)))).replace("-", "−"));
+}
+/** Those of an axis whose last one has the unit. */
+const withUnit = (found, unit) => labels(found).map((word, i) => word + (i === found.length - 1 && unit ? ` ${unit}` : ""));
 const isNumber = (value) => value !== null && value !== undefined && Number.isFinite(value);
 
 /** A range with a little room, that always holds some numbers. */
@@ -205,7 +211,12 @@ export class Plot {
   get lines() { return this.what.lines.filter((line) => !this.hidden.has(line.name)); }
 
   /** To the right of the axis [px]: for half of its last label, which has the unit. */
-  get room() { return Math.max(18, 4 * (this.what.unit ?? "").length + 8); }
+  get room() {
+    const [low, high] = this.group.zoom ?? this.what.x, found = ticks(low, high, Math.max(2, this.chart.clientWidth / 90));
+    const half = 3.5 * (withUnit(found, this.what.unit).at(-1) ?? "").length + 4;
+    const rest = ((high - (found.at(-1) ?? high)) / (high - low)) * (this.chart.clientWidth - 54 - half);
+    return Math.max(18, half - rest);
+  }
 
   get size() { return { width: this.chart.clientWidth, height: this.chart.clientHeight }; }
 
@@ -249,11 +260,11 @@ export class Plot {
     const axis = { stroke: soft, grid, ticks: { show: false }, font: "12px system-ui, sans-serif" };
     const { unit, log } = this.what;
     return {
-      ...this.size, legend: { show: false }, padding: [8, this.room, 0, 0],
+      ...this.size, legend: { show: false }, padding: [8, () => this.room, 0, 0],
       scales: { x: { time: false, range: () => this.group.zoom ?? this.what.x }, y: { range: () => this.reach() } },
       axes: [
-        { ...axis, size: 26, splits: (u, i, low, high) => ticks(low, high, Math.max(2, u.bbox.width / devicePixelRatio / 90)), values: (u, found) => found.map((x, i) => label(x) + (i === found.length - 1 && unit ? ` ${unit}` : "")) },
-        { ...axis, size: 54, gap: 4, splits: (u, i, low, high) => ticks(low, high, 4).filter((y) => !log || Math.abs(y - Math.round(y)) < 1e-6), values: (u, found) => found.map((y) => (log ? shown(10 ** y, 1) : label(y))) },
+        { ...axis, size: 26, splits: (u, i, low, high) => ticks(low, high, Math.max(2, u.bbox.width / devicePixelRatio / 90)), values: (u, found) => withUnit(found, unit) },
+        { ...axis, size: 54, gap: 4, splits: (u, i, low, high) => ticks(low, high, 4).filter((y) => !log || Math.abs(y - Math.round(y)) < 1e-6), values: (u, found) => (log ? found.map((y) => shown(10 ** y, 1)) : labels(found)) },
       ],
       cursor: {
         sync: { key: this.group.sync.key, scales: ["x", null] }, y: false,
@@ -325,7 +336,7 @@ export class Plot {
       return shown(log && isNumber(value) ? 10 ** value : value, 4);
     };
     const isAlone = this.lines.length === 1 && !this.lines[0].name;
-    this.read.textContent = x === null || x === undefined ? "" : `${label(x)} ${unit ?? ""}${isAlone ? `: ${at(this.lines[0])}` : ""}`;
+    this.read.textContent = x === null || x === undefined ? "" : `${labels([x, x + (this.what.x[1] - this.what.x[0]) / 1000])[0]} ${unit ?? ""}${isAlone ? `: ${at(this.lines[0])}` : ""}`;
     for (const button of this.legend.children) {
       const line = this.lines.find(({ name }) => name === button.dataset.name);
       button.lastChild.textContent = line && x !== null && x !== undefined ? ` ${at(line)}` : "";
@@ -432,9 +443,10 @@ export class Plot {
     const text = (x, y, anchor, word, color = "soft") => `<text x="${x}" y="${y}" text-anchor="${anchor}" fill="${colour(color)}">${word.replaceAll("&", "&amp;").replaceAll("<", "&lt;")}</text>`;
     const line = (points, color, more = "") => `<polyline points="${points.join(" ")}" fill="none" stroke="${colour(color)}" ${more}/>`;
     const { log, unit, levels = [], bands = [], marks = [] } = this.what, times = ticks(x0, x1, Math.max(2, (right - left) / 90));
+    const under = withUnit(times, unit), heights = ticks(y0, y1, 4).filter((y) => !log || Math.abs(y - Math.round(y)) < 1e-6), beside = labels(heights);
     const grid = [
-      ...times.map((x, i) => line([`${X(x)},${top}`, `${X(x)},${bottom}`], "line") + text(X(x), height - 8, "middle", label(x) + (i === times.length - 1 && unit ? ` ${unit}` : ""))),
-      ...ticks(y0, y1, 4).filter((y) => !log || Math.abs(y - Math.round(y)) < 1e-6).map((y) => line([`${left},${Y(y)}`, `${right},${Y(y)}`], "line") + text(left - 6, Y(y) + 4, "end", log ? shown(10 ** y, 1) : label(y))),
+      ...times.map((x, i) => line([`${X(x)},${top}`, `${X(x)},${bottom}`], "line") + text(X(x), height - 8, "middle", under[i])),
+      ...heights.map((y, i) => line([`${left},${Y(y)}`, `${right},${Y(y)}`], "line") + text(left - 6, Y(y) + 4, "end", log ? shown(10 ** y, 1) : beside[i])),
     ];
     const band = ({ x, lower, upper, color }) => `<polygon points="${[...x.map((v, i) => `${X(v)},${Y(lower[i])}`), ...x.map((v, i) => `${X(v)},${Y(upper[i])}`).reverse()].join(" ")}" fill="${colour(color)}"/>`;
     const level = ({ y, until, color, word }) => {
