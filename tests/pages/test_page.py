@@ -607,8 +607,8 @@ def test_labels_of_an_axis_differ_and_the_last_one_is_not_cut(
       for (const i in x) x[i] += 1732718858;
       document.querySelector("main").prepend(place);
       const plot = new Plot(place, "Volt", "a");
-      const lines = [{ x, y: [5000, 5000.1, 5000.2, 5000.3, 5000.4], name: "u", color: "output" }];
-      plot.show({ x: [x[0], x[4]], y: [5000, 5000.4], unit: "s", lines });
+      const lines = [{ x, y: x, name: "u", color: "output" }];
+      plot.show({ x: [x[0], x[4]], y: [x[0], x[4]], unit: "s", lines });
     }""")
     poll(page, PLOT.format("#place .chart", 0) + ".u?.scales.x.max === 1732718860")
     with page.expect_download() as waiting:
@@ -624,6 +624,10 @@ def test_labels_of_an_axis_differ_and_the_last_one_is_not_cut(
         assert float(text.attrib["x"]) + 3.4 * len(str(text.text)) <= width
     heights = [text.text for text in drawing.iterfind(".//{*}text[@text-anchor='end']")]
     assert len(set(heights)) == len(heights) > 1
+    left = min(
+        float(text.attrib["x"]) for text in drawing.iterfind(".//{*}text[@text-anchor='end']")
+    )
+    assert left >= 6.7 * max(len(str(height)) for height in heights)
 
 
 def test_very_many_samples_are_saved_in_a_small_drawing(address: str, page: Page, tmp_path: Path):

@@ -264,7 +264,7 @@ export class Plot {
       scales: { x: { time: false, range: () => this.group.zoom ?? this.what.x }, y: { range: () => this.reach() } },
       axes: [
         { ...axis, size: 26, splits: (u, i, low, high) => ticks(low, high, Math.max(2, u.bbox.width / devicePixelRatio / 90)), values: (u, found) => withUnit(found, unit) },
-        { ...axis, size: 54, gap: 4, splits: (u, i, low, high) => ticks(low, high, 4).filter((y) => !log || Math.abs(y - Math.round(y)) < 1e-6), values: (u, found) => (log ? found.map((y) => shown(10 ** y, 1)) : labels(found)) },
+        { ...axis, size: (u, found) => Math.max(54, ...(found ?? []).map((word) => 6.8 * (word ?? "").length + 8)), gap: 4, splits: (u, i, low, high) => ticks(low, high, 4).filter((y) => !log || Math.abs(y - Math.round(y)) < 1e-6), values: (u, found) => (log ? found.map((y) => shown(10 ** y, 1)) : labels(found)) },
       ],
       cursor: {
         sync: { key: this.group.sync.key, scales: ["x", null] }, y: false,
@@ -438,7 +438,7 @@ export class Plot {
   /** What is drawn on the canvas, in the same order. */
   svg() {
     const { width, height } = this.size, { x: { min: x0, max: x1 }, y: { min: y0, max: y1 } } = this.u.scales;
-    const left = 54, right = width - this.room, top = 8, bottom = height - 26, two = (v) => +v.toFixed(2);
+    const left = this.u.bbox.left / devicePixelRatio, right = width - this.room, top = 8, bottom = height - 26, two = (v) => +v.toFixed(2);
     const X = (x) => two(left + ((x - x0) / (x1 - x0)) * (right - left)), Y = (y) => two(bottom - ((y - y0) / (y1 - y0)) * (bottom - top));
     const text = (x, y, anchor, word, color = "soft") => `<text x="${x}" y="${y}" text-anchor="${anchor}" fill="${colour(color)}">${word.replaceAll("&", "&amp;").replaceAll("<", "&lt;")}</text>`;
     const line = (points, color, more = "") => `<polyline points="${points.join(" ")}" fill="none" stroke="${colour(color)}" ${more}/>`;
