@@ -88,10 +88,10 @@ function preview() {
   }
 }
 
-/** A cell of the file: a number with a fraction has six digits, or all before the point; its title is the whole of it. */
+/** A cell of the file: a number with a fraction has six digits, or three behind the point; its title is the whole of it. */
 function cell(text) {
   if (!/^-?\d*\.\d+(e[-+]?\d+)?$/i.test(text)) return el("td", {}, text);
-  const value = +(+text).toPrecision(Math.max(6, String(Math.trunc(Math.abs(text))).length));
+  const value = +(+text).toPrecision(Math.max(6, String(Math.trunc(Math.abs(text))).length + 3));
   return el("td", { title: value !== +text && text }, value && Math.abs(value) < 1e-4 ? value.toExponential() : String(value));
 }
 
