@@ -9,7 +9,7 @@ from scipy.stats import norm
 from test_own_noise import Question, entropy
 
 import excite as ex
-from excite.environment import ContrastiveGain, Env
+from excite.environment import ContrastiveGain, Env, StepData
 from excite.estimation.prior_knowledge import plants_of
 from excite.excitation import Replay
 from excite.plant import AbstractStaticTask, static_description
@@ -121,7 +121,45 @@ def test_a_study_names_it_and_its_plants():
     assert (
         "contrast_plants" not in Agent.of(AgentSettings(), {}, {}, {}).settings(Aero2())["decision"]
     )
-    with pytest.raises(ValueError, match="the reward 'contrast' is of all parameters"):
+    with pytest.raises(ValueError, match=r"reward 'contrast'. is of all parameters"):
         Agent.of(settings.model_copy(update={"targets": ["J_p"]}), {}, {}, {}).env(Aero2(), 0.3, 20)
     with pytest.raises(ValueError, match="the reward 'contrast' has no 'criterion'"):
         Agent.of(AgentSettings(decision={"reward": "contrast", "criterion": "A"}), {}, {}, {})
+
+
+class Root(Line):
+    """Not a number for half of the plants."""
+
+    def outcome(self, design, params):
+        return jnp.sqrt(params.slope + 0.1 * design)
+
+
+def test_a_plant_that_cannot_be_computed_leaves_the_gradient_finite():
+    task = Root()
+    prior, true = plants_of(task, {"slope": "normal:1:1"}), task.Params(jnp.asarray(1.0))
+    objective = ContrastiveGain(prior, 31)
+    memory = objective.init(task, jnp.zeros(1), jax.random.key(0))
+
+    def reward(design):
+        sample = StepData(true, jnp.zeros(2), design, task.outcome(design, true))
+        return objective.update(task, memory, sample, jnp.asarray(0))[1]
+
+    assert jnp.any(memory.params.slope < -0.1)
+    slope = jax.grad(lambda design: jnp.sum(reward(design)))(jnp.array([0.5]))
+    step = 1e-5
+    ends = [float(reward(jnp.array([0.5 + way * step]))) for way in (-1, 1)]
+    assert float(slope[0]) == pytest.approx((ends[1] - ends[0]) / (2 * step), rel=1e-4)
+
+
+@pytest.mark.slow
+def test_it_is_an_objective_of_training():
+    policy = ex.train(
+        Line(), method="ppo", objective="sPCE", contrast_plants=15, prior={"slope": "normal:0:1"},
+        steps=4, window=1, episodes=8,
+        training={"total_steps": 256, "num_envs": 4, "n_steps": 16, "batch_size": 64},
+    )  # fmt: skip
+    assert policy.layout.num_steps == 4
+    with pytest.raises(ValueError, match="contrast_plants are for the objective sPCE: got D"):
+        ex.train(Line(), contrast_plants=15)
+    with pytest.raises(ValueError, match="compares plants that differ: give a spread or a prior"):
+        ex.train(Aero2(), objective="sPCE", spread=0.0)

@@ -14,6 +14,7 @@ import excite as ex
 from excite.excitation import Replay
 from excite.plant import AbstractStaticTask, static_description
 from excite.plant.catalogue import plant_named
+from excite.plant.extension import extended
 from excite.plant.static import has_own_noise
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "constant_elasticity.py"
@@ -78,9 +79,30 @@ def test_what_is_measured_is_the_tasks_own():
     assert 0.7 < right.mean() < 1
 
 
-def test_a_fit_and_a_training_are_refused():
-    record = ex.simulate(Question, "random", steps=50)
-    for verb in (lambda: ex.identify(record, Question), lambda: ex.train(Question, prior=PRIOR)):
+class Loud(Question):
+    """With a sensor's noise, which it does not use."""
+
+    definition = static_description(
+        "question",
+        designs=(ex.Input("place", "m", -3.0, 3.0),),
+        outcomes=(ex.Output("answer", "", scale=1.0, noise_sd=0.1),),
+        parameters=(ex.Parameter("at", "m", 0.0, scale=1.0, positive=False),),
+    )
+
+
+@pytest.mark.parametrize("task", [Question, Loud])
+def test_what_needs_the_noise_of_a_sensor_is_refused(task, tmp_path):
+    record = ex.simulate(task, "random", steps=50)
+    for verb in (
+        lambda: ex.identify(record, task),
+        lambda: ex.train(task, prior=PRIOR),
+        lambda: ex.information(task, "random"),
+        lambda: ex.design(task, steps=5),
+        lambda: ex.run("simulated", plant=task, excitation="random", out=tmp_path / "a.csv"),
+        lambda: ex.simulate(task, "random", steps=5, noise={"answer": 2.0}),
+        lambda: ex.information_gain(task, noise={"answer": 2.0}),
+        lambda: extended(task(), ["bias_answer"]),
+    ):
         with pytest.raises(ValueError, match="'question' has its own log_likelihood"):
             verb()
 
@@ -112,3 +134,68 @@ def test_a_slider_at_its_limit_is_as_likely_as_all_beyond():
     sd = 0.005 * (1 + 15.2 * np.sqrt(3))
     found = task.log_likelihood(jnp.array([limit]), design, params)
     assert float(found) == pytest.approx(norm.logsf(limit, mean, sd), rel=1e-6)
+
+
+def made(**functions):
+    """A question with other functions."""
+    return type("Other", (Question,), functions)
+
+
+class Plain(AbstractStaticTask):
+    """With a sensor's noise."""
+
+    definition = static_description(
+        "plain",
+        designs=(ex.Input("place", "m", -3.0, 3.0),),
+        outcomes=(ex.Output("answer", "", scale=1.0, noise_sd=0.1),),
+        parameters=(ex.Parameter("at", "m", 0.0, scale=1.0, positive=False),),
+    )
+
+    def outcome(self, design, params):
+        return params.at - design
+
+
+@pytest.mark.parametrize(
+    ("task", "sentence"),
+    [
+        (
+            type("Half", (Plain,), {"measured": Question.measured}),
+            "Half defines measured, and needs log_likelihood too",
+        ),
+        (
+            type("Half", (Plain,), {"log_likelihood": Question.log_likelihood}),
+            "Half defines log_likelihood, and needs measured too",
+        ),
+        (
+            made(measured=lambda self, design, params, noise: jnp.zeros(3)),
+            r"measured of .*Other returns shape \(3,\); one array of shape \(1,\) is needed",
+        ),
+        (
+            made(log_likelihood=lambda self, measured, design, params: measured),
+            r"log_likelihood of .*Other returns shape \(1,\); one number is needed",
+        ),
+        (
+            made(log_likelihood=lambda self, m, d, p: jnp.sum(m) * jnp.nan),
+            "log_likelihood of .*Other is not finite",
+        ),
+    ],
+)
+def test_functions_that_do_not_fit_are_one_sentence(task, sentence):
+    for verb in (ex.Myopic.of, ex.information_gain):
+        with pytest.raises(ValueError, match=sentence):
+            verb(task, prior=PRIOR)
+
+
+def test_what_a_laboratory_cannot_have_made_is_refused():
+    chosen = ex.Myopic.of(Question, PRIOR)
+    state = chosen.init(Question(), 2, jax.random.key(0))
+    for outcome in ([np.nan], [1.0, 1.0]):
+        with pytest.raises(ValueError, match="an outcome has one finite number for each of answer"):
+            chosen(state, jnp.array(outcome))
+    state, _ = chosen(state, jnp.zeros(1))
+    with pytest.raises(ValueError, match=r"a design lies from \[-3.0\] to \[3.0\]: got \[99.0\]"):
+        chosen.applied(state, jnp.array([99.0]))
+    with pytest.raises(ValueError, match="num_steps"):
+        chosen.init(Question(), 0, jax.random.key(0))
+    state = chosen.learnt(chosen.applied(state, jnp.array([1.0])), jnp.ones(1))
+    assert float(jnp.median(chosen.posterior(state).at)) > 0.9

@@ -20,6 +20,7 @@ from excite.plant.catalogue import plant_named
 from excite.report.rows import ExpectedGain, Nats
 from excite.report.study_table import footnotes
 from excite.study.folder import fingerprint
+from excite.study.methods import evaluate_method
 from excite.study.spec import study_from
 from excite.study.table import _mean_of_seeds, study_table
 from excite.training.gradient import started
@@ -265,3 +266,28 @@ def test_a_plant_without_a_prior_is_drawn_as_before():
     with_none = run_episodes(plant, PRBS(), 5, 0.3, keys, prior=None).params
     usual = run_episodes(plant, PRBS(), 5, 0.3, keys).params
     assert jax.tree.all(jax.tree.map(jnp.array_equal, with_none, usual))
+
+
+@pytest.mark.slow
+def test_a_study_of_a_task_compares_designs_that_are_chosen_for_its_prior():
+    task = {
+        "plant": SOURCES,
+        "prior": dict.fromkeys(("x_1", "y_1", "x_2", "y_2"), "normal:0:1"),
+        "num_steps": 4,
+        "agents": {},
+    }
+    own = study(
+        **task,
+        methods={"random": {"excitation": "random", "hold": 1}, "near": {"excitation": "myopic"}},
+    )
+    plant = own.build_plant()
+    methods = own.build_methods(plant)
+    assert isinstance(methods["near"], ex.Myopic)
+    assert own.origins(plant) == {}
+    rows = {name: evaluate_method(own, plant, name, made)[0][0] for name, made in methods.items()}
+    gains = {name: row.expected_gain.lower.mean for name, row in rows.items()}
+    assert gains["near"] > gains["random"] + 1
+    with pytest.raises(ValueError, match="excitation 'myopic' has no option 'pool'"):
+        study(**task, methods={"near": {"excitation": "myopic", "pool": 5}})
+    with pytest.raises(ValueError, match="unknown excitation 'myopic'"):
+        study(agents={}, methods={"near": {"excitation": "myopic"}})

@@ -249,7 +249,7 @@ def measure(
         output: what the sensor is shown.
         noise: standard normal.
     """
-    if isinstance(plant, AbstractStaticTask) and has_own_noise(plant):
+    if has_own_noise(plant):
         *design, is_made = state
         measured = plant.measured(jnp.stack(design), params, noise)
         return jnp.where(is_made > 0.5, measured, 0.0)

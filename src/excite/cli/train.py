@@ -50,6 +50,8 @@ def _options(command: Any) -> Any:
                          "whatever their order."),
             click.option("--clock", type=Number(), multiple=True, metavar="HZ",
                          help="Also observe sine and cosine of this frequency."),
+            click.option("--contrast-plants", type=WholeNumber(1, 1_000_000), metavar="NUMBER",
+                         help="Plants with which sPCE compares the true one; default 255."),
             click.option("--change-price", type=Number(min=0), default=0.0, metavar="PRICE",
                          help="Subtracted from the information for each squared change of an "
                          "input [1 / input unit²]; default none."),

@@ -7,8 +7,9 @@ import math
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
+from ..description import require_whole
 from ..estimation.prior import PriorPlants
 from ..plant import AbstractPlant, Params
 from ..plant.fields import floats
@@ -16,6 +17,18 @@ from ..plant.static import AbstractStaticTask
 from ..safety import safe_input
 from ..simulation import require_likelihood, step
 from .objective import AbstractObjective, StepData
+
+
+@jax.custom_vjp
+def _with_finite_gradient(value: PyTree) -> PyTree:
+    """The same value; what is not finite of its gradient is zero."""
+    return value
+
+
+_with_finite_gradient.defvjp(
+    lambda value: (value, None),
+    lambda _, slope: (jax.tree.map(lambda g: jnp.where(jnp.isfinite(g), g, 0.0), slope),),
+)
 
 _IMPOSSIBLE = -1e6  # logarithm of a likelihood where it is smaller, or not a number
 
@@ -45,7 +58,7 @@ class ContrastiveGain(AbstractObjective):
     others of the prior, which are drawn for every experiment (sequential prior contrastive
     estimation; A. Foster et al., Deep adaptive design, ICML 2021). It needs no approximation of
     the posterior, and no derivative of the plant by its parameters, and is at most
-    log(num_plants + 1).
+    log(num_plants + 1). Outcomes that jump (answers, counts) have no gradient for it.
 
     Attributes:
         prior: of the parameters.
@@ -65,8 +78,7 @@ class ContrastiveGain(AbstractObjective):
 
     def __check_init__(self) -> None:
         """Raises ValueError without another plant."""
-        if self.num_plants < 1:
-            raise ValueError(f"num_plants must be at least 1: got {self.num_plants}")
+        require_whole("num_plants", self.num_plants, 1)
 
     def init(
         self, plant: AbstractPlant, measured: Float[Array, " output"], key: PRNGKeyArray
@@ -87,17 +99,24 @@ class ContrastiveGain(AbstractObjective):
         is_task = isinstance(plant, AbstractStaticTask)
         observes_state = not is_task and require_likelihood(plant)
 
-        def likely(state: Array, params: Params) -> tuple[Array, Array]:
+        def likely(
+            state: Array, params: Params, true_state: Array, input: Array, measured: Array
+        ) -> tuple[Array, Array]:
             if is_task:
-                return state, plant.log_likelihood(sample.measured, sample.input, params)
-            after = step(plant, sample.state if observes_state else state, sample.input, params)
+                return state, plant.log_likelihood(measured, input, params)
+            after = step(plant, true_state if observes_state else state, input, params)
             expected = after if observes_state else plant.output(after, params)
             sd = plant.process_noise_sd if observes_state else plant.sensor.sd
-            found = -0.5 * jnp.sum(((sample.measured - expected) / sd) ** 2)
+            found = -0.5 * jnp.sum(((measured - expected) / sd) ** 2)
             return jnp.where(jnp.all(jnp.isfinite(after)), after, state), found
 
-        states, of_others = jax.vmap(likely)(memory.states, memory.params)
-        own = likely(sample.state, sample.params)[1]
+        made = sample.state, sample.input, sample.measured
+        shape = (self.num_plants,)
+        # Of a plant that cannot be computed, nothing is learnt: not even a gradient.
+        of_each = [jnp.broadcast_to(value, shape + value.shape) for value in made]
+        before, of_each = _with_finite_gradient((memory.states, of_each))
+        states, of_others = jax.vmap(likely)(before, memory.params, *of_each)
+        own = likely(sample.state, sample.params, *made)[1]
         found = jnp.append(of_others, own)
         found = jnp.where(found > _IMPOSSIBLE, found, _IMPOSSIBLE)  # also for NaN
         total = memory.log_likelihoods + found
@@ -116,7 +135,11 @@ class ContrastiveGain(AbstractObjective):
     def relative_errors(
         self, plant: AbstractPlant, memory: ContrastMemory, params: Params
     ) -> Float[Array, " param"]:
-        """Root mean square of the compared plants' relative differences, by their probability."""
+        """Root mean square of the compared plants' relative differences, by their probability.
+
+        Too small where the outcomes tell so much that none of these plants is as probable as the
+        true one.
+        """
         del plant
         probable = jax.nn.softmax(memory.log_likelihoods)[:-1]
         differences = jnp.stack(memory.params) - jnp.stack(params)[:, None]

@@ -166,8 +166,9 @@ def gains(
 
         def log_likelihood(z: Array) -> Array:
             if isinstance(plant, AbstractStaticTask):
-                own = partial(plant.log_likelihood, params=prior.params(z))
-                found = jnp.sum(jax.vmap(own)(run.measured[1:], run.inputs))
+                params = prior.params(z)
+                own = jax.vmap(lambda *made: plant.log_likelihood(*made, params))
+                found = jnp.sum(own(run.measured[1:], run.inputs))
             else:
                 found = -0.5 * jnp.sum(residual(z) ** 2)
             return jnp.where(jnp.isfinite(found), found, -jnp.inf)
@@ -373,7 +374,7 @@ def information_gain(
         samples: of the evidence of each record.
         from_prior: draws these samples from the prior: the usual figure of benchmarks, which
             can only be compared for the same number of samples.
-        seed: of plants, noise and samples.
+        seed: of plants, noise and samples, which are other ones on an accelerator.
         progress: called with a text, how much is done, and the total.
 
     A plant with process noise is judged where its state is observed: its records then have the
@@ -409,7 +410,7 @@ def information_gain(
     lower, upper, laplace, changes = (
         Mean.of(v, found.controls) for v in (found.lower, found.upper, found.laplace, found.changes)
     )
-    few = int(np.sum(found.effective < _FEW))
+    few = int(np.sum(~(found.effective >= _FEW)))  # NaN, too
     warnings = list(e.warnings)
     if from_prior and lower.value > math.log(number + 1) - _NEAR_CAP:
         warnings.append(

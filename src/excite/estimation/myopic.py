@@ -23,10 +23,10 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from ..description import SpreadLike, require_whole
+from ..description import Input, Output, SpreadLike, names_of, require_whole
 from ..excitation import AbstractExcitation
 from ..information import require_bound
-from ..plant import AbstractPlant, floats
+from ..plant import AbstractPlant, Params, floats
 from ..plant.catalogue import PlantLike, plant_from
 from ..plant.static import AbstractStaticTask, has_own_noise
 from .prior import PriorPlants
@@ -37,7 +37,8 @@ MYOPIC = "myopic"
 
 _SMALLEST = 1e-3  # distance of a design near another, in half ranges; the largest is 1
 _HALVINGS = 25  # of the search for a power
-_IMPOSSIBLE = -1e10  # logarithm of the likelihood where it is none
+_LEAST = -70.0  # logarithm of the smallest one
+_IMPOSSIBLE = -1e30  # logarithm of the likelihood where it is none
 _BEST = 8  # designs near which those of the next round lie
 _JUMP = 0.2  # share of the moves by a whole difference of two particles, from mode to mode
 _FINE = 1e-3  # part of a move that no difference has, in the particles' standard deviations
@@ -172,6 +173,7 @@ class Myopic(AbstractExcitation):
         d, own = plant.definition, self.prior.plant.definition
         if d.name != own.name:
             raise ValueError(f"these designs are for the task {own.name!r}: got {d.name!r}")
+        require_whole("num_steps", num_steps, 1)
         key, draw_key = jax.random.split(key)
         drawn = jax.random.normal(draw_key, (self.num_particles, len(d.parameters)), float)
         designs = jnp.zeros((num_steps, len(d.inputs)))
@@ -183,11 +185,14 @@ class Myopic(AbstractExcitation):
         """The next design, after the outcome of the last one; the first call has none yet.
 
         Raises:
-            ValueError: for more designs than the state was made for.
+            ValueError: for more designs than the state was made for, and for an outcome of another
+                size or that is not a number.
         """
         count = len(state.designs)
-        if not isinstance(state.k, jax.core.Tracer) and int(state.k) >= count:
-            raise ValueError(f"all {count} designs are chosen: make a state for more (init)")
+        if not isinstance(state.k, jax.core.Tracer):
+            if int(state.k) >= count:
+                raise ValueError(f"all {count} designs are chosen: make a state for more (init)")
+            _require_numbers("an outcome", measurement, self._task.definition.outputs)
         return self._next(state, measurement)
 
     @eqx.filter_jit
@@ -202,9 +207,25 @@ class Myopic(AbstractExcitation):
         return Known(known.particles, designs, known.outcomes, known.k + 1, key), design
 
     def applied(self, state: Known, input: Float[Array, " input"]) -> Known:
-        """The state after another design than the proposed one."""
+        """The state after another design than the proposed one.
+
+        Raises:
+            ValueError: for a design of another size, that is not a number, or outside the limits.
+        """
+        if not isinstance(state.k, jax.core.Tracer) and not isinstance(input, jax.core.Tracer):
+            _require_numbers("a design", input, self._task.definition.inputs)
+            lower, upper = (np.asarray(limit) for limit in self._task.input_limits)
+            if not np.all((lower <= input) & (input <= upper)):
+                raise ValueError(
+                    f"a design lies from {lower.tolist()} to {upper.tolist()}: got "
+                    f"{np.asarray(input).tolist()}"
+                )
         designs = state.designs.at[state.k - 1].set(input)
         return Known(state.particles, designs, state.outcomes, state.k, state.key)
+
+    def posterior(self, state: Known) -> Params:
+        """Parameters as probable as the outcomes so far leave them, an array of each."""
+        return jax.vmap(self.prior.params)(state.particles)
 
     def learnt(self, state: Known, outcome: Float[Array, " output"]) -> Known:
         """What is known after the outcome of the last design."""
@@ -252,7 +273,7 @@ class Myopic(AbstractExcitation):
         particles = known.particles[order[: 4 * count]]
 
         def gain(design: Array) -> Array:
-            """Expected, by outcomes of some particles, each as likely for all of them."""
+            """Expected gain: the mean over outcomes that are simulated from some particles."""
             params = jax.vmap(self.prior.params)(particles)
             some = jax.tree.map(lambda values: values[:count], params)
             seen = jax.vmap(lambda own, noise: self._task.measured(design, own, noise))(some, noise)
@@ -295,8 +316,9 @@ def _weighted(
 ) -> Float[Array, "particle param"]:
     """Particles of one distribution as those of the same times a likelihood.
 
-    The likelihood comes in by powers, each as large as half of the particles remain (adaptive
-    tempering; P. Del Moral, A. Doucet, A. Jasra, Sequential Monte Carlo samplers, 2006).
+    The likelihood is raised to powers that grow to 1, each so large that half of the particles
+    remain effective (adaptive tempering; P. Del Moral, A. Doucet, A. Jasra, Sequential Monte Carlo
+    samplers, 2006).
     """
     count = len(particles)
 
@@ -307,12 +329,15 @@ def _weighted(
 
         def halve(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
             middle = (ends[0] + ends[1]) / 2
-            small = is_small(middle)
+            small = is_small(jnp.exp(middle))
             return jnp.where(small, middle, ends[0]), jnp.where(small, ends[1], middle)
 
         rest = 1 - power
-        step = jax.lax.fori_loop(0, _HALVINGS, halve, (jnp.zeros_like(rest), rest))[0]
-        return jnp.where(is_small(rest), 1.0, jnp.minimum(power + jnp.maximum(step, 1e-9), 1.0))
+        ends = jnp.full_like(rest, _LEAST), jnp.log(rest)
+        step = jnp.exp(jax.lax.fori_loop(0, _HALVINGS, halve, ends)[0])
+        return jnp.where(
+            is_small(rest), 1.0, jnp.minimum(power + jnp.maximum(step, 0.01 * power), 1.0)
+        )
 
     def stage(now: tuple[Array, Array, PRNGKeyArray]) -> tuple[Array, Array, PRNGKeyArray]:
         z, power, key = now
@@ -356,6 +381,14 @@ def _moved(
 
     keys = jax.random.split(key, num_moves)
     return jax.lax.scan(move, (drawn, log_target(drawn)), keys)[0][0]
+
+
+def _require_numbers(what: str, given: ArrayLike, signals: Sequence[Input | Output]) -> None:
+    """Raises ValueError for something else than one finite number for each signal."""
+    values = np.asarray(given)
+    if values.shape != (len(signals),) or not np.isfinite(values).all():
+        names = ", ".join(names_of(signals))
+        raise ValueError(f"{what} has one finite number for each of {names}: got {values.tolist()}")
 
 
 def _require_static(plant: AbstractPlant) -> None:

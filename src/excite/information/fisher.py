@@ -23,6 +23,7 @@ from ..description import Named, PlantDescription, names_of
 from ..excitation.catalogue import ExcitationLike
 from ..plant import AbstractPlant, Params, require_double_precision
 from ..plant.catalogue import PlantLike
+from ..plant.static import require_sensor_noise
 from ..record import Record
 from ..record.table import data_frame
 from ..report.results import information_html, information_text, wrapped
@@ -38,6 +39,7 @@ Information = Float[Array, "param param"]
 
 def require_noise(plant: AbstractPlant) -> None:
     """Raises ValueError for a sensor without noise, which has no Cramér-Rao bound."""
+    require_sensor_noise(plant)
     if plant.definition.is_disturbed:
         raise ValueError(
             f"plant {plant.definition.name!r} has process noise, so that its information differs "

@@ -28,6 +28,7 @@ from .dc_motor import DCMotor
 from .emps import EMPS
 from .extension import extended, plain_kind
 from .fields import floats
+from .static import AbstractStaticTask, has_own_noise, require_sensor_noise
 
 PLANTS: Mapping[str, type[AbstractPlant]] = {
     "aero2": Aero2,
@@ -212,11 +213,15 @@ def _check_plant(plant: AbstractPlant, where: str) -> None:
     """Raises ValueError where the functions of a plant do not fit its description."""
     d = plant.definition
     state, inputs = plant.initial_state, jnp.zeros(len(d.inputs))
-    for name, arguments, count in (
+    functions: list[tuple[str, tuple[Any, ...], int]] = [
         ("derivative", (state, inputs, plant.nominal), len(d.states)),
         ("output", (state, plant.nominal), len(d.outputs)),
         ("delay", (plant.nominal,), len(d.inputs)),
-    ):
+    ]
+    if has_own_noise(plant):
+        noise = jnp.zeros(len(d.outputs))
+        functions.append(("measured", (inputs, plant.nominal, noise), len(d.outputs)))
+    for name, arguments, count in functions:
         what = f"{name} of {where}"
         found = _traced(plant, name, arguments, what)
         if name == "delay" and found is None:
@@ -229,6 +234,35 @@ def _check_plant(plant: AbstractPlant, where: str) -> None:
             raise ValueError(f"{what} returns shape {found.shape}; {needed}")
         if jnp.issubdtype(found.dtype, jnp.complexfloating):
             raise ValueError(f"{what} returns complex numbers; real ones are needed")
+    if has_own_noise(plant):
+        _check_own_noise(plant, where)
+
+
+def _check_own_noise(plant: AbstractStaticTask, where: str) -> None:
+    """Raises ValueError where what is measured of a task does not fit its likelihood."""
+    own = {
+        name: getattr(type(plant), name) is not getattr(AbstractStaticTask, name)
+        for name in ("measured", "log_likelihood")
+    }
+    if not all(own.values()):
+        has, lacks = sorted(own, key=lambda name: not own[name])
+        raise ValueError(f"{where} defines {has}, and needs {lacks} too: both or none of the two")
+    lower, upper = plant.input_limits
+    design = (lower + upper) / 2
+    measured = plant.measured(design, plant.nominal, jnp.zeros(len(plant.definition.outputs)))
+    found = _traced(
+        plant, "log_likelihood", (measured, design, plant.nominal), f"log_likelihood of {where}"
+    )
+    if getattr(found, "shape", None) != ():
+        kind = f"shape {found.shape}" if hasattr(found, "shape") else f"a {type(found).__name__}"
+        raise ValueError(
+            f"log_likelihood of {where} returns {kind}; one number is needed, such as jnp.sum(...)"
+        )
+    if not jnp.isfinite(plant.log_likelihood(measured, design, plant.nominal)):
+        raise ValueError(
+            f"log_likelihood of {where} is not finite for what is measured without noise, in the "
+            "middle of the designs, with nominal parameters"
+        )
 
 
 def _traced(plant: AbstractPlant, name: str, arguments: tuple[Any, ...], what: str) -> Any:
@@ -304,9 +338,12 @@ def with_sensor(
     """The plant with another noise or resolution of the named outputs, in their units.
 
     Raises:
-        ValueError: for an unknown output, or a value that is negative or not finite.
+        ValueError: for an unknown output, or a value that is negative or not finite; for a task
+            with its own noise.
         TypeError: for a value that is no number.
     """
+    if noise_sd or resolution:
+        require_sensor_noise(plant)
     outputs, sensor = names_of(plant.definition.outputs), plant.sensor
     numbers = {"noise": sensor.noise_sd.tolist(), "resolution": sensor.resolution.tolist()}
     for what, given in (("noise", noise_sd or {}), ("resolution", resolution or {})):

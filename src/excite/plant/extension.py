@@ -28,6 +28,7 @@ from jaxtyping import Array, Float
 from ..description import Parameter, PlantDescription, State, names_of, unknown
 from .contract import AbstractPlant, Params, with_nominal
 from .fields import floats
+from .static import require_sensor_noise
 
 _INPUT, _VELOCITY, _OUTPUT = (
     ("delay", "lag", "gain", "offset", "saturation", "dead_zone"),
@@ -89,6 +90,8 @@ def extended(plant: AbstractPlant, extensions: Sequence[str]) -> AbstractPlant:
         ValueError: for an unknown name, or one that the plant has.
     """
     kind = plain_kind(plant)
+    if extensions:
+        require_sensor_noise(plant)
     possible, chosen = _extensions(kind.definition), {*names_of(plant.definition.parameters)}
     for word in extensions:
         found = [e.name for e in possible if word in (e.kind, e.name)]

@@ -8,6 +8,7 @@ trainings and evaluations as one that moves.
 from __future__ import annotations
 
 import abc
+from typing import TypeGuard
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -75,7 +76,7 @@ class AbstractStaticTask(AbstractPlant):
     ) -> Float[Array, " output"]:
         """What is measured of a design: its outcome, and the sensor's noise.
 
-        A task whose noise is another one defines this and `log_likelihood`.
+        A task with another noise than a normal one of fixed size defines this and `log_likelihood`.
 
         Args:
             noise: standard normal, one number for each output.
@@ -109,10 +110,12 @@ class AbstractStaticTask(AbstractPlant):
         return jnp.where(made > 0.5, self.outcome(design, params), 0.0)
 
 
-def has_own_noise(plant: AbstractPlant) -> bool:
+def has_own_noise(plant: AbstractPlant) -> TypeGuard[AbstractStaticTask]:
     """Whether a plant is a static task with another noise than its sensor's."""
-    usual = AbstractStaticTask.log_likelihood
-    return isinstance(plant, AbstractStaticTask) and type(plant).log_likelihood is not usual
+    if not isinstance(plant, AbstractStaticTask):
+        return False
+    usual, own = AbstractStaticTask, type(plant)
+    return own.measured is not usual.measured or own.log_likelihood is not usual.log_likelihood
 
 
 def require_sensor_noise(plant: AbstractPlant) -> None:
@@ -120,5 +123,6 @@ def require_sensor_noise(plant: AbstractPlant) -> None:
     if has_own_noise(plant):
         raise ValueError(
             f"plant {plant.definition.name!r} has its own log_likelihood: it has expected "
-            "information gains and myopic designs (`excite gain`), but no fit, training or study"
+            "information gains and myopic designs (excite gain), but nothing that needs the normal "
+            "noise of a sensor: fits, information, designs of signals, trainings, studies, rigs"
         )

@@ -449,7 +449,10 @@ class Policy:
 
 
 def _layout_data(layout: Layout) -> dict[str, Any]:
-    """The layout as JSON-ready data; as before there were any without a memory or its kind."""
+    """The layout as JSON-ready data, without memory and its kind where they are the default ones.
+
+    So the hashes of older policies stay valid.
+    """
     unused = ("memory", 0), ("memory_kind", "gru")
     return {k: v for k, v in dataclasses.asdict(layout).items() if (k, v) not in unused}
 

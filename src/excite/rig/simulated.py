@@ -23,6 +23,7 @@ from ..environment import Episodes, scored
 from ..excitation import AbstractExcitation
 from ..plant import AbstractPlant, Params, draw_params, params_from, params_within
 from ..plant.extension import extended
+from ..plant.static import require_sensor_noise
 from ..safety import (
     Supervision,
     Trip,
@@ -295,8 +296,10 @@ class SimulatedRig(AbstractRig):
             is_real_time: whether readings come in real time.
 
         Raises:
-            ValueError: if an input would not act before the next one is written.
+            ValueError: if an input would not act before the next one is written; for a task with
+                its own noise.
         """
+        require_sensor_noise(plant)
         self.description = plant.description
         self.num_readings, self.is_real_time = num_readings, is_real_time
         self.num_latency = round(float(hardware.latency) * num_readings / float(plant.dt))

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 from jaxtyping import PyTree
 from pydantic import Field
 
-from ..description import SpreadLike, names_of, prior_sd_of, unknown
+from ..description import Spread, SpreadLike, names_of, prior_sd_of, unknown
 from ..environment import (
     MAX_SENSITIVITY,
     AbstractObjective,
@@ -278,8 +278,15 @@ class Agent:
         # A gradient needs no reward before the last step.
         dense = self.method == "ppo" if chosen.dense is None else chosen.dense
         if form == "contrast":
-            if self.targets is not None and not all(targets):
-                raise ValueError("the reward 'contrast' is of all parameters: leave targets out")
+            if not all(targets):
+                raise ValueError(
+                    "the objective sPCE (reward 'contrast') is of all parameters: name all of them "
+                    "as targets, or take the objective D"
+                )
+            if prior is None and not Spread.of(spread).relative:
+                raise ValueError(
+                    "the objective sPCE compares plants that differ: give a spread or a prior"
+                )
             return ContrastiveGain(
                 plants_of(plant, None, spread) if prior is None else prior,
                 chosen.contrast_plants,

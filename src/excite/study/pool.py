@@ -48,7 +48,7 @@ def environment(cache: Path | None = None) -> dict[str, str]:
     """
     told = os.environ.get("XLA_FLAGS", "").split()
     others = [flag for flag in told if not flag.startswith(_ONE_THREAD.partition("=")[0])]
-    flags = " ".join([*others, _ONE_THREAD])
+    flags = " ".join([_ONE_THREAD, *others])  # XLA takes a first word without -- for a file
     variables = {**dict.fromkeys(_ONE, "1"), "TF_CPP_MIN_LOG_LEVEL": "3", "XLA_FLAGS": flags}
     if cache is not None:
         variables["JAX_COMPILATION_CACHE_DIR"] = str(cache)

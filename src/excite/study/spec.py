@@ -15,6 +15,7 @@ from ..description import by_name, names_of, unknown, wrong_type
 from ..environment import Env, InformationGain
 from ..estimation import ARX, AbstractEstimator, Decrement
 from ..estimation.catalogue import ESTIMATORS, estimator_named
+from ..estimation.myopic import MYOPIC, Myopic
 from ..estimation.prior import PriorPlants
 from ..estimation.prior_knowledge import plants_of
 from ..excitation import AbstractExcitation
@@ -30,6 +31,7 @@ from ..plant.catalogue import (
     with_sensor,
     word_of,
 )
+from ..plant.static import AbstractStaticTask
 from ..plant.uncertainty import Uncertainty
 from ..training.settings import GradientSettings, PPOSettings
 from ..training.signals import CLAIRVOYANT, CLAIRVOYANT_STARTS
@@ -238,7 +240,10 @@ class Study(Settings):
             if not 2 <= length <= self.num_steps:
                 raise ValueError(f"lengths must lie between 2 and num_steps: got {length}")
         for name, method in self.methods.items():
-            made = excitation_named(method.excitation, method.options, plant)
+            if _is_myopic(method, plant):
+                made = Myopic.of(plant, self.prior or None, self.spread)
+            else:
+                made = excitation_named(method.excitation, method.options, plant)
             try:
                 jax.eval_shape(partial(made.init, plant, self.num_steps), jax.random.key(0))
             except ValueError as error:
@@ -259,6 +264,7 @@ class Study(Settings):
         own = {
             name: excitation_and_origin(m.excitation, m.options, plant)[1]
             for name, m in self.methods.items()
+            if not _is_myopic(m, plant)
         }
         return {name: origin for name, origin in own.items() if origin}
 
@@ -365,6 +371,15 @@ class Study(Settings):
                     raise unknown("estimator", name, known)
             settings["estimators"] = {name: known[name] for name in chosen}
         return study_from({**self.model_dump(), **settings}, "settings")
+
+
+def _is_myopic(method: MethodSettings, plant: AbstractPlant) -> bool:
+    """Whether a method chooses designs for the study's prior; ValueError for options."""
+    if method.excitation != MYOPIC or not isinstance(plant, AbstractStaticTask):
+        return False
+    if method.options:
+        raise ValueError(f"excitation {MYOPIC!r} has no option {next(iter(method.options))!r}")
+    return True
 
 
 def of_prior(prior: Mapping[str, str] | None) -> dict[str, object]:

@@ -33,6 +33,7 @@ def train(
     memory_kind: str | None = None,
     clock: float | Sequence[float] = (),
     change_price: float = 0.0,
+    contrast_plants: int | None = None,
     training: Mapping[str, object] | None = None,
     updates: int | None = None,
     seeds: int = 1,
@@ -77,7 +78,8 @@ def train(
             which does not depend on their order: for tasks without memory.
         clock: frequencies [Hz] whose sine and cosine are observed too.
         change_price: of the squared change of an input from step to step [1 / input unit²],
-            subtracted from the objective, which must be information.
+            subtracted from the objective, which must be information (`D`, `A`, `E`, `sPCE`).
+        contrast_plants: with which the objective `sPCE` compares the true one, default 255.
         training: hyper-parameters of the method (`excite.training.settings`).
         updates: gradient updates, default 1000; the hyper-parameter `num_updates`.
         seeds: independent trainings; the best policy is returned.
@@ -122,6 +124,12 @@ def train(
                 f"sPCE, got {', '.join(rewards)}"
             )
         rewards[priced]["change_price"] = change_price
+    if contrast_plants is not None:
+        if "sPCE" not in rewards:
+            raise ValueError(
+                f"contrast_plants are for the objective sPCE: got {', '.join(rewards)}"
+            )
+        rewards["sPCE"]["contrast_plants"] = contrast_plants
     decision = {
         **decision_of(rewards.values()),
         "output_scale": by_name("output_scale", output_scale, "a dict by output"),
