@@ -21,15 +21,20 @@ EXAMPLE = Path(__file__).parent.parent / "examples" / "constant_elasticity.py"
 PRIOR = {"at": "normal:0:1"}
 
 
+def described(**noise):
+    """Of a question, whose sensor may have noise."""
+    return static_description(
+        "question",
+        designs=(ex.Input("place", "m", -3.0, 3.0),),
+        outcomes=(ex.Output("answer", "", scale=1.0, **noise),),
+        parameters=(ex.Parameter("at", "m", 0.0, scale=1.0, positive=False),),
+    )
+
+
 class Question(AbstractStaticTask):
     """Whether something lies above a place: the answer is 1 or -1, and wrong near the place."""
 
-    definition = static_description(
-        "question",
-        designs=(ex.Input("place", "m", -3.0, 3.0),),
-        outcomes=(ex.Output("answer", "", scale=1.0),),
-        parameters=(ex.Parameter("at", "m", 0.0, scale=1.0, positive=False),),
-    )
+    definition = described()
 
     def outcome(self, design, params):
         return 4 * (params.at - design)
@@ -82,12 +87,7 @@ def test_what_is_measured_is_the_tasks_own():
 class Loud(Question):
     """With a sensor's noise, which it does not use."""
 
-    definition = static_description(
-        "question",
-        designs=(ex.Input("place", "m", -3.0, 3.0),),
-        outcomes=(ex.Output("answer", "", scale=1.0, noise_sd=0.1),),
-        parameters=(ex.Parameter("at", "m", 0.0, scale=1.0, positive=False),),
-    )
+    definition = described(noise_sd=0.1)
 
 
 @pytest.mark.parametrize("task", [Question, Loud])
@@ -144,12 +144,7 @@ def made(**functions):
 class Plain(AbstractStaticTask):
     """With a sensor's noise."""
 
-    definition = static_description(
-        "plain",
-        designs=(ex.Input("place", "m", -3.0, 3.0),),
-        outcomes=(ex.Output("answer", "", scale=1.0, noise_sd=0.1),),
-        parameters=(ex.Parameter("at", "m", 0.0, scale=1.0, positive=False),),
-    )
+    definition = described(noise_sd=0.1)
 
     def outcome(self, design, params):
         return params.at - design

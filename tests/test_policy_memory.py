@@ -11,13 +11,14 @@ import numpy as np
 import onnxruntime
 import pytest
 import torch
+from test_myopic import Beacon
 
 import excite as ex
 from excite.cli import main
 from excite.environment import Env, InformationGain
 from excite.estimation.prior_knowledge import plants_of
 from excite.excitation import PolicyExcitation
-from excite.plant import AbstractStaticTask, Aero2, static_description
+from excite.plant import Aero2
 from excite.policy import (
     Layout,
     Policy,
@@ -393,20 +394,6 @@ def test_without_the_part_through_measurements_the_gradient_is_that_of_fixed_one
     np.testing.assert_allclose(gradient(deaf, True), gradient(deaf, False), rtol=1e-4)
     seeing = PolicyExcitation.of(policy()).weights
     assert not np.allclose(gradient(seeing, True), gradient(seeing, False), rtol=1e-3)
-
-
-class Beacon(AbstractStaticTask):
-    """Its outcome tells most of where it is beside it."""
-
-    definition = static_description(
-        "beacon",
-        designs=(ex.Input("place", "m", -4.0, 4.0),),
-        outcomes=(ex.Output("level", "", scale=1.0, noise_sd=0.1),),
-        parameters=(ex.Parameter("at", "m", 0.0, scale=1.0, positive=False),),
-    )
-
-    def outcome(self, design, params):
-        return 1 / (1 + (design - params.at) ** 2)
 
 
 @pytest.mark.slow

@@ -291,7 +291,7 @@ BAD_STUDIES: dict[str, tuple[str, tuple[str, ...]]] = {
     ),
     "unknown reward": (
         MINIMAL + '[agents.a]\n[decision]\nreward = "nice"\n',
-        ("decision: reward must be 'relative', 'log', 'goals', ", "nice"),
+        ("reward must be 'relative', 'log', 'goals', 'information' or 'contrast'", "nice"),
     ),
     "window beyond any memory": (
         MINIMAL + "[agents.a]\n[decision]\nwindow = 100000000000\n",

@@ -176,7 +176,7 @@ def test_workers_that_die_take_nobody_along(tmp_path):
 
 def test_the_environment_is_set_before_anything_is_imported(monkeypatch):
     # XLA takes the first word for a file where it has no --.
-    told = "--xla_cpu_multi_thread_eigen=true intra_op_parallelism_threads=1"
+    told = "--xla_cpu_multi_thread_eigen=true --xla_dump_to=nowhere word=1"
     monkeypatch.setenv("XLA_FLAGS", told)
     monkeypatch.delenv("NPROC", raising=False)
     before = os.environ.copy()
@@ -189,7 +189,7 @@ def test_the_environment_is_set_before_anything_is_imported(monkeypatch):
         "NPROC": "1",
         "JAX_ENABLE_X64": "1",
         "TF_CPP_MIN_LOG_LEVEL": "3",
-        "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
+        "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false --xla_dump_to=nowhere word=1",
     }
     assert results["e"]["environment"] == expected
     assert results["e"]["at the import of this file"].items() >= expected.items()

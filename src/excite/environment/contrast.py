@@ -18,6 +18,8 @@ from ..safety import safe_input
 from ..simulation import require_likelihood, step
 from .objective import AbstractObjective, StepData
 
+_IMPOSSIBLE = -1e6  # logarithm of a likelihood where it is smaller, or not a number
+
 
 @jax.custom_vjp
 def _with_finite_gradient(value: PyTree) -> PyTree:
@@ -29,8 +31,6 @@ _with_finite_gradient.defvjp(
     lambda value: (value, None),
     lambda _, slope: (jax.tree.map(lambda g: jnp.where(jnp.isfinite(g), g, 0.0), slope),),
 )
-
-_IMPOSSIBLE = -1e6  # logarithm of a likelihood where it is smaller, or not a number
 
 
 class ContrastMemory(eqx.Module):

@@ -28,7 +28,7 @@ from .dc_motor import DCMotor
 from .emps import EMPS
 from .extension import extended, plain_kind
 from .fields import floats
-from .static import AbstractStaticTask, has_own_noise, require_sensor_noise
+from .static import AbstractStaticTask, has_own_noise, own_functions, require_sensor_noise
 
 PLANTS: Mapping[str, type[AbstractPlant]] = {
     "aero2": Aero2,
@@ -240,13 +240,12 @@ def _check_plant(plant: AbstractPlant, where: str) -> None:
 
 def _check_own_noise(plant: AbstractStaticTask, where: str) -> None:
     """Raises ValueError where what is measured of a task does not fit its likelihood."""
-    own = {
-        name: getattr(type(plant), name) is not getattr(AbstractStaticTask, name)
-        for name in ("measured", "log_likelihood")
-    }
-    if not all(own.values()):
-        has, lacks = sorted(own, key=lambda name: not own[name])
-        raise ValueError(f"{where} defines {has}, and needs {lacks} too: both or none of the two")
+    own = own_functions(plant)
+    if len(own) == 1:
+        (lacks,) = {"measured", "log_likelihood"} - {*own}
+        raise ValueError(
+            f"{where} defines {own[0]}, and needs {lacks} too: both or none of the two"
+        )
     lower, upper = plant.input_limits
     design = (lower + upper) / 2
     measured = plant.measured(design, plant.nominal, jnp.zeros(len(plant.definition.outputs)))

@@ -112,10 +112,14 @@ class AbstractStaticTask(AbstractPlant):
 
 def has_own_noise(plant: AbstractPlant) -> TypeGuard[AbstractStaticTask]:
     """Whether a plant is a static task with another noise than its sensor's."""
-    if not isinstance(plant, AbstractStaticTask):
-        return False
-    usual, own = AbstractStaticTask, type(plant)
-    return own.measured is not usual.measured or own.log_likelihood is not usual.log_likelihood
+    return isinstance(plant, AbstractStaticTask) and bool(own_functions(plant))
+
+
+def own_functions(task: AbstractStaticTask) -> list[str]:
+    """Names of the functions of its own noise that a task defines: both or none, if it is right."""
+    functions = "measured", "log_likelihood"
+    usual = AbstractStaticTask
+    return [name for name in functions if getattr(type(task), name) is not getattr(usual, name)]
 
 
 def require_sensor_noise(plant: AbstractPlant) -> None:

@@ -204,8 +204,9 @@ def added(
 ) -> AnyArray:
     """The memory after one more sample: the sum of all encoded ones, whatever their order.
 
-    M. Zaheer et al., Deep sets, NeurIPS 2017. A sample is a measurement and the input before it;
-    the measurement of step 0 has none. The sum over the root of num_steps does not grow with it.
+    M. Zaheer et al., Deep sets, NeurIPS 2017. A sample is an input and the measurement after it;
+    the measurement at step 0 follows no input and is not added. Encoded samples are divided by the
+    root of num_steps, so that their sum has about the same size for experiments of any length.
     """
     encoded = network(xp, weights, observation[np.array(layout.newest)])
     is_sample = observation[layout.progress] > 0
