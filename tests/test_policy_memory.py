@@ -18,6 +18,7 @@ from excite.cli import main
 from excite.environment import Env, InformationGain
 from excite.estimation.prior_knowledge import plants_of
 from excite.excitation import PolicyExcitation
+from excite.files import tensors_from_bytes, tensors_to_bytes
 from excite.plant import Aero2
 from excite.policy import (
     Layout,
@@ -29,7 +30,7 @@ from excite.policy import (
     with_input,
     with_measurement,
 )
-from excite.policy.contract import added, gated
+from excite.policy.contract import FORMAT, added, attended, gated
 from excite.rig.player import PolicyPlayer
 from excite.simulation import run_episode
 from excite.study.agent import Agent, AgentSettings
@@ -46,15 +47,18 @@ from excite.training.settings import GradientSettings
 MEMORY, STEPS = 5, 12
 LAYOUT = Layout.of(Aero2.definition, window=1, num_steps=STEPS, memory=MEMORY)
 SUM = dataclasses.replace(LAYOUT, window=2, clocks=(0.1,), memory_kind="sum")
-BOTH = pytest.mark.parametrize("layout", [LAYOUT, SUM], ids=["gru", "sum"])
+ATTENTION = dataclasses.replace(LAYOUT, window=8, clocks=(0.1,), memory_kind="attention")
+EACH = pytest.mark.parametrize("layout", [LAYOUT, SUM, ATTENTION], ids=["gru", "sum", "attention"])
 SMALL: dict[str, Any] = {"num_plants": 2, "hidden": [4], "watch_episodes": 2}
 
 
 def weights(seed: int = 0, layout: Layout = LAYOUT) -> Any:
     rng, size = np.random.default_rng(seed), layout.size
     unit = [(3 * MEMORY, size), (3 * MEMORY, MEMORY)]
-    if layout.memory_kind == "sum":
+    if layout.memory_kind != "gru":
         unit = [(7, 2), (MEMORY, 7)]
+    if layout.memory_kind == "attention":
+        unit, size = [*unit, (3 * MEMORY, MEMORY)], 2 + 1 + 2 * len(layout.clocks)
     return tuple(
         (rng.normal(size=s).astype(np.float32), rng.normal(size=s[0]).astype(np.float32))
         for s in [*unit, (4, MEMORY + size), (1, 4)]
@@ -113,20 +117,65 @@ def test_a_sum_is_that_of_the_encoded_samples():
     np.testing.assert_array_equal(after(SUM, SAMPLES[:0])[0], 0)
 
 
-def test_the_gradient_of_a_sum_is_that_of_differences():
-    """With respect to all weights of the encoder, along one direction."""
-    own, changes = weights(0, SUM), weights(1, SUM)
+@pytest.mark.parametrize("count", [0, 1, 3, 6])
+def test_attention_is_that_of_torch(count):
+    """Over the samples there are; beside what is read, the encoded samples themselves."""
+    (inner, inner_bias), (outer, bias), (read, read_bias), *_ = weights(0, ATTENTION)
+    scaled = SAMPLES[:count, ::-1] / [ATTENTION.output_scale[0], ATTENTION.input_half[0]]
+    encoded = np.tanh(scaled @ inner.T + inner_bias) @ outer.T + bias
+    unit = torch.nn.MultiheadAttention(MEMORY, 1, batch_first=True)
+    with torch.no_grad():
+        unit.in_proj_weight.copy_(torch.from_numpy(read))
+        unit.in_proj_bias.copy_(torch.from_numpy(read_bias))
+        unit.out_proj.weight.copy_(torch.eye(MEMORY))
+        unit.out_proj.bias.zero_()
+        given = torch.from_numpy(encoded.astype(np.float32))
+        found = unit(given[None], given[None], given[None])[0][0].numpy() if count else 0 * encoded
+    expected = (encoded + found).sum(axis=0) / np.sqrt(STEPS)
+    np.testing.assert_allclose(after(ATTENTION, SAMPLES[:count])[0], expected, atol=1e-5)
+
+
+def test_attention_reads_the_samples_of_the_window_alone():
+    """With more samples than the window, the oldest are left out."""
+    rng = np.random.default_rng(6)
+    samples = rng.normal(size=(11, 2)) * [10, 0.3]
+    forgotten = np.concatenate([rng.normal(size=(3, 2)), samples[3:]])
+    kept, changed = (after(ATTENTION, own)[0] for own in (samples, forgotten))
+    np.testing.assert_array_equal(kept, changed)
+    shorter = dataclasses.replace(ATTENTION, window=9)
+    assert abs(after(shorter, samples)[0] - after(shorter, forgotten)[0]).max() > 1e-3
+
+
+@pytest.mark.parametrize("steps", [7, 49, 500, 10_007])
+def test_attention_counts_the_samples_at_every_step(steps):
+    """In single precision too, where k / T times T is not k."""
+    layout = dataclasses.replace(ATTENTION, num_steps=steps, window=steps, clocks=())
+    if steps > 500:
+        layout = dataclasses.replace(layout, window=500)
+    zero = np.zeros((MEMORY, 7), np.float32)
+    nothing = np.zeros((3 * MEMORY, MEMORY), np.float32), np.zeros(3 * MEMORY, np.float32)
+    unit = weights(0, ATTENTION)[0], (zero, np.ones(MEMORY, np.float32)), nothing
+    window = empty_window(np, layout)
+    for k in {0, 1, 2, steps // 3, layout.window - 1, steps - 1}:
+        seen = attended(np, layout, unit, None, observe(np, layout, window, k))
+        assert seen[0] * np.sqrt(steps) == pytest.approx(min(k, layout.window), rel=1e-5)
+
+
+@pytest.mark.parametrize("layout", [SUM, ATTENTION], ids=["sum", "attention"])
+def test_the_gradient_is_that_of_differences(layout):
+    """With respect to all weights of the unit, along one direction."""
+    own, changes, first = weights(0, layout), weights(1, layout), len(layout.unit)
     whole, changes = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), (own, changes))
 
     @jax.jit
     @jax.value_and_grad
     def actions(step: jax.Array) -> jax.Array:
-        moved = jax.tree.map(lambda leaf, by: leaf + step * by, whole[:2], changes[:2])
-        window, total = empty_window(jnp, SUM), jnp.zeros(())
+        moved = jax.tree.map(lambda leaf, by: leaf + step * by, whole[:first], changes[:first])
+        window, total = empty_window(jnp, layout), jnp.zeros(())
         for k, (input, measured) in enumerate(SAMPLES):
-            window = with_input(jnp, SUM, window, input[None])
-            window = with_measurement(jnp, SUM, window, measured[None])
-            window, action = act(jnp, SUM, (*moved, *whole[2:]), window, jnp.asarray(k))
+            window = with_input(jnp, layout, window, input[None])
+            window = with_measurement(jnp, layout, window, measured[None])
+            window, action = act(jnp, layout, (*moved, *whole[first:]), window, jnp.asarray(k))
             total += action[0]
         return total
 
@@ -137,19 +186,20 @@ def test_the_gradient_of_a_sum_is_that_of_differences():
 
 
 def test_a_sum_does_not_depend_on_the_order_of_the_samples_and_a_unit_does():
-    """The action depends on the window, too: here of the newest two samples."""
+    """The action depends on the window, too: here of the newest two samples; of attention, one."""
     orders = [[3, 0, 2, 1, 4, 5], [2, 3, 1, 0, 4, 5]]
-    kept, changed = (
-        [after(layout, SAMPLES[order]) for order in orders] for layout in (SUM, LAYOUT)
+    kept, read, changed = (
+        [after(layout, SAMPLES[order]) for order in orders] for layout in (SUM, ATTENTION, LAYOUT)
     )
-    np.testing.assert_allclose(kept[0][0], kept[1][0], atol=1e-5)
-    assert kept[0][1] == pytest.approx(kept[1][1], abs=1e-5)
+    for own in (kept, read):
+        np.testing.assert_allclose(own[0][0], own[1][0], atol=1e-5)
+        assert own[0][1] == pytest.approx(own[1][1], abs=1e-5)
     assert abs(changed[0][0] - changed[1][0]).max() > 1e-3
     assert abs(changed[0][1] - changed[1][1]) > 1e-4
     np.testing.assert_allclose(after(SUM, SAMPLES[::-1])[0], kept[0][0], atol=1e-5)
 
 
-@BOTH
+@EACH
 def test_numpy_on_a_rig_and_jax_in_a_simulation_give_the_same_inputs(layout):
     rng, player = np.random.default_rng(2), PolicyPlayer(policy(0, layout))
     excitation = PolicyExcitation.of(policy(0, layout))
@@ -197,7 +247,7 @@ def test_the_training_plays_what_the_simulation_plays():
     assert not np.allclose(experiments(process, without, keys, 0.9).nearness, sizes, rtol=1e-3)
 
 
-@BOTH
+@EACH
 def test_it_travels_in_its_file_and_others_keep_theirs(tmp_path, layout):
     policy(0, layout).save(tmp_path / "p.safetensors")
     read = ex.read_policy(tmp_path / "p.safetensors")
@@ -207,7 +257,7 @@ def test_it_travels_in_its_file_and_others_keep_theirs(tmp_path, layout):
     run = run_episode(Aero2(), Aero2().nominal, PolicyExcitation.of(read), STEPS, jax.random.key(0))
     assert np.isfinite(run.inputs).all()
     assert b"memory" not in ex.read_policy("aero2").to_bytes()
-    assert (b"memory_kind" in read.to_bytes()) == (layout is SUM)
+    assert (b"memory_kind" in read.to_bytes()) == (layout is not LAYOUT)
 
 
 def test_a_policy_with_a_unit_has_the_hash_it_had_before_there_were_sums():
@@ -249,7 +299,7 @@ def test_trainers_refuse_what_they_cannot_train():
         gymnasium.make("excite.environment.gymnasium:excite/Aero2-v0", layout=LAYOUT)
 
 
-@BOTH
+@EACH
 @pytest.mark.parametrize("part", range(4))
 def test_a_unit_that_does_not_fit_is_refused(part, layout):
     wrong = [list(layer) for layer in weights(0, layout)]
@@ -269,13 +319,16 @@ def test_a_unit_whose_weights_are_not_finite_and_a_negative_memory_are_refused()
 
 
 def test_a_kind_of_memory_that_does_not_exist_or_is_of_none_is_refused():
-    with pytest.raises(ValueError, match="memory_kind must be 'gru' or 'sum': got 'lstm'"):
+    with pytest.raises(
+        ValueError, match="memory_kind must be one of gru, sum, attention: got 'lstm'"
+    ):
         Layout.of(Aero2.definition, memory=3, memory_kind="lstm")
     with pytest.raises(ValueError, match="memory_kind needs a memory: set memory, or"):
         Layout.of(Aero2.definition, memory_kind="sum")
-    content = dataclasses.replace(policy(), layout=dataclasses.replace(LAYOUT, memory_kind="lstm"))
-    with pytest.raises(ValueError, match="policy: memory_kind must be 'gru' or 'sum': got 'lstm'"):
-        Policy.from_bytes(content.to_bytes())
+    tensors, contract = tensors_from_bytes(policy(0, SUM).to_bytes(), FORMAT, "policy")
+    contract["layout"]["memory_kind"] = "lstm"
+    with pytest.raises(ValueError, match="policy: memory_kind must be one of gru, sum, attention"):
+        Policy.from_bytes(tensors_to_bytes(tensors, FORMAT, contract))
 
 
 def test_one_observation_is_not_enough_for_an_action():
@@ -283,7 +336,7 @@ def test_one_observation_is_not_enough_for_an_action():
         policy()(np.zeros(LAYOUT.size, np.float32))
 
 
-@BOTH
+@EACH
 def test_other_runtimes_play_it_with_its_memory(tmp_path, monkeypatch, capsys, layout):
     policy(0, layout).save(tmp_path / "p.safetensors")
     words = "export", str(tmp_path / "p.safetensors"), "--onnx", str(tmp_path / "p.onnx")
@@ -316,7 +369,8 @@ def test_other_runtimes_play_it_with_its_memory(tmp_path, monkeypatch, capsys, l
         assert (float(ours[0]) == 0) == np.isnan(bad)
         np.testing.assert_array_equal(kept[1], np.asarray(memory, np.float32)[1])
         np.testing.assert_array_equal(after.memory, window.memory)
-        assert not np.allclose(kept[0], memory[0])
+        if layout is not ATTENTION:  # which reads the window again
+            assert not np.allclose(kept[0], memory[0])
 
 
 @pytest.mark.slow
@@ -337,7 +391,7 @@ def test_it_is_trained_by_its_arguments():
     [
         ({"method": "ppo"}, "ppo trains policies without a memory"),
         ({"training": {"starts": 4}}, "several starts are for policies without a memory"),
-        ({"memory_kind": "lstm"}, "memory_kind must be 'gru' or 'sum', got \"lstm\""),
+        ({"memory_kind": "lstm"}, "memory_kind must be 'gru', 'sum' or 'attention', got \"lstm\""),
         ({"memory": None, "memory_kind": "sum"}, "memory_kind needs a memory: set memory, or"),
         ({"memory": 0, "memory_kind": "gru"}, "memory_kind needs a memory: set memory, or"),
     ],
@@ -350,7 +404,10 @@ def test_trainings_that_cannot_be_are_one_sentence(options, message):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--memory", "3", "--memory-kind", "lstm"], "'lstm' is not one of 'gru', 'sum'"),
+        (
+            ["--memory", "3", "--memory-kind", "lstm"],
+            "is not one of 'gru', 'sum', 'attention'",
+        ),
         (["--memory-kind", "sum"], "memory_kind needs a memory: set memory, or"),
     ],
 )

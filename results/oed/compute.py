@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import excite as ex
-from excite.environment import Env, InformationGain
+from excite.environment import ContrastiveGain, Env, InformationGain
 from excite.estimation.prior_knowledge import plants_of
 from excite.excitation import PRBS, Random, Replay
 from excite.files import module_at
@@ -32,6 +32,24 @@ from excite.training.signals import ROBUST, robust_signal
 
 HERE = Path(__file__).parent
 EXAMPLES = HERE.parent.parent / "examples"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rival:
+    """A published method, trained by this package.
+
+    Attributes:
+        memory, memory_kind: of its policy.
+        compared: plants in the bound that its training makes large.
+        settings: of the training.
+    """
+
+    memory: int
+    memory_kind: str
+    compared: int
+    settings: GradientSettings
+
+
 NEAR_THE_POSTERIOR = {"plants": 2048, "samples": 100, "seed": 1}
 FROM_THE_PRIOR = {"plants": 256, "samples": 100_000, "from_prior": True, "seed": 1}
 
@@ -55,6 +73,7 @@ class Task:
         myopic: evaluation of designs chosen one after the other, for each seed; none for a plant
             with states. Another one has as many plants and 1,000 samples near the posterior.
         pool: number of designs, drawn at random, that are allowed to these; 0 for all.
+        rivals: other methods, by their names.
     """
 
     plant: str
@@ -69,6 +88,7 @@ class Task:
     also: Mapping[str, object] | None = None
     myopic: Mapping[str, object] | None = None
     pool: int = 0
+    rivals: Mapping[str, Rival] = field(default_factory=dict)
 
     @property
     def word(self):
@@ -83,6 +103,14 @@ class Task:
             (True,) * count, 1.0, 0.5, dense=False, prior=prior, change_price=price
         )
         layout = Layout.of(plant.description, 1, self.steps, self.memory)
+        return Env.of(plant, objective=objective, layout=layout, prior=prior)
+
+    def rival_env(self, rival):
+        """The decision process of another method."""
+        plant = plant_named(self.word)
+        prior = plants_of(plant, self.prior)
+        objective = ContrastiveGain(prior, rival.compared, dense=False)
+        layout = Layout.of(plant.description, 1, self.steps, rival.memory, rival.memory_kind)
         return Env.of(plant, objective=objective, layout=layout, prior=prior)
 
 
@@ -141,6 +169,15 @@ TASKS = {
         evaluation=FROM_THE_PRIOR,
         also={"plants": 256, "samples": 5000, "seed": 1},
         myopic={"plants": 667, "samples": 1_000_000, "from_prior": True},
+        rivals={
+            "DAD": Rival(
+                memory=16, memory_kind="sum", compared=1023,
+                settings=GradientSettings(
+                    num_updates=8000, num_plants=128, learning_rate=1e-3, hidden=(256,),
+                    last_gain=0.3, watch_every=500, watch_episodes=512,
+                ),
+            ),
+        },
     ),
     "one source": Task(
         plant="location_finding.py:OneSource",
@@ -223,6 +260,18 @@ def trained_rows(task, seed):
         yield row(task, "gradient", policy, **told)
 
 
+def rival_row(task, name):
+    """Of another method, trained once; its policy is written beside the table."""
+    rival, start = TASKS[task].rivals[name], time.process_time()
+    env = TASKS[task].rival_env(rival)
+    made = train(env, rival.settings, 0)
+    seconds = time.process_time() - start
+    about = {"excite": ex.__version__, "task": task, "method": name, "seed": 0}
+    policy = Policy(env.plant.description, env.layout, made.weights, about)
+    policy.save(path_of(task, f"-{name}.safetensors"), overwrite=True)
+    return row(task, name, policy, train_cpu_seconds=seconds)
+
+
 def myopic_row(task, seed):
     """Of designs chosen one after the other; the seed is that of plants, noise and designs."""
     own, start = TASKS[task], time.process_time()
@@ -300,6 +349,8 @@ def main():
         if own.myopic is not None:
             for seed in seeds:
                 keep("myopic", lambda task=task, seed=seed: [myopic_row(task, seed)], seed)
+        for name in own.rivals:
+            keep(name, lambda task=task, name=name: [rival_row(task, name)])
         for seed in seeds if own.trainings else ():
             keep("gradient", partial(trained_rows, task, seed), seed)
         print("\n".join(lines(task)))

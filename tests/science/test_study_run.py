@@ -482,7 +482,10 @@ def test_one_command_trains_a_policy_by_gradient(name, choice, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--objective", "X"), "unknown objective 'X' (there is D, A, E, sPCE, goals, relative, log, nls"),
+        (
+            ("--objective", "X"),
+            "unknown objective 'X' (there is D, A, E, sPCE, goals, relative, log, nls",
+        ),
         (("--objective", "D", "--objective", "log=x"), "the weight of 'log' must be a number"),
         (("--objective", "D", "--objective", "log=-1"), "weight must be greater than 0"),
         (("--objective", "D", "--objective", "D=2"), "objectives must differ from each other"),

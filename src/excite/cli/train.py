@@ -44,10 +44,10 @@ def _options(command: Any) -> Any:
             click.option("--window", type=WholeNumber(1, 10_000),
                          help="Number of samples observed; default 80."),
             click.option("--memory", type=WholeNumber(0, 10_000),
-                         help="Numbers that the policy carries from step to step; default none."),
-            click.option("--memory-kind", type=click.Choice(["gru", "sum"]),
-                         help="Gated recurrent unit (default), or sum of the encoded samples, "
-                         "whatever their order."),
+                         help="Numbers in which the policy keeps what it has seen; default none."),
+            click.option("--memory-kind", type=click.Choice(["gru", "sum", "attention"]),
+                         help="Gated recurrent unit (default), sum of the encoded samples, "
+                         "whatever their order, or attention over the window."),
             click.option("--clock", type=Number(), multiple=True, metavar="HZ",
                          help="Also observe sine and cosine of this frequency."),
             click.option("--contrast-plants", type=WholeNumber(1, 1_000_000), metavar="NUMBER",

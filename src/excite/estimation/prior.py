@@ -16,7 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import ndtr
+from jax.scipy.special import ndtr, ndtri
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..description import RARE, Parameter, Spread, names_of, prior_sd_of
@@ -244,6 +244,20 @@ class PriorPlants(eqx.Module):
                 unit, nominal = 2 * ndtr(z[i]) - 1, self.plant.nominal[i]
                 values[parameter.name] = self.spread.value(parameter, nominal, unit)
         return self.plant.Params(**values)
+
+    def coordinates(self, params: Params) -> Float[Array, " param"]:
+        """The coordinates of some parameters: the inverse of `params`."""
+        d, values = self.plant.definition, {}
+        if self.normal is not None:
+            own = self.normal.residual(names_of(d.parameters), jnp.stack(params))
+            values = dict(zip(self.normal.names, own, strict=True))
+        for name, low, high in self.ranges:
+            values[name] = ndtri((getattr(params, name) - low) / (high - low))
+        for parameter, nominal in zip(d.parameters, self.plant.nominal, strict=True):
+            if parameter.name not in values:
+                own = getattr(params, parameter.name)
+                values[parameter.name] = ndtri((1 + self.spread.unit(parameter, nominal, own)) / 2)
+        return jnp.stack([values[name] for name in names_of(d.parameters)])
 
 
 def bounded(

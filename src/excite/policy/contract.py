@@ -38,8 +38,9 @@ AnyArray: TypeAlias = Any
 """A NumPy or a JAX array."""
 
 Weights: TypeAlias = tuple[tuple[AnyArray, AnyArray], ...]
-"""Matrix [out, in] and bias [out] of every layer. Of a policy with a memory, the first two are its
-unit: gates from the observation and from the memory, or the encoder of a sample."""
+"""Matrix [out, in] and bias [out] of every layer. Of a policy with a memory, the first are its
+unit: gates from the observation and from the memory, or the encoder of a sample, which for
+attention is followed by queries, keys and values."""
 
 
 @dataclass(frozen=True)
@@ -58,9 +59,9 @@ class Layout:
         input_middle, input_half: middle of each input's limits, and the largest distance
             from it: half their width, or less.
         clocks: frequencies of the clocks, in cycles a step, at most one half.
-        memory: numbers that the policy carries from step to step.
-        memory_kind: how: `gru`, by a gated recurrent unit, or `sum`, as the sum of the encoded
-            samples.
+        memory: numbers in which the policy keeps what it has seen.
+        memory_kind: how: `gru`, by a gated recurrent unit; `sum`, as the sum of the encoded
+            samples; or `attention`, by self-attention over the samples of the window.
     """
 
     window: int
@@ -71,6 +72,15 @@ class Layout:
     clocks: tuple[float, ...] = ()
     memory: int = 0
     memory_kind: str = "gru"
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for a kind of memory that does not exist, or of none."""
+        if self.memory_kind not in MEMORIES:
+            raise ValueError(
+                f"memory_kind must be one of {', '.join(MEMORIES)}: got {self.memory_kind!r}"
+            )
+        if self.memory_kind != "gru" and not self.memory:
+            raise ValueError(NO_MEMORY)
 
     @classmethod
     def of(
@@ -89,12 +99,6 @@ class Layout:
         """
         if memory < 0:
             raise ValueError(f"memory must not be negative: got {memory}")
-        if memory_kind not in MEMORIES:
-            raise ValueError(
-                f"memory_kind must be {' or '.join(map(repr, MEMORIES))}: got {memory_kind!r}"
-            )
-        if memory_kind != "gru" and not memory:
-            raise ValueError(NO_MEMORY)
         if window < 1 or num_steps < 1:
             raise ValueError(
                 f"window and num_steps must be at least 1: got {window} and {num_steps}"
@@ -125,6 +129,25 @@ class Layout:
         first = self.window * len(self.output_scale)
         outputs = range(first - len(self.output_scale), first)
         return (*outputs, *range(self.progress - len(self.input_half), self.progress))
+
+    @property
+    def beside_memory(self) -> tuple[int, ...]:
+        """Where an observation has what the layers after a memory see too.
+
+        All of it; with attention, which has read the window, the newest sample and the time.
+        """
+        if self.memory_kind == "attention":
+            return (*self.newest, *range(self.progress, self.size))
+        return tuple(range(self.size))
+
+    @property
+    def unit(self) -> tuple[tuple[int, int], ...]:
+        """Shapes of the matrices of the memory's unit; of an encoder, -1 is a free width."""
+        m, sample = self.memory, len(self.newest)
+        gates = (3 * m, self.size), (3 * m, m)
+        encoder = (-1, sample), (m, -1)
+        units = {"gru": gates, "sum": encoder, "attention": (*encoder, (3 * m, m))}
+        return units[self.memory_kind] if m else ()
 
 
 class Window(NamedTuple):
@@ -213,7 +236,34 @@ def added(
     return memory + xp.where(is_sample, encoded / math.sqrt(layout.num_steps), 0.0)
 
 
-MEMORIES = {"gru": gated, "sum": added}
+def attended(
+    xp: ModuleType, layout: Layout, weights: Weights, memory: AnyArray, observation: AnyArray
+) -> AnyArray:
+    """What self-attention reads in the samples of the window, whatever their order.
+
+    A. Vaswani et al., Attention is all you need, NeurIPS 2017, with one head; added up and divided
+    by the root of num_steps, as in `added`. With a window of num_steps these are all samples.
+    """
+    del memory
+    outputs, inputs = xp.split(
+        observation[: layout.progress], [layout.window * len(layout.output_scale)]
+    )
+    parts = [xp.reshape(part, (layout.window, -1)) for part in (outputs, inputs)]
+    hidden, last, read = weights
+    inner = xp.tanh(xp.concatenate(parts, axis=1) @ hidden[0].T + hidden[1][None])
+    encoded = inner @ last[0].T + last[1][None]
+    queries, keys, values = xp.split(encoded @ read[0].T + read[1][None], 3, axis=1)
+    age = np.arange(layout.window, dtype=np.float32)[::-1] + np.float32(0.5)
+    is_sample = age < observation[layout.progress] * layout.num_steps
+    scores = queries @ keys.T / np.float32(math.sqrt(layout.memory))
+    scores = xp.where(is_sample[None], scores, np.float32(-1e9))
+    shares = xp.exp(scores - xp.max(scores, axis=1, keepdims=True))
+    seen = encoded + shares / xp.sum(shares, axis=1, keepdims=True) @ values
+    whole = xp.sum(xp.where(is_sample[:, None], seen, np.float32(0)), axis=0)
+    return whole / np.float32(math.sqrt(layout.num_steps))
+
+
+MEMORIES = {"gru": gated, "sum": added, "attention": attended}
 """Kinds of memory, and how each goes on with one more observation."""
 
 NO_MEMORY = "memory_kind needs a memory: set memory, or leave memory_kind out"
@@ -237,8 +287,10 @@ def act(
     seen = observe(xp, layout, window, k)
     if layout.memory:
         remembered = MEMORIES[layout.memory_kind]
-        memory = remembered(xp, layout, weights[:2], window.memory, seen)
-        action = network(xp, weights[2:], xp.concatenate([memory, seen]))
+        first = len(layout.unit)
+        memory = remembered(xp, layout, weights[:first], window.memory, seen)
+        beside = seen[np.array(layout.beside_memory)]
+        action = network(xp, weights[first:], xp.concatenate([memory, beside]))
         memory = xp.where(xp.all(xp.isfinite(seen)), memory, window.memory)
         action = xp.where(xp.isfinite(action), xp.tanh(action), if_not_finite)
         return window._replace(memory=memory), action
@@ -333,7 +385,7 @@ class Policy:
     def __repr__(self) -> str:
         """Plant, what is observed, how it was trained, and the hash."""
         layout, made = self.layout, self.provenance
-        layers = self.weights[2:] if layout.memory else self.weights
+        layers = self.weights[len(layout.unit) :]
         widths = [layout.size, *[layout.memory] * bool(layout.memory), *(len(b) for _, b in layers)]
         words = [f"{word} {made[word]}" for word in ("method", "agent", "study") if word in made]
         claim = textwrap.fill(self.claim, 80, initial_indent="  ", subsequent_indent="    ")
@@ -513,17 +565,14 @@ def _check_certificate(certificate: Any) -> None:
 
 def _check_layers(weights: Weights, layout: Layout) -> None:
     """Raises ValueError where the layers do not fit each other, the layout or the plant."""
-    width, first = layout.size, 0
+    width, first = layout.size, len(layout.unit)
     if layout.memory:
-        if layout.memory_kind == "sum":
-            inner = weights[0][1].size if weights else 0
-            matrices = (inner, len(layout.newest)), (layout.memory, inner)
-        else:
-            matrices = (3 * layout.memory, width), (3 * layout.memory, layout.memory)
-        shapes = [shape for matrix in matrices for shape in (matrix, matrix[:1])]
-        if [part.shape for layer in weights[:2] for part in layer] != shapes:
+        inner = weights[0][1].size if weights else 0
+        matrices = [[inner if n == -1 else n for n in matrix] for matrix in layout.unit]
+        shapes = [tuple(shape) for matrix in matrices for shape in (matrix, matrix[:1])]
+        if [part.shape for layer in weights[:first] for part in layer] != shapes:
             raise ValueError(f"the unit of a memory of {layout.memory} numbers has other weights")
-        width, first = width + layout.memory, 2
+        width = layout.memory + len(layout.beside_memory)
     if len(weights) <= first:
         raise ValueError("a policy needs at least one layer")
     for matrix, bias in weights[:first]:

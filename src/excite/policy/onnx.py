@@ -94,7 +94,7 @@ def _network(policy: Policy) -> tuple[list[NodeProto], dict[str, np.ndarray]]:
     nodes, into, layers = [], "observation", policy.weights
     if policy.layout.memory:
         nodes, unit = _unit(policy)
-        constants, into, layers = constants | unit, "seen", layers[2:]
+        constants, into, layers = constants | unit, "seen", layers[len(policy.layout.unit) :]
     for i, (matrix, bias) in enumerate(layers):
         if i:
             nodes.append(helper.make_node("Tanh", [into], [f"{i}.tanh"]))
@@ -120,9 +120,13 @@ def _network(policy: Policy) -> tuple[list[NodeProto], dict[str, np.ndarray]]:
 
 def _unit(policy: Policy) -> tuple[list[NodeProto], dict[str, np.ndarray]]:
     """Nodes and constants of the memory, and of what the layers after it see."""
-    nodes, constants = _sum(policy) if policy.layout.memory_kind == "sum" else _gru(policy)
+    nodes, constants = {"gru": _gru, "sum": _sum, "attention": _attention}[
+        policy.layout.memory_kind
+    ](policy)
+    constants["beside"] = np.array(policy.layout.beside_memory, np.int64)
     nodes += [
-        helper.make_node("Concat", ["new", "observation"], ["seen"], axis=1),
+        helper.make_node("Gather", ["observation", "beside"], ["also"], axis=1),
+        helper.make_node("Concat", ["new", "also"], ["seen"], axis=1),
         # Zero times what is not finite is NaN: such an observation is not remembered.
         helper.make_node("Mul", ["observation", "zero"], ["nothing"]),
         helper.make_node("ReduceSum", ["nothing", "last"], ["sum"]),
@@ -155,6 +159,58 @@ def _sum(policy: Policy) -> tuple[list[NodeProto], dict[str, np.ndarray]]:
         helper.make_node("Greater", ["done", "zero"], ["is_sample"]),
         helper.make_node("Where", ["is_sample", "encoded", "zero"], ["more"]),
         helper.make_node("Add", ["memory", "more"], ["new"]),
+    ]
+    return nodes, constants
+
+
+def _attention(policy: Policy) -> tuple[list[NodeProto], dict[str, np.ndarray]]:
+    """Nodes and constants of `policy.contract.attended`."""
+    layout, memory = policy.layout, policy.layout.memory
+    names = "outputs", "inputs"
+    ends = 0, layout.window * len(layout.output_scale), layout.progress
+    constants = {
+        "progress": np.array([layout.progress], np.int64),
+        "steps": np.array(layout.num_steps, np.float32),
+        "age": np.arange(layout.window, dtype=np.float32)[::-1] + np.float32(0.5),
+        "root": np.array(math.sqrt(memory), np.float32),
+        "root_of_steps": np.array(math.sqrt(layout.num_steps), np.float32),
+        "never": np.array(-1e9, np.float32),
+        "samples_axis": np.array([1], np.int64),
+        "in_a_sample": np.array([2], np.int64),
+    }
+    nodes = [
+        helper.make_node("Gather", ["observation", "progress"], ["done"], axis=1),
+        helper.make_node("Mul", ["done", "steps"], ["count"]),
+        helper.make_node("Less", ["age", "count"], ["is_sample"]),
+        helper.make_node("Unsqueeze", ["is_sample", "samples_axis"], ["is_key"]),
+        helper.make_node("Unsqueeze", ["is_sample", "in_a_sample"], ["is_row"]),
+    ]
+    for name, start, end in zip(names, ends, ends[1:], strict=False):
+        constants[f"{name}.places"] = np.arange(start, end)
+        constants[f"{name}.shape"] = np.array([-1, layout.window, (end - start) // layout.window])
+        words = ["observation", f"{name}.places"], [f"{name}.flat"]
+        nodes.append(helper.make_node("Gather", *words, axis=1))
+        nodes.append(helper.make_node("Reshape", [f"{name}.flat", f"{name}.shape"], [name]))
+    nodes.append(helper.make_node("Concat", list(names), ["samples"], axis=2))
+    layers = ("samples", "inner_sum"), ("inner", "encoded"), ("encoded", "read")
+    for i, ((into, out), (matrix, bias)) in enumerate(zip(layers, policy.weights, strict=False)):
+        constants |= {f"unit.{i}.weight": matrix.T.copy(), f"unit.{i}.bias": bias}
+        nodes.append(helper.make_node("MatMul", [into, f"unit.{i}.weight"], [f"unit.{i}"]))
+        nodes.append(helper.make_node("Add", [f"unit.{i}", f"unit.{i}.bias"], [out]))
+        if i == 0:
+            nodes.append(helper.make_node("Tanh", ["inner_sum"], ["inner"]))
+    nodes += [
+        helper.make_node("Split", ["read"], ["queries", "keys", "values"], axis=2),
+        helper.make_node("Transpose", ["keys"], ["turned"], perm=[0, 2, 1]),
+        helper.make_node("MatMul", ["queries", "turned"], ["products"]),
+        helper.make_node("Div", ["products", "root"], ["scores"]),
+        helper.make_node("Where", ["is_key", "scores", "never"], ["allowed"]),
+        helper.make_node("Softmax", ["allowed"], ["shares"], axis=2),
+        helper.make_node("MatMul", ["shares", "values"], ["found"]),
+        helper.make_node("Add", ["encoded", "found"], ["each"]),
+        helper.make_node("Where", ["is_row", "each", "zero"], ["counted"]),
+        helper.make_node("ReduceSum", ["counted", "samples_axis"], ["whole"], keepdims=0),
+        helper.make_node("Div", ["whole", "root_of_steps"], ["new"]),
     ]
     return nodes, constants
 

@@ -88,8 +88,9 @@ class DecisionSettings(RewardSettings):
     Attributes:
         terms: several rewards instead of one, which are added.
         window: number of samples observed.
-        memory: numbers that the policy carries from step to step (by gradient), beside the window.
-        memory_kind: `gru`, a gated recurrent unit, or `sum`, of the encoded samples.
+        memory: numbers in which the policy keeps what it has seen (by gradient), beside the window.
+        memory_kind: `gru`, a gated recurrent unit; `sum`, of the encoded samples; `attention`,
+            over the samples of the window.
         clocks: frequencies [Hz] whose sine and cosine are observed too.
         output_scale: y_max by output, in its unit, where it differs from the output's scale.
         input_amplitude: by input, in its unit, how far from the middle of its limits the
@@ -103,7 +104,7 @@ class DecisionSettings(RewardSettings):
     terms: Annotated[list[RewardSettings], Field(min_length=1)] = []
     window: Annotated[Count, Field(le=10_000)] = 80
     memory: Annotated[int, Field(ge=0, le=10_000, strict=True)] = 0
-    memory_kind: Literal["gru", "sum"] = "gru"
+    memory_kind: Literal["gru", "sum", "attention"] = "gru"
     clocks: list[Positive] = []
     output_scale: dict[str, Positive] = {}
     input_amplitude: dict[str, Positive] = {}

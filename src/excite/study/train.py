@@ -72,10 +72,11 @@ def train(
         target: parameters in the objective, default the plant's targets.
         goal: relative error that is scaled to one, by parameter.
         window: number of samples observed, default 80.
-        memory: numbers that the policy carries from step to step; default none. With a memory, a
-            window of one sample is enough. By gradient only.
-        memory_kind: `gru` (default), a gated recurrent unit, or `sum`, of the encoded samples,
-            which does not depend on their order: for tasks without memory.
+        memory: numbers in which the policy keeps what it has seen; default none. By gradient only.
+        memory_kind: `gru` (default), a gated recurrent unit; `sum`, of the encoded samples, which
+            does not depend on their order: for tasks without memory; or `attention`, of each
+            sample of the window to the others. With the first two, a window of one sample is
+            enough; with attention, take a window as long as the experiment.
         clock: frequencies [Hz] whose sine and cosine are observed too.
         change_price: of the squared change of an input from step to step [1 / input unit²],
             subtracted from the objective, which must be information (`D`, `A`, `E`, `sPCE`).

@@ -434,7 +434,8 @@ def optimiser(settings: GradientSettings) -> optax.GradientTransformation:
 def _first_weights(env: Env, settings: GradientSettings, key: PRNGKeyArray) -> Weights:
     """Glorot's weights (X. Glorot, Y. Bengio, 2010), those of the last layer made small."""
     layout, memory = env.layout, env.layout.memory
-    widths = [memory + layout.size, *settings.hidden, len(layout.input_half)]
+    seen = memory + len(layout.beside_memory) if memory else layout.size
+    widths = [seen, *settings.hidden, len(layout.input_half)]
     gains = [1.0] * len(settings.hidden) + [settings.last_gain]
     keys = jax.random.split(key, len(gains))
     layers = tuple(
@@ -443,17 +444,17 @@ def _first_weights(env: Env, settings: GradientSettings, key: PRNGKeyArray) -> W
     )
     if not memory:
         return layers
-    into_key, back_key = jax.random.split(jax.random.fold_in(key, 1))
-    if layout.memory_kind == "sum":
-        inner = settings.hidden[0]
-        encoder = _layer(into_key, len(layout.newest), inner), _layer(back_key, inner, memory)
-        return *encoder, *layers
-    into = _layer(into_key, layout.size, 3 * memory)
-    back = jax.nn.initializers.orthogonal(column_axis=0)(
-        back_key, (3 * memory, memory), jnp.float32
-    )
-    keeps = jnp.repeat(jnp.array([0.0, 1.0, 0.0], jnp.float32), memory)
-    return into, (back, keeps), *layers
+    own_keys = jax.random.split(jax.random.fold_in(key, 1))
+    if layout.memory_kind == "gru":
+        back = jax.nn.initializers.orthogonal(column_axis=0)(
+            own_keys[1], (3 * memory, memory), jnp.float32
+        )
+        keeps = jnp.repeat(jnp.array([0.0, 1.0, 0.0], jnp.float32), memory)
+        return _layer(own_keys[0], layout.size, 3 * memory), (back, keeps), *layers
+    own_keys = [*own_keys, jax.random.fold_in(key, 2)]
+    shapes = [[settings.hidden[0] if n == -1 else n for n in shape] for shape in layout.unit]
+    unit = [_layer(own, n, m) for own, (m, n) in zip(own_keys, shapes, strict=False)]
+    return *unit, *layers
 
 
 def _layer(
