@@ -121,7 +121,7 @@ def test_a_study_names_it_and_its_plants():
     assert (
         "contrast_plants" not in Agent.of(AgentSettings(), {}, {}, {}).settings(Aero2())["decision"]
     )
-    with pytest.raises(ValueError, match=r"reward 'contrast'. is of all parameters"):
+    with pytest.raises(ValueError, match="the reward 'contrast' is of all parameters"):
         Agent.of(settings.model_copy(update={"targets": ["J_p"]}), {}, {}, {}).env(Aero2(), 0.3, 20)
     with pytest.raises(ValueError, match="the reward 'contrast' has no 'criterion'"):
         Agent.of(AgentSettings(decision={"reward": "contrast", "criterion": "A"}), {}, {}, {})
@@ -159,7 +159,7 @@ def test_it_is_an_objective_of_training():
         training={"total_steps": 256, "num_envs": 4, "n_steps": 16, "batch_size": 64},
     )  # fmt: skip
     assert policy.layout.num_steps == 4
-    with pytest.raises(ValueError, match="contrast_plants are for the objective sPCE: got D"):
+    with pytest.raises(ValueError, match="are for the objectives sPCE and ACE: got D"):
         ex.train(Line(), contrast_plants=15)
     with pytest.raises(ValueError, match="compares plants that differ: give a spread or a prior"):
         ex.train(Aero2(), objective="sPCE", spread=0.0)

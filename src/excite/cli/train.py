@@ -31,8 +31,8 @@ def _options(command: Any) -> Any:
             click.option("--method", type=click.Choice(["gradient", "ppo"]), default="gradient",
                          show_default=True, help="Gradient of the simulated experiment, or PPO."),
             click.option("--objective", multiple=True, metavar="NAME[=WEIGHT]",
-                         help="Criterion of the Fisher information (D, A, E), a lower bound of the "
-                         "expected information gain (sPCE), or errors of the ARX estimator "
+                         help="Criterion of the Fisher information (D, A, E), lower bounds of the "
+                         "expected information gain (sPCE, ACE), or errors of the ARX estimator "
                          "(relative, log, goals) or of nonlinear least squares (nls); repeated, a "
                          "sum with these weights. Default D."),
             click.option("--target", multiple=True, metavar="NAME",
@@ -51,7 +51,8 @@ def _options(command: Any) -> Any:
             click.option("--clock", type=Number(), multiple=True, metavar="HZ",
                          help="Also observe sine and cosine of this frequency."),
             click.option("--contrast-plants", type=WholeNumber(1, 1_000_000), metavar="NUMBER",
-                         help="Plants with which sPCE compares the true one; default 255."),
+                         help="Plants with which the true one is compared; default 255 for sPCE, "
+                         "15 for ACE."),
             click.option("--change-price", type=Number(min=0), default=0.0, metavar="PRICE",
                          help="Subtracted from the information for each squared change of an "
                          "input [1 / input unit²]; default none."),

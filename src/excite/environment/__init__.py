@@ -3,6 +3,7 @@
 `gymnasium` is imported by its module's name, because it loads Gymnasium.
 """
 
+from .adaptive_contrast import AdaptiveContrastiveGain as AdaptiveContrastiveGain
 from .contrast import ContrastiveGain as ContrastiveGain
 from .episodes import Episodes as Episodes
 from .episodes import run_episodes as run_episodes

@@ -18,16 +18,17 @@ from ..safety import safe_input
 from ..simulation import require_likelihood, step
 from .objective import AbstractObjective, StepData
 
-_IMPOSSIBLE = -1e6  # logarithm of a likelihood where it is smaller, or not a number
+IMPOSSIBLE = -1e6
+"""Logarithm of a likelihood where it is smaller, or not a number."""
 
 
 @jax.custom_vjp
-def _with_finite_gradient(value: PyTree) -> PyTree:
+def with_finite_gradient(value: PyTree) -> PyTree:
     """The same value; what is not finite of its gradient is zero."""
     return value
 
 
-_with_finite_gradient.defvjp(
+with_finite_gradient.defvjp(
     lambda value: (value, None),
     lambda _, slope: (jax.tree.map(lambda g: jnp.where(jnp.isfinite(g), g, 0.0), slope),),
 )
@@ -114,11 +115,11 @@ class ContrastiveGain(AbstractObjective):
         shape = (self.num_plants,)
         # Of a plant that cannot be computed, nothing is learnt: not even a gradient.
         of_each = [jnp.broadcast_to(value, shape + value.shape) for value in made]
-        before, of_each = _with_finite_gradient((memory.states, of_each))
+        before, of_each = with_finite_gradient((memory.states, of_each))
         states, of_others = jax.vmap(likely)(before, memory.params, *of_each)
         own = likely(sample.state, sample.params, *made)[1]
         found = jnp.append(of_others, own)
-        found = jnp.where(found > _IMPOSSIBLE, found, _IMPOSSIBLE)  # also for NaN
+        found = jnp.where(found > IMPOSSIBLE, found, IMPOSSIBLE)  # also for NaN
         total = memory.log_likelihoods + found
         cost = self.change_price * jnp.sum((sample.input - memory.input) ** 2)
         value = self._bound(total) if self.dense else memory.value

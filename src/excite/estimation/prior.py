@@ -256,7 +256,9 @@ class PriorPlants(eqx.Module):
         for parameter, nominal in zip(d.parameters, self.plant.nominal, strict=True):
             if parameter.name not in values:
                 own = getattr(params, parameter.name)
-                values[parameter.name] = ndtri((1 + self.spread.unit(parameter, nominal, own)) / 2)
+                is_log = self.spread.is_factor and parameter.positive
+                change = jnp.log(own / nominal) if is_log else (own - nominal) / parameter.scale
+                values[parameter.name] = ndtri((1 + change / self.spread.relative) / 2)
         return jnp.stack([values[name] for name in names_of(d.parameters)])
 
 

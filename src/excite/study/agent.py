@@ -15,6 +15,7 @@ from ..description import Spread, SpreadLike, names_of, prior_sd_of, unknown
 from ..environment import (
     MAX_SENSITIVITY,
     AbstractObjective,
+    AdaptiveContrastiveGain,
     ContrastiveGain,
     Env,
     EstimationError,
@@ -32,6 +33,7 @@ from ..plant.uncertainty import Range, Uncertainty
 from ..policy import NO_MEMORY, Layout
 from ..safety import watched_levels
 from ..training.settings import AGAINST_UNCERTAINTY, ONE_START, GradientSettings, PPOSettings
+from .objectives import CONTRASTS
 from .settings import (
     Count,
     EstimatorSettings,
@@ -51,9 +53,11 @@ class RewardSettings(Settings):
 
     Attributes:
         reward: of the experiment: `relative` errors (Eq. 4), `log` of them, the largest over
-            its goal (`goals`), `information`, or the `contrast` with other plants of the prior (see
-            `ContrastiveGain`); the default depends on the plant.
-        dense: whether information or contrast is rewarded at every step, by default for PPO alone.
+            its goal (`goals`), `information`, the `contrast` with other plants of the prior (see
+            `ContrastiveGain`), or an `adaptive_contrast` with probable ones (see
+            `AdaptiveContrastiveGain`); the default depends on the plant.
+        dense: whether information or contrast is rewarded at every step, by default for PPO alone;
+            the adaptive one is not.
         weight: factor of that reward.
         criterion, max_sensitivity: of the information, see `InformationGain`.
         goals: by parameter, the relative error that is scaled to one, default one.
@@ -61,18 +65,20 @@ class RewardSettings(Settings):
             or `nls` to first order in the noise, for any plant.
         change_price: of the squared change of an input [1 / input unit²], subtracted from
             information or contrast at every step.
-        contrast_plants: with which the true one is compared.
+        contrast_plants: with which the true one is compared, by default 255, or 15 probable ones.
         start_covariance: replaces that of the estimator; with a smaller one its bias, which
             is a smooth function of the inputs, is larger than the effect of sensor noise.
     """
 
-    reward: Literal["relative", "log", "goals", "information", "contrast"] | None = None
+    reward: (
+        Literal["relative", "log", "goals", "information", "contrast", "adaptive_contrast"] | None
+    ) = None
     dense: Annotated[bool, Field(strict=True)] | None = None
     weight: Positive = 1.0
     criterion: Literal["D", "A", "E"] = "D"
     max_sensitivity: Positive = MAX_SENSITIVITY
     change_price: Magnitude = 0.0
-    contrast_plants: Annotated[Count, Field(le=1_000_000)] = 255
+    contrast_plants: Annotated[Count, Field(le=1_000_000)] | None = None
     goals: dict[str, Positive] = {}
     estimator: str = "arx-rls"
     start_covariance: Positive | None = None
@@ -222,7 +228,7 @@ class Agent:
             raise ValueError("ppo does not train on the coast: take the method gradient")
         return Env.of(
             plant,
-            objective=self._objective(plant, own, prior),
+            objective=self._objective(plant, own, prior, num_steps),
             layout=self._layout(plant, num_steps),
             spread=own,
             penalty_weight=1 / num_steps if decision.normalise_penalty else 1.0,
@@ -259,10 +265,15 @@ class Agent:
         )
 
     def _objective(
-        self, plant: AbstractPlant, spread: SpreadLike, prior: PriorPlants | None
+        self,
+        plant: AbstractPlant,
+        spread: SpreadLike,
+        prior: PriorPlants | None,
+        num_steps: int,
     ) -> AbstractObjective:
-        terms = [self._term(reward, plant, spread, prior) for reward in self.decision.terms]
-        return WeightedSum(terms) if terms else self._term(self.decision, plant, spread, prior)
+        own = plant, spread, prior, num_steps
+        terms = [self._term(reward, *own) for reward in self.decision.terms]
+        return WeightedSum(terms) if terms else self._term(self.decision, *own)
 
     def _term(
         self,
@@ -270,6 +281,7 @@ class Agent:
         plant: AbstractPlant,
         spread: SpreadLike,
         prior: PriorPlants | None,
+        num_steps: int,
     ) -> AbstractObjective:
         has_mapping = isinstance(plant, AbstractARXPlant)
         form = chosen.reward or ("relative" if has_mapping else "information")
@@ -278,23 +290,27 @@ class Agent:
         targets = target_mask(plant.definition, self.targets)
         # A gradient needs no reward before the last step.
         dense = self.method == "ppo" if chosen.dense is None else chosen.dense
-        if form == "contrast":
+        if form in CONTRASTS:
             if not all(targets):
                 raise ValueError(
-                    "the objective sPCE (reward 'contrast') is of all parameters: name all of them "
-                    "as targets, or take the objective D"
+                    f"the reward {form!r} is of all parameters: name all of them as targets, or "
+                    "take the objective D"
                 )
             if prior is None and not Spread.of(spread).relative:
                 raise ValueError(
-                    "the objective sPCE compares plants that differ: give a spread or a prior"
+                    f"the reward {form!r} compares plants that differ: give a spread or a prior"
                 )
-            return ContrastiveGain(
-                plants_of(plant, None, spread) if prior is None else prior,
-                chosen.contrast_plants,
-                chosen.weight,
-                dense=dense,
-                change_price=chosen.change_price,
-            )
+            population = plants_of(plant, None, spread) if prior is None else prior
+            count = {} if (n := chosen.contrast_plants) is None else {"num_plants": n}
+            own = {**count, "weight": chosen.weight, "change_price": chosen.change_price}
+            if form == "contrast":
+                return ContrastiveGain(population, dense=dense, **own)
+            if self.decision.constants:
+                raise ValueError(
+                    "the reward 'adaptive_contrast' is of plants with the same constants: leave "
+                    "their ranges out, or take the reward 'contrast'"
+                )
+            return AdaptiveContrastiveGain(population, num_steps, **own)
         if form == "information":
             in_nats = prior is not None and chosen.criterion == "D"  # half of log det
             return InformationGain(
@@ -406,6 +422,7 @@ def _require_one_reward(process: DecisionSettings) -> None:
 _USED = {
     "information": {"dense", "criterion", "max_sensitivity", "change_price"},
     "contrast": {"dense", "change_price", "contrast_plants"},
+    "adaptive_contrast": {"change_price", "contrast_plants"},
     "errors of nls": {"goals", "estimator", "max_sensitivity"},
     "errors of an ARX estimator": {"goals", "estimator", "start_covariance"},
 }
@@ -413,7 +430,7 @@ _USED = {
 
 
 def _kind(form: str, chosen: RewardSettings, estimators: Mapping[str, EstimatorSettings]) -> str:
-    if form in ("information", "contrast"):
+    if form in ("information", *CONTRASTS):
         return form
     is_nls = _estimator(chosen, estimators).kind == "nls"
     return "errors of nls" if is_nls else "errors of an ARX estimator"

@@ -14,12 +14,16 @@ OBJECTIVES: Mapping[str, Mapping[str, str]] = {
     "A": {"reward": "information", "criterion": "A"},
     "E": {"reward": "information", "criterion": "E"},
     "sPCE": {"reward": "contrast"},
+    "ACE": {"reward": "adaptive_contrast"},
     "goals": {"reward": "goals"},
     "relative": {"reward": "relative"},
     "log": {"reward": "log"},
     "nls": {"reward": "relative", "estimator": "nls"},
 }
-"""Settings of a reward: criteria of the Fisher information, contrast, errors of an estimator."""
+"""Settings of a reward: criteria of the Fisher information, contrasts, errors of an estimator."""
+
+CONTRASTS = "contrast", "adaptive_contrast"
+"""Rewards that compare the true plant with others."""
 
 
 def rewards_of(
@@ -62,7 +66,7 @@ def is_information(name: str) -> bool:
 
 def is_error(name: str) -> bool:
     """Whether an objective is the errors of an estimator."""
-    return OBJECTIVES[name]["reward"] not in ("information", "contrast")
+    return OBJECTIVES[name]["reward"] not in ("information", *CONTRASTS)
 
 
 def _weighted(word: str) -> tuple[str, float | None]:

@@ -14,7 +14,7 @@ from ..plant.uncertainty import Range
 from ..policy import Policy, read_policy
 from ..progress import SHOWN, Progress
 from .folder import seed_folder
-from .objectives import decision_of, is_error, rewards_of
+from .objectives import CONTRASTS, decision_of, is_error, rewards_of
 from .run import run_study
 from .spec import Study, of_prior, plant_tables, study_from
 from .table import best_seeds
@@ -65,10 +65,10 @@ def train(
         out: run folder of the study; without one only the policy is kept.
         method: `gradient` of the simulated experiment, or `ppo`.
         objective: criterion of the Fisher information (`D`, `A`, `E`), a lower bound of the
-            expected information gain without approximation of the posterior (`sPCE`), or errors
-            of the ARX estimator (`relative`, `log`, `goals`) or of nonlinear least squares
-            (`nls`); several are added, with weights (`["D", "log=0.1"]` or
-            `{"D": 1, "log": 0.1}`).
+            expected information gain by comparison with other plants of the prior (`sPCE`), or
+            with those that the record makes probable (`ACE`), or errors of the ARX estimator
+            (`relative`, `log`, `goals`) or of nonlinear least squares (`nls`); several are added,
+            with weights (`["D", "log=0.1"]` or `{"D": 1, "log": 0.1}`).
         target: parameters in the objective, default the plant's targets.
         goal: relative error that is scaled to one, by parameter.
         window: number of samples observed, default 80.
@@ -79,8 +79,8 @@ def train(
             enough; with attention, take a window as long as the experiment.
         clock: frequencies [Hz] whose sine and cosine are observed too.
         change_price: of the squared change of an input from step to step [1 / input unit²],
-            subtracted from the objective, which must be information (`D`, `A`, `E`, `sPCE`).
-        contrast_plants: with which the objective `sPCE` compares the true one, default 255.
+            subtracted from the objective, which must be information (`D`, `A`, `E`, `sPCE`, `ACE`).
+        contrast_plants: with which the true one is compared, default 255 for `sPCE`, 15 for `ACE`.
         training: hyper-parameters of the method (`excite.training.settings`).
         updates: gradient updates, default 1000; the hyper-parameter `num_updates`.
         seeds: independent trainings; the best policy is returned.
@@ -121,16 +121,18 @@ def train(
         priced = next((name for name in rewards if not is_error(name)), None)
         if priced is None:
             raise ValueError(
-                "change_price is subtracted from information: it needs the objective D, A, E or "
-                f"sPCE, got {', '.join(rewards)}"
+                "change_price is subtracted from information: it needs the objective D, A, E, "
+                f"sPCE or ACE, got {', '.join(rewards)}"
             )
         rewards[priced]["change_price"] = change_price
     if contrast_plants is not None:
-        if "sPCE" not in rewards:
+        compared = [reward for reward in rewards.values() if reward["reward"] in CONTRASTS]
+        if not compared:
             raise ValueError(
-                f"contrast_plants are for the objective sPCE: got {', '.join(rewards)}"
+                f"contrast_plants are for the objectives sPCE and ACE: got {', '.join(rewards)}"
             )
-        rewards["sPCE"]["contrast_plants"] = contrast_plants
+        for reward in compared:
+            reward["contrast_plants"] = contrast_plants
     decision = {
         **decision_of(rewards.values()),
         "output_scale": by_name("output_scale", output_scale, "a dict by output"),
