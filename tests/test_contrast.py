@@ -159,7 +159,7 @@ def test_it_is_an_objective_of_training():
         training={"total_steps": 256, "num_envs": 4, "n_steps": 16, "batch_size": 64},
     )  # fmt: skip
     assert policy.layout.num_steps == 4
-    with pytest.raises(ValueError, match="are for the objectives sPCE and ACE: got D"):
+    with pytest.raises(ValueError, match="are for the objectives sPCE, ACE and InfoNCE: got D"):
         ex.train(Line(), contrast_plants=15)
     with pytest.raises(ValueError, match="compares plants that differ: give a spread or a prior"):
         ex.train(Aero2(), objective="sPCE", spread=0.0)

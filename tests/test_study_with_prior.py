@@ -106,7 +106,7 @@ def test_trainings_of_earlier_versions_keep_what_identifies_them():
 
 @pytest.mark.parametrize("objective", ["log", ["relative", "goals"]])
 def test_a_price_of_changes_needs_information(objective):
-    with pytest.raises(ValueError, match="it needs the objective D, A, E, sPCE or ACE, got"):
+    with pytest.raises(ValueError, match="it needs the objective D, A, E, sPCE, ACE or InfoNCE,"):
         ex.train("aero2", objective=objective, change_price=0.1)
 
 

@@ -484,7 +484,7 @@ def test_one_command_trains_a_policy_by_gradient(name, choice, tmp_path):
     [
         (
             ("--objective", "X"),
-            "unknown objective 'X' (there is D, A, E, sPCE, ACE, goals, relative, log, nls",
+            "'X' (there is D, A, E, sPCE, ACE, InfoNCE, goals, relative, log, nls)",
         ),
         (("--objective", "D", "--objective", "log=x"), "the weight of 'log' must be a number"),
         (("--objective", "D", "--objective", "log=-1"), "weight must be greater than 0"),

@@ -32,9 +32,9 @@ def _options(command: Any) -> Any:
                          show_default=True, help="Gradient of the simulated experiment, or PPO."),
             click.option("--objective", multiple=True, metavar="NAME[=WEIGHT]",
                          help="Criterion of the Fisher information (D, A, E), lower bounds of the "
-                         "expected information gain (sPCE, ACE), or errors of the ARX estimator "
-                         "(relative, log, goals) or of nonlinear least squares (nls); repeated, a "
-                         "sum with these weights. Default D."),
+                         "expected information gain (sPCE, ACE, InfoNCE), or errors of the ARX "
+                         "estimator (relative, log, goals) or of nonlinear least squares (nls); "
+                         "repeated, a sum with these weights. Default D."),
             click.option("--target", multiple=True, metavar="NAME",
                          help="Parameter in the objective; default the plant's targets."),
             click.option("--goal", type=NUMBERS, multiple=True,
@@ -51,8 +51,8 @@ def _options(command: Any) -> Any:
             click.option("--clock", type=Number(), multiple=True, metavar="HZ",
                          help="Also observe sine and cosine of this frequency."),
             click.option("--contrast-plants", type=WholeNumber(1, 1_000_000), metavar="NUMBER",
-                         help="Plants with which the true one is compared; default 255 for sPCE, "
-                         "15 for ACE."),
+                         help="Plants with which the true one is compared; default 255, for "
+                         "ACE 15."),
             click.option("--change-price", type=Number(min=0), default=0.0, metavar="PRICE",
                          help="Subtracted from the information for each squared change of an "
                          "input [1 / input unit²]; default none."),

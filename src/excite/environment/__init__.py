@@ -5,6 +5,7 @@
 
 from .adaptive_contrast import AdaptiveContrastiveGain as AdaptiveContrastiveGain
 from .contrast import ContrastiveGain as ContrastiveGain
+from .critic import CriticGain as CriticGain
 from .episodes import Episodes as Episodes
 from .episodes import run_episodes as run_episodes
 from .episodes import scored as scored

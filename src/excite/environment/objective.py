@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Sequence
+from typing import Self
 
 import equinox as eqx
 import jax
@@ -47,6 +48,15 @@ class StepData(eqx.Module):
 
 class AbstractObjective(eqx.Module):
     """What an experiment is rewarded for."""
+
+    def first_part(self, plant: AbstractPlant, key: PRNGKeyArray) -> PyTree:
+        """What of the objective is trained with the policy, before the first update; often none."""
+        del plant, key
+
+    def with_part(self, part: PyTree) -> Self:
+        """The objective with this part."""
+        del part
+        return self
 
     @abc.abstractmethod
     def init(

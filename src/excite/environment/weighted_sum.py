@@ -32,6 +32,16 @@ class WeightedSum(AbstractObjective):
         if not self.terms:
             raise ValueError("a sum of objectives needs at least one")
 
+    def first_part(self, plant: AbstractPlant, key: PRNGKeyArray) -> tuple[PyTree, ...]:
+        """Those of the terms."""
+        keys = jax.random.split(key, len(self.terms))
+        return tuple(t.first_part(plant, own) for t, own in zip(self.terms, keys, strict=True))
+
+    def with_part(self, part: tuple[PyTree, ...]) -> WeightedSum:
+        """With these parts of the terms."""
+        pairs = zip(self.terms, part, strict=True)
+        return WeightedSum(tuple(term.with_part(own) for term, own in pairs))
+
     def init(
         self, plant: AbstractPlant, measured: Float[Array, " output"], key: PRNGKeyArray
     ) -> SumMemory:

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeAlias
 
 from jaxtyping import PyTree
 from pydantic import Field
@@ -17,6 +17,7 @@ from ..environment import (
     AbstractObjective,
     AdaptiveContrastiveGain,
     ContrastiveGain,
+    CriticGain,
     Env,
     EstimationError,
     InformationGain,
@@ -48,16 +49,22 @@ METHODS = {"ppo": PPOSettings, "gradient": GradientSettings}
 """Trainers, and their hyper-parameters."""
 
 
+Reward: TypeAlias = Literal[
+    "relative", "log", "goals", "information", "contrast", "adaptive_contrast", "critic"
+]
+
+
 class RewardSettings(Settings):
     """The reward of an agent.
 
     Attributes:
         reward: of the experiment: `relative` errors (Eq. 4), `log` of them, the largest over
             its goal (`goals`), `information`, the `contrast` with other plants of the prior (see
-            `ContrastiveGain`), or an `adaptive_contrast` with probable ones (see
-            `AdaptiveContrastiveGain`); the default depends on the plant.
+            `ContrastiveGain`), an `adaptive_contrast` with probable ones (see
+            `AdaptiveContrastiveGain`), or the scores of a `critic` that is trained too (by
+            gradient, see `CriticGain`); the default depends on the plant.
         dense: whether information or contrast is rewarded at every step, by default for PPO alone;
-            the adaptive one is not.
+            the other two are not.
         weight: factor of that reward.
         criterion, max_sensitivity: of the information, see `InformationGain`.
         goals: by parameter, the relative error that is scaled to one, default one.
@@ -70,9 +77,7 @@ class RewardSettings(Settings):
             is a smooth function of the inputs, is larger than the effect of sensor noise.
     """
 
-    reward: (
-        Literal["relative", "log", "goals", "information", "contrast", "adaptive_contrast"] | None
-    ) = None
+    reward: Reward | None = None
     dense: Annotated[bool, Field(strict=True)] | None = None
     weight: Positive = 1.0
     criterion: Literal["D", "A", "E"] = "D"
@@ -305,6 +310,13 @@ class Agent:
             own = {**count, "weight": chosen.weight, "change_price": chosen.change_price}
             if form == "contrast":
                 return ContrastiveGain(population, dense=dense, **own)
+            if form == "critic":
+                if self.method == "ppo":
+                    raise ValueError(
+                        "ppo does not train a critic (the objective InfoNCE): take the method "
+                        "gradient, or another objective"
+                    )
+                return CriticGain(population, num_steps, **own)
             if self.decision.constants:
                 raise ValueError(
                     "the reward 'adaptive_contrast' is of plants with the same constants: leave "
@@ -423,6 +435,7 @@ _USED = {
     "information": {"dense", "criterion", "max_sensitivity", "change_price"},
     "contrast": {"dense", "change_price", "contrast_plants"},
     "adaptive_contrast": {"change_price", "contrast_plants"},
+    "critic": {"change_price", "contrast_plants"},
     "errors of nls": {"goals", "estimator", "max_sensitivity"},
     "errors of an ARX estimator": {"goals", "estimator", "start_covariance"},
 }

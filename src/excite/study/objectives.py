@@ -15,6 +15,7 @@ OBJECTIVES: Mapping[str, Mapping[str, str]] = {
     "E": {"reward": "information", "criterion": "E"},
     "sPCE": {"reward": "contrast"},
     "ACE": {"reward": "adaptive_contrast"},
+    "InfoNCE": {"reward": "critic"},
     "goals": {"reward": "goals"},
     "relative": {"reward": "relative"},
     "log": {"reward": "log"},
@@ -22,7 +23,7 @@ OBJECTIVES: Mapping[str, Mapping[str, str]] = {
 }
 """Settings of a reward: criteria of the Fisher information, contrasts, errors of an estimator."""
 
-CONTRASTS = "contrast", "adaptive_contrast"
+CONTRASTS = "contrast", "adaptive_contrast", "critic"
 """Rewards that compare the true plant with others."""
 
 

@@ -65,8 +65,9 @@ def train(
         out: run folder of the study; without one only the policy is kept.
         method: `gradient` of the simulated experiment, or `ppo`.
         objective: criterion of the Fisher information (`D`, `A`, `E`), a lower bound of the
-            expected information gain by comparison with other plants of the prior (`sPCE`), or
-            with those that the record makes probable (`ACE`), or errors of the ARX estimator
+            expected information gain by comparison with other plants of the prior (`sPCE`),
+            with those that the record makes probable (`ACE`), or by a critic that needs no
+            likelihood and is trained too (`InfoNCE`, by gradient), or errors of the ARX estimator
             (`relative`, `log`, `goals`) or of nonlinear least squares (`nls`); several are added,
             with weights (`["D", "log=0.1"]` or `{"D": 1, "log": 0.1}`).
         target: parameters in the objective, default the plant's targets.
@@ -79,8 +80,9 @@ def train(
             enough; with attention, take a window as long as the experiment.
         clock: frequencies [Hz] whose sine and cosine are observed too.
         change_price: of the squared change of an input from step to step [1 / input unit²],
-            subtracted from the objective, which must be information (`D`, `A`, `E`, `sPCE`, `ACE`).
-        contrast_plants: with which the true one is compared, default 255 for `sPCE`, 15 for `ACE`.
+            subtracted from the objective, which must be information (`D`, `A`, `E`, `sPCE`,
+            `ACE`, `InfoNCE`).
+        contrast_plants: with which the true one is compared, default 255, for `ACE` 15.
         training: hyper-parameters of the method (`excite.training.settings`).
         updates: gradient updates, default 1000; the hyper-parameter `num_updates`.
         seeds: independent trainings; the best policy is returned.
@@ -122,14 +124,15 @@ def train(
         if priced is None:
             raise ValueError(
                 "change_price is subtracted from information: it needs the objective D, A, E, "
-                f"sPCE or ACE, got {', '.join(rewards)}"
+                f"sPCE, ACE or InfoNCE, got {', '.join(rewards)}"
             )
         rewards[priced]["change_price"] = change_price
     if contrast_plants is not None:
         compared = [reward for reward in rewards.values() if reward["reward"] in CONTRASTS]
         if not compared:
             raise ValueError(
-                f"contrast_plants are for the objectives sPCE and ACE: got {', '.join(rewards)}"
+                "contrast_plants are for the objectives sPCE, ACE and InfoNCE: got "
+                + ", ".join(rewards)
             )
         for reward in compared:
             reward["contrast_plants"] = contrast_plants

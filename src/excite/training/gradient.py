@@ -124,24 +124,32 @@ class Optimisation(eqx.Module):
         adam: state of the optimiser.
         penalty_weight: of the safety penalty.
         adversaries: of the last update; None where no uncertainty is declared.
+        part: of the objective, where it is trained too.
     """
 
     player: PyTree
     adam: PyTree
     penalty_weight: Float[Array, "*training"]
     adversaries: Cases | None = None
+    part: PyTree = None
 
     @classmethod
-    def start(cls, player: PyTree, settings: GradientSettings, env: Env) -> Optimisation:
+    def start(
+        cls, player: PyTree, settings: GradientSettings, env: Env, part: PyTree = None
+    ) -> Optimisation:
         """Before the first update."""
-        adam = optimiser(settings).init(eqx.filter(player, eqx.is_array))
+        adam = optimiser(settings).init(eqx.filter((player, part), eqx.is_array))
         weight, count = jnp.asarray(settings.penalty_weight, float), settings.num_adversaries
         if (box := env.uncertainty) is None:
-            return cls(player, adam, weight)
+            return cls(player, adam, weight, None, part)
         length = env.layout.num_steps + env.coast + 1
         noise = jnp.zeros((count, length, len(env.plant.definition.outputs)))
         middle = Cases(jnp.zeros((count, len(box.names))), jnp.zeros(count, int), noise)
-        return cls(player, adam, weight, middle)
+        return cls(player, adam, weight, middle, part)
+
+    def env(self, env: Env) -> Env:
+        """The decision process whose objective has the trained part."""
+        return dataclasses.replace(env, objective=env.objective.with_part(self.part))
 
 
 def update(
@@ -169,24 +177,27 @@ def update(
         key = jax.random.fold_in(keys[0], 1)
         adversaries = _adversaries(play, settings, adversaries, key)
 
-    def loss(player: PyTree) -> tuple[Array, tuple[Scores, Array]]:
-        batch = experiments(env, player, keys, start)
+    def loss(trained: tuple[PyTree, PyTree]) -> tuple[Array, tuple[Scores, Array]]:
+        player, part = trained
+        own = dataclasses.replace(now, part=part).env(env)
+        batch = experiments(own, player, keys, start)
         excess, nearest = jnp.mean(batch.excess), batch.nearness
         if is_adversarial and box is not None and adversaries is not None:
             play = _on_plants(env, box, player)
             more, size = _excess(play, adversaries, settings.adversary_margin)
             excess, nearest = excess + jnp.mean(more), jnp.concatenate([nearest, size])
-        worth = env.objective.of_batch(batch.outcome)
+        worth = own.objective.of_batch(batch.outcome)
         return now.penalty_weight * excess - worth, (batch, nearest)
 
-    (cost, (batch, nearest)), gradient = eqx.filter_value_and_grad(loss, has_aux=True)(now.player)
+    trained = now.player, now.part
+    (cost, (batch, nearest)), gradient = eqx.filter_value_and_grad(loss, has_aux=True)(trained)
     gradient = jax.tree.map(lambda leaf: jnp.where(jnp.isfinite(cost), leaf, jnp.nan), gradient)
     step, adam = optimiser(settings).update(gradient, now.adam)
     is_near = jnp.mean(nearest >= settings.near) > settings.violation_rate
     change = jnp.where(is_near, settings.penalty_growth, -settings.penalty_decay)
-    player = eqx.apply_updates(now.player, step)
+    player, part = eqx.apply_updates(trained, step)
     weight = jnp.maximum(now.penalty_weight * jnp.exp(change), settings.penalty_weight)
-    return Optimisation(player, adam, weight, adversaries), batch
+    return Optimisation(player, adam, weight, adversaries, part), batch
 
 
 def _on_plants(env: Env, box: Uncertainty, player: PyTree) -> OnPlant:
@@ -362,7 +373,8 @@ def started(
     def start(key: PRNGKeyArray) -> Optimisation:
         weights = _first_policy(env, settings, key) if first is None else first
         network = Network(weights, env.layout, settings.through_measurements)
-        return Optimisation.start(network, settings, env)
+        part = env.objective.first_part(env.plant, jax.random.fold_in(key, 3))
+        return Optimisation.start(network, settings, env, part)
 
     def keys(i: int) -> Key[Array, "seed plant"]:
         own = jax.vmap(jax.random.fold_in, (0, None))(pairs[:, 1], i)
@@ -379,8 +391,9 @@ def _looked(
     """Validates every policy and keeps the best; returns the mean of the validations."""
     for s, curve in enumerate(course.curves):
         own = jax.tree.map(lambda x, s=s: x[s], course.now)
-        seen = look(env, own.player.weights, settings.watch_episodes)
-        judged = _judged(env, own.player, validation_keys(settings.watch_episodes))
+        judging = own.env(env)
+        seen = look(judging, own.player.weights, settings.watch_episodes)
+        judged = _judged(judging, own.player, validation_keys(settings.watch_episodes))
         judged |= _falsified(env, own.player)
         curve.append({"steps": steps, **seen, **judged, **_state(own)})
         own_rank = rank(settings, curve[-1])
