@@ -87,7 +87,11 @@ def test_every_shipped_study_loads(path):
     study = read_study(path)
     assert study.name == path.stem
     assert study.episodes >= (100 if study.agents else 1000)
-    own = {"paper": [], "robust": ["chirp", "ideal plant"], "wide": ["chirp"]}
+    own = {
+        **{"paper": [], "robust": ["chirp", "ideal plant"], "wide": ["chirp"]},
+        **{p.stem: ["random", "prbs"] for p in STUDIES.glob("oed_*_p*.toml")},
+        "oed_location_finding": ["random", "myopic"],
+    }
     assert list(study.methods)[:3] == own.get(path.stem, ["random", "prbs", "chirp"])
     assert set(study.reference) <= {*study.methods, *study.agents}
 

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import excite as ex
-from excite.environment import ContrastiveGain, Env, InformationGain
+from excite.environment import ContrastiveGain, CriticGain, Env, InformationGain
 from excite.estimation.prior_knowledge import plants_of
 from excite.excitation import PRBS, Random, Replay
 from excite.files import module_at
@@ -39,13 +39,16 @@ class Rival:
     """A published method, trained by this package.
 
     Attributes:
-        memory, memory_kind: of its policy.
-        compared: plants in the bound that its training makes large.
+        memory, memory_kind, window: of its policy.
+        objective: whose bound its training makes large.
+        compared: plants in that bound.
         settings: of the training.
     """
 
     memory: int
     memory_kind: str
+    window: int = 1
+    objective: str = "sPCE"
     compared: int
     settings: GradientSettings
 
@@ -109,8 +112,12 @@ class Task:
         """The decision process of another method."""
         plant = plant_named(self.word)
         prior = plants_of(plant, self.prior)
-        objective = ContrastiveGain(prior, rival.compared, dense=False)
-        layout = Layout.of(plant.description, 1, self.steps, rival.memory, rival.memory_kind)
+        if rival.objective == "sPCE":
+            objective = ContrastiveGain(prior, rival.compared, dense=False)
+        else:
+            objective = CriticGain(prior, self.steps, rival.compared)
+        remembers = rival.memory, rival.memory_kind
+        layout = Layout.of(plant.description, rival.window, self.steps, *remembers)
         return Env.of(plant, objective=objective, layout=layout, prior=prior)
 
 
@@ -175,6 +182,13 @@ TASKS = {
                 settings=GradientSettings(
                     num_updates=8000, num_plants=128, learning_rate=1e-3, hidden=(256,),
                     last_gain=0.3, watch_every=500, watch_episodes=512,
+                ),
+            ),
+            "iDAD": Rival(
+                memory=16, memory_kind="attention", window=30, objective="InfoNCE", compared=255,
+                settings=GradientSettings(
+                    num_updates=2500, num_plants=128, learning_rate=1e-3, hidden=(256,),
+                    last_gain=0.3, watch_every=500, watch_episodes=256,
                 ),
             ),
         },

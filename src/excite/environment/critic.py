@@ -20,7 +20,7 @@ from ..policy.contract import network
 from ..safety import safe_input
 from .objective import AbstractObjective, StepData
 
-_WIDTH, _SIZE = 128, 32  # of the hidden layers, and of what a record and a plant are encoded to
+_WIDTH, _SIZE = 64, 32  # of the hidden layers, and of what a record and a plant are encoded to
 
 
 class Critic(eqx.Module):
