@@ -14,6 +14,7 @@ from excite.excitation import Random, Replay
 from excite.plant import AbstractStaticTask, static_description
 from excite.plant.catalogue import plant_named
 from excite.simulation import predicted, response, run_episode
+from excite.study.table import finished_table
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "location_finding.py"
 SD = 0.5
@@ -49,6 +50,24 @@ def test_the_outcome_is_that_of_the_last_design_alone():
     run = run_episode(sources, params, Replay(jnp.asarray(designs)), 30, jax.random.key(1))
     noise = np.asarray(run.measured - outputs)
     assert 0.3 < noise.std() < 0.7
+
+
+def test_without_an_excitation_the_designs_are_random():
+    own, random, chirp = (
+        ex.simulate(Slope, excitation, steps=20).inputs for excitation in (None, "random", "chirp")
+    )
+    np.testing.assert_array_equal(own, random)
+    assert not np.allclose(own, chirp)
+    np.testing.assert_array_equal(
+        ex.simulate("aero2", steps=20).inputs, ex.simulate("aero2", "chirp", steps=20).inputs
+    )
+
+
+@pytest.mark.slow
+def test_a_trained_policy_is_compared_with_random_designs(tmp_path):
+    ex.train(Slope, tmp_path / "run", steps=5, window=1, episodes=2, updates=1,
+             training={"num_plants": 2, "hidden": [2]})  # fmt: skip
+    assert {row.method for row in finished_table(tmp_path / "run").rows} == {"random", "gradient D"}
 
 
 def test_what_the_likelihood_expects_is_the_response():

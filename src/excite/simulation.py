@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from . import __version__
 from .description import by_name, names_of, require_whole, wrong_type
 from .excitation import AbstractExcitation, Coast, NoInput, PolicyExcitation, Replay
-from .excitation.catalogue import ExcitationLike, excitation_and_origin, name_of
+from .excitation.catalogue import ExcitationLike, excitation_and_origin, name_of, usual_signal
 from .files import json_ready
 from .plant import AbstractPlant, Params, params_from
 from .plant.catalogue import PlantLike, plant_from, with_sensor
@@ -393,7 +393,7 @@ class Experiment:
             chosen = chosen.changed(dt=excitation.dt)
         options = by_name("options", options)
         if excitation is None:
-            excitation = "chirp" if chosen.definition.inputs else NoInput()
+            excitation = usual_signal(chosen) if chosen.definition.inputs else NoInput()
         elif not chosen.definition.inputs and not isinstance(excitation, Record):
             raise ValueError(
                 f"plant {chosen.definition.name!r} has no inputs: leave the excitation out"
@@ -521,8 +521,8 @@ def simulate(
             its class.
         excitation: a name (`ex.excitations()` lists them), an excitation or its class, a
             policy, the file of a policy or of a signal, a record to replay, or an array of
-            inputs by sample and input [input units]. Default a chirp; a plant without inputs
-            takes none.
+            inputs by sample and input [input units]. Default a chirp, for a task without memory
+            random designs; a plant without inputs takes none.
         options: of the excitation, by name.
         steps: length [samples]; default 500, or that of a policy, a record or a signal.
         params: true parameters that differ from the nominal ones, by name or as the

@@ -38,7 +38,8 @@ def excitation_options(command: Callable[..., Any]) -> Callable[..., Any]:
             click.option("--excitation", metavar="NAME",
                          help=f"{', '.join(signals())}, loop-NAME around one of them, a shipped "
                          "policy, or a file: policy (.safetensors) or signal (.csv, .mat); default "
-                         "chirp, and none for a plant without inputs."),
+                         "chirp, for a task without memory random, and none for a plant without "
+                         "inputs."),
             click.option("--set", "settings", type=VALUES, multiple=True,
                          help="Options of the excitation, such as amplitude=5 (the message about "
                          "an unknown one lists them); of a loop also gain, damping."),

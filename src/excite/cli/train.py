@@ -90,6 +90,7 @@ def _options(command: Any) -> Any:
 def train(plant: str, out: Path, as_json: bool, **options: Any) -> None:
     """Train a policy that excites PLANT, and compare it with a chirp.
 
+    In a task without memory it is compared with random designs.
     The run folder is that of a study with one agent: FOLDER/seeds/METHOD_OBJECTIVE/0 holds
     policy.safetensors. After an interruption, rerun the same command to resume.
     """

@@ -15,6 +15,7 @@ from ..description import Listing, first_line, unknown, wrong_type
 from ..files import is_class_word, made_at
 from ..plant import AbstractPlant, floats
 from ..plant.fields import with_options
+from ..plant.static import AbstractStaticTask
 from ..policy import POLICY_ENDING, Policy, mismatch, policy_path, read_policy, shipped_policies
 from ..record import Record, read_signal, require_playable
 from ..record.read import SIGNAL_ENDINGS
@@ -53,6 +54,11 @@ def excitations() -> Listing:
     """
     listed = {name: first_line(kind) for name, kind in EXCITATIONS.items()}
     return Listing({**listed, f"{LOOP}NAME": first_line(PositionLoop)})
+
+
+def usual_signal(plant: AbstractPlant) -> str:
+    """The name of the excitation of a plant with inputs where none is named."""
+    return "random" if isinstance(plant, AbstractStaticTask) else "chirp"
 
 
 Inputs: TypeAlias = Float[np.ndarray, "time input"] | Float[Array, "time input"]

@@ -8,6 +8,7 @@ from numbers import Real
 from pathlib import Path
 
 from ..description import SpreadLike, by_name, path_from, wrong_type
+from ..excitation.catalogue import usual_signal
 from ..plant import AbstractARXPlant
 from ..plant.catalogue import PlantLike
 from ..plant.uncertainty import Range
@@ -51,6 +52,8 @@ def train(
     command: str = "",
 ) -> Policy:
     """Trains a policy that excites a plant, and compares it with a chirp.
+
+    In a task without memory it is compared with random designs.
 
     Rerun with the same arguments and the same `out` to resume an interrupted training.
 
@@ -163,7 +166,7 @@ def train(
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) if out is None else path_from("out", out)
         title = "train" if out is None else folder.absolute().name
-        study = _compared_with_a_chirp(plant, noise, title, settings, agents)
+        study = _compared(plant, noise, title, settings, agents)
         run_study(
             study, folder, workers=workers, progress=progress, on_done=on_done, command=command
         )
@@ -179,7 +182,7 @@ def _several(what: str, given: object, kind: type, allowed: str) -> list[object]
     return list(listed)
 
 
-def _compared_with_a_chirp(
+def _compared(
     plant: PlantLike,
     noise: Mapping[str, float] | None,
     name: str,
@@ -188,6 +191,7 @@ def _compared_with_a_chirp(
 ) -> Study:
     """The study of these settings; ValueError for one that is not allowed."""
     own, built = plant_tables(plant, noise)
+    usual = usual_signal(built)
     kinds = ["nls"] + ["arx-rls"] * isinstance(built, AbstractARXPlant)
     content = {
         "name": name,
@@ -195,7 +199,7 @@ def _compared_with_a_chirp(
         **own,
         **settings,
         "agents": agents,
-        "methods": {"chirp": {"excitation": "chirp"}},
+        "methods": {usual: {"excitation": usual}},
         "estimators": {kind: {"kind": kind} for kind in kinds},
     }
     return study_from(content, "train").checked("train")
