@@ -8,7 +8,7 @@ import pytest
 from test_contrast import Line, Root
 
 import excite as ex
-from excite.environment import AdaptiveContrastiveGain, Env, StepData
+from excite.environment import AdaptiveContrastiveGain, Env, StepData, WeightedSum
 from excite.estimation.prior_knowledge import plants_of
 from excite.excitation import Replay
 from excite.plant.aero2 import Aero2
@@ -63,9 +63,44 @@ def test_coordinates_are_those_of_the_parameters():
         ({"J_p": "normal:0.022:5%", "K_pu": "lognormal:0.011:50%"}, 0.3),
         ({"D_p": "uniform:0.001:0.02"}, "factor:3"),
         ({}, 0.2),
+        ({"J_p": "normal:0.022:5%"}, 0.0),
+        ({"J_p": "normal:0.022:5%"}, "factor:1"),
     ):
         population = plants_of(plant, prior, spread)
-        np.testing.assert_allclose(population.coordinates(population.params(z)), z, rtol=1e-9)
+        is_fixed = jnp.arange(3) > 0 if spread in (0.0, "factor:1") else jnp.zeros(3, bool)
+        found = population.coordinates(population.params(z))
+        np.testing.assert_allclose(found, jnp.where(is_fixed, 0.0, z), rtol=1e-9)
+
+
+def test_the_gradient_is_that_of_differences():
+    """Also of the part that goes through the proposal; inside the limits of the design."""
+    prior = plants_of(Line(), {"slope": "normal:1:1"})
+    objective = AdaptiveContrastiveGain(prior, 2, 3)
+    layout = Layout.of(Line().description, 1, 2)
+    env = Env.of(Line(), objective=objective, layout=layout, penalty_weight=0.0, prior=prior)
+    keys = jax.random.split(jax.random.key(1), 64)
+
+    @jax.jit
+    @jax.value_and_grad
+    def worth(scale):
+        def of(key):
+            state, _ = env.reset(key)
+            for action in (0.5, -0.3):
+                state, made = env.step(state, scale * jnp.array([action]))
+            return made.reward
+
+        return jnp.mean(jax.vmap(of)(keys))
+
+    (low, _), (_, slope), (high, _) = (worth(1 + change) for change in (-1e-4, 0.0, 1e-4))
+    assert float(slope) == pytest.approx(float(high - low) / 2e-4, rel=1e-3)
+
+
+def test_an_experiment_of_another_length_is_refused():
+    prior = plants_of(Line(), {"slope": "normal:1:1"})
+    layout, objective = Layout.of(Line().description, 1, 4), AdaptiveContrastiveGain(prior, 6)
+    for own in (objective, WeightedSum((objective,))):
+        with pytest.raises(ValueError, match="for 6 steps: got experiments of 4"):
+            Env.of(Line(), objective=own, layout=layout, prior=prior)
 
 
 @pytest.mark.slow
@@ -115,7 +150,7 @@ def test_a_study_names_it_and_its_plants():
     )
     objective = Agent.of(settings, {}, {}, {}).env(Aero2(), 0.3, 20).objective
     assert (objective.num_plants, objective.num_steps, objective.change_price) == (15, 20, 0.1)
-    with pytest.raises(ValueError, match=r"the reward 'adaptive_contrast' is of all parameters"):
+    with pytest.raises(ValueError, match=r"ACE .reward 'adaptive_contrast'. is of all parameters"):
         Agent.of(settings.model_copy(update={"targets": ["J_p"]}), {}, {}, {}).env(Aero2(), 0.3, 20)
     for own, words in (({"dense": True}, "has no 'dense'"), ({"goals": {}}, "has no 'goals'")):
         with pytest.raises(ValueError, match=f"the reward 'adaptive_contrast' {words}"):

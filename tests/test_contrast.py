@@ -121,7 +121,7 @@ def test_a_study_names_it_and_its_plants():
     assert (
         "contrast_plants" not in Agent.of(AgentSettings(), {}, {}, {}).settings(Aero2())["decision"]
     )
-    with pytest.raises(ValueError, match="the reward 'contrast' is of all parameters"):
+    with pytest.raises(ValueError, match=r"sPCE .reward 'contrast'. is of all parameters"):
         Agent.of(settings.model_copy(update={"targets": ["J_p"]}), {}, {}, {}).env(Aero2(), 0.3, 20)
     with pytest.raises(ValueError, match="the reward 'contrast' has no 'criterion'"):
         Agent.of(AgentSettings(decision={"reward": "contrast", "criterion": "A"}), {}, {}, {})

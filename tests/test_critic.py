@@ -94,8 +94,8 @@ def test_several_trainings_have_a_critic_each():
     env = env_of(Line(), {"slope": "normal:1:1"}, 2, 7)
     several, one = train_all(env, SMALL, [3, 4]), train(env, SMALL, 4)
     np.testing.assert_allclose(several[1].weights[0][0], one.weights[0][0], atol=1e-4)
-    parts = started(env, SMALL, [3, 4])[0].now.part
-    assert not np.allclose(*parts.plant[0][0])
+    parts = started(env, SMALL, [3, 4])[0].now.trained
+    assert not np.allclose(*parts.params[0][0])
 
 
 def test_it_is_a_term_of_a_sum():
@@ -105,9 +105,9 @@ def test_it_is_a_term_of_a_sum():
     both = dataclasses.replace(env, objective=WeightedSum((information, env.objective)))
     course, keys = started(both, SMALL, [0])
     now, _ = update_all(both, SMALL, course.now, keys(0), False, None)
-    before, after = course.now.part, now.part
+    before, after = course.now.trained, now.trained
     assert before[0] is after[0] is None
-    assert not np.allclose(before[1].plant[0][0], after[1].plant[0][0])
+    assert not np.allclose(before[1].params[0][0], after[1].params[0][0])
 
 
 def test_a_study_names_it_and_ppo_refuses_it():
@@ -115,8 +115,13 @@ def test_a_study_names_it_and_ppo_refuses_it():
     objective = Agent.of(settings, {}, {}, {}).env(Aero2(), 0.3, 20).objective
     assert (objective.num_plants, objective.num_steps, objective.critic) == (255, 20, None)
     by_ppo = Agent.of(settings.model_copy(update={"method": "ppo"}), {}, {}, {})
-    with pytest.raises(ValueError, match="ppo does not train a critic"):
+    with pytest.raises(ValueError, match="ppo does not train a critic: take the method gradient"):
         by_ppo.env(Aero2(), 0.3, 20)
+    several = Agent.of(settings, {"window": 1}, {"starts": 4}, {})
+    with pytest.raises(
+        ValueError, match=r"InfoNCE .reward 'critic'. cannot compare several starts"
+    ):
+        several.env(Aero2(), 0.3, 20)
 
 
 @pytest.mark.slow

@@ -13,6 +13,7 @@ import excite as ex
 from excite.excitation import Random, Replay
 from excite.plant import AbstractStaticTask, static_description
 from excite.plant.catalogue import plant_named
+from excite.policy import Layout, Policy
 from excite.simulation import predicted, response, run_episode
 from excite.study.table import finished_table
 
@@ -188,3 +189,13 @@ def test_of_a_posterior_with_two_modes_both_are_found():
     gains = log_likelihood(true[:, None])[:, 0] - evidence
     error = math.hypot(gains.std() / math.sqrt(500), found.lower.std_error)
     assert abs(found.lower.value - gains.mean()) < 4 * error
+
+
+def test_the_plant_of_a_policy_that_is_in_a_file_has_to_be_named():
+    layout = Layout.of(Slope.definition, 1, 5)
+    weights = ((np.zeros((1, layout.size)), np.zeros(1)),)
+    policy = Policy(Slope().description, layout, weights)
+    for verb in (ex.evaluate, ex.falsify):
+        with pytest.raises(ValueError, match=r"plant 'slope' is in a file of yours: name it"):
+            verb(policy)
+    assert ex.evaluate(policy, plant=Slope, episodes=2) is not None

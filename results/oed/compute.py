@@ -36,7 +36,7 @@ EXAMPLES = HERE.parent.parent / "examples"
 
 @dataclass(frozen=True, kw_only=True)
 class Rival:
-    """A published method, trained by this package.
+    """After a published method: its kind of network and bound, with settings of our own.
 
     Attributes:
         memory, memory_kind, window: of its policy.

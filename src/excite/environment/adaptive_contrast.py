@@ -7,6 +7,7 @@ import math
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from ..description import require_whole
@@ -16,7 +17,7 @@ from ..plant.fields import floats
 from ..safety import safe_input
 from ..simulation import require_likelihood, step
 from .contrast import IMPOSSIBLE, with_finite_gradient
-from .objective import AbstractObjective, StepData
+from .objective import AbstractObjective, StepData, require_same_steps
 
 _STEPS = 8  # of the fit
 _FROM_PRIOR = 0.2  # of the compared plants
@@ -54,8 +55,8 @@ class AdaptiveContrastiveGain(AbstractObjective):
     gain, however large that is; where it has several, it is a weak one.
 
     The reward is that of the last step: there the experiment is computed again for every compared
-    plant. PPO computes it at every step, which takes long for long experiments. The gradient does
-    not go through the proposal, on which a tight bound hardly depends.
+    plant. PPO computes it at every step, which takes long for long experiments. The gradient goes
+    through the proposal by the last step of the fit.
 
     Attributes:
         prior: of the parameters.
@@ -75,6 +76,10 @@ class AdaptiveContrastiveGain(AbstractObjective):
         """Raises ValueError without another plant, or a step."""
         require_whole("num_plants", self.num_plants, 1)
         require_whole("num_steps", self.num_steps, 1)
+
+    def require_steps(self, num_steps: int) -> None:
+        """Raises ValueError for experiments of another length."""
+        require_same_steps(self.num_steps, num_steps)
 
     def init(
         self, plant: AbstractPlant, measured: Float[Array, " output"], key: PRNGKeyArray
@@ -119,23 +124,21 @@ class AdaptiveContrastiveGain(AbstractObjective):
         """Relative standard deviations of the normal approximation; before the end, the prior's."""
         prior = jnp.zeros(len(params)), jnp.eye(len(params))
         is_whole = memory.count >= self.num_steps
-        estimate, information = jax.lax.cond(
-            is_whole, lambda: self._fit(plant, memory), lambda: prior
-        )
+        estimate, root = jax.lax.cond(is_whole, lambda: self._fit(plant, memory), lambda: prior)
         changes = jax.jacfwd(lambda z: jnp.stack(self.prior.params(z)))(estimate)
-        covariance = changes @ jnp.linalg.inv(information) @ changes.T
-        return jnp.sqrt(jnp.diagonal(covariance)) / jnp.abs(jnp.stack(params))
+        deviations = solve_triangular(root.T, changes.T, lower=True)
+        return jnp.linalg.norm(deviations, axis=0) / jnp.abs(jnp.stack(params))
 
     def _bound(
         self, plant: AbstractPlant, memory: RecordMemory, params: Params
     ) -> Float[Array, ""]:
-        estimate, information = self._fit(plant, jax.lax.stop_gradient(memory))
+        estimate, root = self._fit(plant, memory)
         count, size = self.num_plants, len(estimate)
         kind_key, value_key = jax.random.split(memory.key)
         drawn = jax.random.normal(value_key, (count, size), float)
-        root = _WIDER * jnp.linalg.cholesky(jnp.linalg.inv(information))
+        about = solve_triangular(root, _WIDER * drawn.T).T
         is_prior = jax.random.uniform(kind_key, (count, 1)) < _FROM_PRIOR
-        others = jnp.where(is_prior, drawn, estimate[None] + drawn @ root.T)
+        others = jnp.where(is_prior, drawn, estimate[None] + about)
         z = jnp.concatenate([others, self.prior.coordinates(params)[None]])
 
         of_each = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(z), *x.shape)), _rows(memory))
@@ -145,9 +148,9 @@ class AdaptiveContrastiveGain(AbstractObjective):
         found = jnp.where(found > IMPOSSIBLE, found, IMPOSSIBLE)  # also for NaN
 
         prior = -0.5 * jnp.sum(z**2, axis=1)
-        change = (z - estimate[None]) / _WIDER
-        height = 0.5 * jnp.linalg.slogdet(information)[1] - size * math.log(_WIDER)
-        near = height - 0.5 * jnp.sum((change @ information) * change, axis=1)
+        change = (z - estimate[None]) @ root.T / _WIDER
+        height = jnp.sum(jnp.log(jnp.abs(jnp.diagonal(root)))) - size * math.log(_WIDER)
+        near = height - 0.5 * jnp.sum(change**2, axis=1)
         mixed = math.log(_FROM_PRIOR) + prior, math.log(1 - _FROM_PRIOR) + near
         evidence = jax.nn.logsumexp(found + prior - jnp.logaddexp(*mixed)) - math.log(count + 1)
         return found[-1] - evidence
@@ -155,30 +158,31 @@ class AdaptiveContrastiveGain(AbstractObjective):
     def _fit(
         self, plant: AbstractPlant, memory: RecordMemory
     ) -> tuple[Float[Array, " param"], Float[Array, "param param"]]:
-        """The most probable coordinates of the prior, and the information about them there."""
+        """The most probable coordinates of the prior, and a root R of the information R' R."""
 
-        def residuals(z: Array) -> Array:
-            return self._residuals(plant, _rows(memory), z)
+        def residuals(z: Array, rows: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+            own = jnp.append(self._residuals(plant, rows, z), z)
+            return own, own
 
-        def cost(z: Array) -> Array:
-            return jnp.sum(residuals(z) ** 2) + z @ z
-
-        def information(z: Array) -> tuple[Array, Array]:
-            slopes = jax.jacfwd(residuals)(z)
-            return jnp.eye(len(z)) + slopes.T @ slopes, slopes
+        slopes = jax.jacfwd(residuals, has_aux=True)
 
         def better(now: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
             z, damping = now
-            known, slopes = information(z)
-            damped = known + damping * jnp.diag(jnp.diagonal(known))
-            new = z - jnp.linalg.solve(damped, slopes.T @ residuals(z) + z)
-            is_better = cost(new) < cost(z)
+            J, r = slopes(z, rows)
+            M = J.T @ J
+            new = z - jnp.linalg.solve(M + damping * jnp.diag(jnp.diagonal(M)), J.T @ r)
+            is_better = jnp.sum(residuals(new, rows)[0] ** 2) < jnp.sum(r**2)
             return (jnp.where(is_better, new, z), damping * jnp.where(is_better, 0.1, 10.0)), None
 
+        rows = jax.lax.stop_gradient(_rows(memory))
         begin = jnp.zeros(len(plant.nominal)), jnp.asarray(1e-3)
         (z, _), _ = jax.lax.scan(better, begin, None, length=_STEPS)
-        known = information(z)[0]
-        return z, jnp.where(jnp.all(jnp.isfinite(known)), known, jnp.eye(len(z)))
+        rows = with_finite_gradient(_rows(memory))
+        J, r = slopes(z, rows)
+        root = jnp.linalg.qr(J, mode="r")
+        moved = z - solve_triangular(root, solve_triangular(root.T, J.T @ r, lower=True))
+        is_sound = jnp.all(jnp.isfinite(root)) & jnp.all(jnp.isfinite(moved))
+        return jnp.where(is_sound, moved, 0.0), jnp.where(is_sound, root, jnp.eye(len(z)))
 
     def _residuals(
         self, plant: AbstractPlant, rows: tuple[Array, Array, Array], z: Float[Array, " param"]

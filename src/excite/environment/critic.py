@@ -18,7 +18,7 @@ from ..plant.fields import floats
 from ..policy import Weights
 from ..policy.contract import network
 from ..safety import safe_input
-from .objective import AbstractObjective, StepData
+from .objective import AbstractObjective, StepData, require_same_steps
 
 _WIDTH, _SIZE = 64, 32  # of the hidden layers, and of what a record and a plant are encoded to
 
@@ -29,19 +29,19 @@ class Critic(eqx.Module):
     Attributes:
         sample: encoder of a sample: the input, the measurement after it and when it was made.
         record: code of a record, from the sum of its encoded samples.
-        plant: code of the parameters, as coordinates of the prior.
+        params: code of the parameters, as coordinates of the prior.
     """
 
     sample: Weights
     record: Weights
-    plant: Weights
+    params: Weights
 
     @classmethod
     def of(cls, plant: AbstractPlant, key: PRNGKeyArray) -> Critic:
         """With random weights (X. Glorot, Y. Bengio, 2010)."""
         d, glorot = plant.definition, jax.nn.initializers.glorot_uniform()
 
-        def network(key: PRNGKeyArray, size: int) -> Weights:
+        def weights(key: PRNGKeyArray, size: int) -> Weights:
             widths = size, _WIDTH, _WIDTH, _SIZE
             pairs = zip(jax.random.split(key, 3), widths, widths[1:], strict=False)
             return tuple(
@@ -50,7 +50,7 @@ class Critic(eqx.Module):
             )
 
         sizes = len(d.inputs) + len(d.outputs) + 1, _SIZE, len(d.parameters)
-        return cls(*map(network, jax.random.split(key, 3), sizes))
+        return cls(*map(weights, jax.random.split(key, 3), sizes))
 
 
 class CriticMemory(eqx.Module):
@@ -76,6 +76,9 @@ class CriticGain(AbstractObjective):
     for policies D. Ivanova et al., Implicit deep adaptive design, NeurIPS 2021). It is a bound for
     any critic, and the closer the better the critic has learnt. By gradient only.
 
+    With an `Env` of your own, it also serves tasks and plants without a likelihood, which
+    `excite train` and studies refuse.
+
     Attributes:
         prior: of the parameters.
         num_steps: of an experiment.
@@ -97,13 +100,17 @@ class CriticGain(AbstractObjective):
         require_whole("num_plants", self.num_plants, 1)
         require_whole("num_steps", self.num_steps, 1)
 
-    def first_part(self, plant: AbstractPlant, key: PRNGKeyArray) -> Critic:
+    def first_trained(self, plant: AbstractPlant, key: PRNGKeyArray) -> Critic:
         """A critic that has learnt nothing."""
         return Critic.of(plant, key)
 
-    def with_part(self, part: Critic) -> Self:
+    def with_trained(self, trained: Critic | None) -> Self:
         """With this critic."""
-        return dataclasses.replace(self, critic=part)
+        return dataclasses.replace(self, critic=trained)
+
+    def require_steps(self, num_steps: int) -> None:
+        """Raises ValueError for experiments of another length."""
+        require_same_steps(self.num_steps, num_steps)
 
     def init(
         self, plant: AbstractPlant, measured: Float[Array, " output"], key: PRNGKeyArray
@@ -155,5 +162,5 @@ class CriticGain(AbstractObjective):
         z = jnp.concatenate([memory.others, self.prior.coordinates(params)[None]])
         if (critic := self.critic) is None:
             return jnp.zeros(len(z))
-        codes = jax.vmap(lambda own: network(jnp, critic.plant, own))(z.astype(jnp.float32))
+        codes = jax.vmap(lambda own: network(jnp, critic.params, own))(z.astype(jnp.float32))
         return (codes @ network(jnp, critic.record, memory.total)).astype(float)

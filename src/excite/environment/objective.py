@@ -49,14 +49,18 @@ class StepData(eqx.Module):
 class AbstractObjective(eqx.Module):
     """What an experiment is rewarded for."""
 
-    def first_part(self, plant: AbstractPlant, key: PRNGKeyArray) -> PyTree:
-        """What of the objective is trained with the policy, before the first update; often none."""
+    def first_trained(self, plant: AbstractPlant, key: PRNGKeyArray) -> PyTree:
+        """What of the objective is trained with the policy, before the first update; often None."""
         del plant, key
 
-    def with_part(self, part: PyTree) -> Self:
-        """The objective with this part."""
-        del part
+    def with_trained(self, trained: PyTree) -> Self:
+        """The objective with what was trained."""
+        del trained
         return self
+
+    def require_steps(self, num_steps: int) -> None:
+        """Raises ValueError where the objective is for experiments of another length."""
+        del num_steps
 
     @abc.abstractmethod
     def init(
@@ -90,6 +94,12 @@ class AbstractObjective(eqx.Module):
     def of_batch(self, outcomes: PyTree) -> Float[Array, ""]:
         """The worth of experiments on many plants from their outcomes: the mean."""
         return jnp.mean(outcomes)
+
+
+def require_same_steps(own: int, num_steps: int) -> None:
+    """Raises ValueError where an objective and the experiments have not the same length."""
+    if own != num_steps:
+        raise ValueError(f"the objective is for {own} steps: got experiments of {num_steps}")
 
 
 def toward_goals(

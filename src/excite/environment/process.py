@@ -7,7 +7,8 @@ estimation error at its end (Eq. 4), or the information gained at every step. Th
 are the paper's.
 
 T is part of the process and k / T is observed, so the last step is `terminated`; nothing
-is ever truncated. The memory of an objective does not grow with T.
+is ever truncated. The memory of an objective does not grow with T, but for that of ACE, which
+keeps the record.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ def _spread(given: SpreadLike) -> Spread:
 
 
 class EnvState(eqx.Module):
-    """State of one episode; of fixed size, whatever T is.
+    """State of one episode; of fixed size, whatever T is, but for the memory of ACE.
 
     Attributes:
         params: true parameters of this episode's plant.
@@ -115,6 +116,10 @@ class Env(eqx.Module):
     uncertainty: Uncertainty | None = None
     coast: int = eqx.field(static=True, default=0)
     prior: PriorPlants | None = None
+
+    def __check_init__(self) -> None:
+        """Raises ValueError for an objective of experiments of another length."""
+        self.objective.require_steps(self.layout.num_steps)
 
     @classmethod
     def of(

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+from typing import Self
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -32,15 +35,23 @@ class WeightedSum(AbstractObjective):
         if not self.terms:
             raise ValueError("a sum of objectives needs at least one")
 
-    def first_part(self, plant: AbstractPlant, key: PRNGKeyArray) -> tuple[PyTree, ...]:
+    def first_trained(self, plant: AbstractPlant, key: PRNGKeyArray) -> tuple[PyTree, ...]:
         """Those of the terms."""
         keys = jax.random.split(key, len(self.terms))
-        return tuple(t.first_part(plant, own) for t, own in zip(self.terms, keys, strict=True))
+        return tuple(t.first_trained(plant, own) for t, own in zip(self.terms, keys, strict=True))
 
-    def with_part(self, part: tuple[PyTree, ...]) -> WeightedSum:
-        """With these parts of the terms."""
-        pairs = zip(self.terms, part, strict=True)
-        return WeightedSum(tuple(term.with_part(own) for term, own in pairs))
+    def with_trained(self, trained: tuple[PyTree, ...] | None) -> Self:
+        """With what was trained of each term."""
+        if trained is None:
+            return self
+        pairs = zip(self.terms, trained, strict=True)
+        terms = tuple(term.with_trained(own) for term, own in pairs)
+        return dataclasses.replace(self, terms=terms)
+
+    def require_steps(self, num_steps: int) -> None:
+        """Raises ValueError where a term is for experiments of another length."""
+        for term in self.terms:
+            term.require_steps(num_steps)
 
     def init(
         self, plant: AbstractPlant, measured: Float[Array, " output"], key: PRNGKeyArray

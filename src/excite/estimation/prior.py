@@ -246,7 +246,7 @@ class PriorPlants(eqx.Module):
         return self.plant.Params(**values)
 
     def coordinates(self, params: Params) -> Float[Array, " param"]:
-        """The coordinates of some parameters: the inverse of `params`."""
+        """The coordinates of some parameters: the inverse of `params`; zero for a fixed one."""
         d, values = self.plant.definition, {}
         if self.normal is not None:
             own = self.normal.residual(names_of(d.parameters), jnp.stack(params))
@@ -258,7 +258,8 @@ class PriorPlants(eqx.Module):
                 own = getattr(params, parameter.name)
                 is_log = self.spread.is_factor and parameter.positive
                 change = jnp.log(own / nominal) if is_log else (own - nominal) / parameter.scale
-                values[parameter.name] = ndtri((1 + change / self.spread.relative) / 2)
+                unit = change / self.spread.relative if self.spread.relative else 0 * change
+                values[parameter.name] = ndtri((1 + unit) / 2)
         return jnp.stack([values[name] for name in names_of(d.parameters)])
 
 

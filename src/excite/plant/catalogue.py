@@ -13,7 +13,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..description import Listing, as_number, first_line, names_of, told, unknown, wrong_type
+from ..description import (
+    Listing,
+    PlantDescription,
+    as_number,
+    first_line,
+    names_of,
+    told,
+    unknown,
+    wrong_type,
+)
 from ..files import class_at, damaged, is_class_word, read_json
 from .aero2 import Aero2, Aero2Detailed, Aero2Lag
 from .cart_pole import CartPole
@@ -107,6 +116,20 @@ def plant_named(name: str) -> AbstractPlant:
     plant = _complete(plant_class, f"{class_name} in {path}")
     _check_plant(plant, f"{class_name} in {path}")
     return plant
+
+
+def trained_on(plant: PlantDescription) -> str:
+    """The name of the plant of a policy, from its description.
+
+    Raises:
+        ValueError: where it is in a user's file, which a policy does not name.
+    """
+    if plant.name.partition("+")[0] not in PLANTS:
+        raise ValueError(
+            f"the policy's plant {plant.name!r} is in a file of yours: name it (--plant "
+            "path/to/file.py:ClassName)"
+        )
+    return plant.name
 
 
 def word_of(plant: AbstractPlant) -> str:

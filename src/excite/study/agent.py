@@ -296,15 +296,14 @@ class Agent:
         # A gradient needs no reward before the last step.
         dense = self.method == "ppo" if chosen.dense is None else chosen.dense
         if form in CONTRASTS:
+            named = f"the objective {CONTRASTS[form]} (reward {form!r})"
             if not all(targets):
                 raise ValueError(
-                    f"the reward {form!r} is of all parameters: name all of them as targets, or "
-                    "take the objective D"
+                    f"{named} is of all parameters: name all of them as targets, or take the "
+                    "objective D"
                 )
             if prior is None and not Spread.of(spread).relative:
-                raise ValueError(
-                    f"the reward {form!r} compares plants that differ: give a spread or a prior"
-                )
+                raise ValueError(f"{named} compares plants that differ: give a spread or a prior")
             population = plants_of(plant, None, spread) if prior is None else prior
             count = {} if (n := chosen.contrast_plants) is None else {"num_plants": n}
             own = {**count, "weight": chosen.weight, "change_price": chosen.change_price}
@@ -313,14 +312,18 @@ class Agent:
             if form == "critic":
                 if self.method == "ppo":
                     raise ValueError(
-                        "ppo does not train a critic (the objective InfoNCE): take the method "
-                        "gradient, or another objective"
+                        f"ppo does not train a critic: take the method gradient for {named}"
+                    )
+                if isinstance(self.training, GradientSettings) and self.training.starts > 1:
+                    raise ValueError(
+                        f"{named} cannot compare several starts, whose critic has learnt nothing: "
+                        "leave starts out"
                     )
                 return CriticGain(population, num_steps, **own)
             if self.decision.constants:
                 raise ValueError(
-                    "the reward 'adaptive_contrast' is of plants with the same constants: leave "
-                    "their ranges out, or take the reward 'contrast'"
+                    f"{named} is of plants with the same constants: leave their ranges out, or "
+                    "take the objective sPCE (reward 'contrast')"
                 )
             return AdaptiveContrastiveGain(population, num_steps, **own)
         if form == "information":

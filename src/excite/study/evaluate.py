@@ -9,7 +9,7 @@ from pathlib import Path
 
 from ..description import SpreadLike, by_name, wrong_type
 from ..plant import AbstractARXPlant
-from ..plant.catalogue import PlantLike
+from ..plant.catalogue import PlantLike, trained_on
 from ..plant.uncertainty import Range
 from ..policy import POLICY_ENDING, Policy, mismatch, read_policy
 from ..progress import SHOWN, Progress
@@ -75,7 +75,7 @@ def evaluate(
             file.write_bytes(policy.to_bytes())
             word = str(file)
         trained, name = read_policy(word), Path(word).stem
-        tables, built = plant_tables(trained.plant.name if plant is None else plant, noise)
+        tables, built = plant_tables(trained_on(trained.plant) if plant is None else plant, noise)
         kinds = ["arx-rls"] * isinstance(built, AbstractARXPlant) + ["nls"]
         settings = {
             "name": name,

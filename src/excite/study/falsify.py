@@ -36,6 +36,7 @@ from ..plant.catalogue import (
     plant_from,
     plant_in_file,
     require_inputs,
+    trained_on,
     with_sensor,
 )
 from ..plant.contract import with_nominal
@@ -331,7 +332,7 @@ def falsify(
                 f"{_word(excitation)} is no policy, which would name its plant: give the plant "
                 "(--plant)"
             )
-        plant = policy.plant.name
+        plant = trained_on(policy.plant)
     chosen = with_sensor(plant_from(plant), noise)
     if isinstance(excitation, Record):
         chosen = chosen.changed(dt=excitation.dt)

@@ -23,8 +23,8 @@ OBJECTIVES: Mapping[str, Mapping[str, str]] = {
 }
 """Settings of a reward: criteria of the Fisher information, contrasts, errors of an estimator."""
 
-CONTRASTS = "contrast", "adaptive_contrast", "critic"
-"""Rewards that compare the true plant with others."""
+CONTRASTS = {"contrast": "sPCE", "adaptive_contrast": "ACE", "critic": "InfoNCE"}
+"""Rewards that compare the true plant with others, and their objectives."""
 
 
 def rewards_of(

@@ -99,11 +99,12 @@ def _fraction(values: np.ndarray) -> Float[np.ndarray, " param"]:
 
 
 def mean_sd(values: np.ndarray) -> MeanSd:
-    """Mean and standard deviation, where there are any."""
-    return MeanSd(
-        mean=float(values.mean()) if values.size else math.nan,
-        sd=float(values.std(ddof=1)) if values.size > 1 else math.nan,
-    )
+    """Mean and standard deviation, where there are any; NaN for what is not finite."""
+    with np.errstate(invalid="ignore"):
+        return MeanSd(
+            mean=float(values.mean()) if values.size else math.nan,
+            sd=float(values.std(ddof=1)) if values.size > 1 else math.nan,
+        )
 
 
 def _error(values: np.ndarray) -> ErrorStatistics:

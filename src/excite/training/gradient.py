@@ -124,32 +124,32 @@ class Optimisation(eqx.Module):
         adam: state of the optimiser.
         penalty_weight: of the safety penalty.
         adversaries: of the last update; None where no uncertainty is declared.
-        part: of the objective, where it is trained too.
+        trained: what of the objective is trained too.
     """
 
     player: PyTree
     adam: PyTree
     penalty_weight: Float[Array, "*training"]
     adversaries: Cases | None = None
-    part: PyTree = None
+    trained: PyTree = None
 
     @classmethod
     def start(
-        cls, player: PyTree, settings: GradientSettings, env: Env, part: PyTree = None
+        cls, player: PyTree, settings: GradientSettings, env: Env, trained: PyTree = None
     ) -> Optimisation:
         """Before the first update."""
-        adam = optimiser(settings).init(eqx.filter((player, part), eqx.is_array))
+        adam = optimiser(settings).init(eqx.filter((player, trained), eqx.is_array))
         weight, count = jnp.asarray(settings.penalty_weight, float), settings.num_adversaries
         if (box := env.uncertainty) is None:
-            return cls(player, adam, weight, None, part)
+            return cls(player, adam, weight, None, trained)
         length = env.layout.num_steps + env.coast + 1
         noise = jnp.zeros((count, length, len(env.plant.definition.outputs)))
         middle = Cases(jnp.zeros((count, len(box.names))), jnp.zeros(count, int), noise)
-        return cls(player, adam, weight, middle, part)
+        return cls(player, adam, weight, middle, trained)
 
     def env(self, env: Env) -> Env:
-        """The decision process whose objective has the trained part."""
-        return dataclasses.replace(env, objective=env.objective.with_part(self.part))
+        """The decision process whose objective has what was trained of it."""
+        return dataclasses.replace(env, objective=env.objective.with_trained(self.trained))
 
 
 def update(
@@ -178,8 +178,8 @@ def update(
         adversaries = _adversaries(play, settings, adversaries, key)
 
     def loss(trained: tuple[PyTree, PyTree]) -> tuple[Array, tuple[Scores, Array]]:
-        player, part = trained
-        own = dataclasses.replace(now, part=part).env(env)
+        player, of_objective = trained
+        own = dataclasses.replace(env, objective=env.objective.with_trained(of_objective))
         batch = experiments(own, player, keys, start)
         excess, nearest = jnp.mean(batch.excess), batch.nearness
         if is_adversarial and box is not None and adversaries is not None:
@@ -189,15 +189,15 @@ def update(
         worth = own.objective.of_batch(batch.outcome)
         return now.penalty_weight * excess - worth, (batch, nearest)
 
-    trained = now.player, now.part
+    trained = now.player, now.trained
     (cost, (batch, nearest)), gradient = eqx.filter_value_and_grad(loss, has_aux=True)(trained)
     gradient = jax.tree.map(lambda leaf: jnp.where(jnp.isfinite(cost), leaf, jnp.nan), gradient)
     step, adam = optimiser(settings).update(gradient, now.adam)
     is_near = jnp.mean(nearest >= settings.near) > settings.violation_rate
     change = jnp.where(is_near, settings.penalty_growth, -settings.penalty_decay)
-    player, part = eqx.apply_updates(trained, step)
+    player, of_objective = eqx.apply_updates(trained, step)
     weight = jnp.maximum(now.penalty_weight * jnp.exp(change), settings.penalty_weight)
-    return Optimisation(player, adam, weight, adversaries, part), batch
+    return Optimisation(player, adam, weight, adversaries, of_objective), batch
 
 
 def _on_plants(env: Env, box: Uncertainty, player: PyTree) -> OnPlant:
@@ -373,8 +373,8 @@ def started(
     def start(key: PRNGKeyArray) -> Optimisation:
         weights = _first_policy(env, settings, key) if first is None else first
         network = Network(weights, env.layout, settings.through_measurements)
-        part = env.objective.first_part(env.plant, jax.random.fold_in(key, 3))
-        return Optimisation.start(network, settings, env, part)
+        trained = env.objective.first_trained(env.plant, jax.random.fold_in(key, 3))
+        return Optimisation.start(network, settings, env, trained)
 
     def keys(i: int) -> Key[Array, "seed plant"]:
         own = jax.vmap(jax.random.fold_in, (0, None))(pairs[:, 1], i)
