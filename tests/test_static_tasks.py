@@ -68,7 +68,10 @@ def test_without_an_excitation_the_designs_are_random():
 def test_a_trained_policy_is_compared_with_random_designs(tmp_path):
     ex.train(Slope, tmp_path / "run", steps=5, window=1, episodes=2, updates=1,
              training={"num_plants": 2, "hidden": [2]})  # fmt: skip
-    assert {row.method for row in finished_table(tmp_path / "run").rows} == {"random", "gradient D"}
+    assert {row.method for row in finished_table(tmp_path / "run").rows} == {
+        "random",
+        "gradient(D)",
+    }
 
 
 def test_what_the_likelihood_expects_is_the_response():

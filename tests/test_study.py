@@ -295,7 +295,7 @@ BAD_STUDIES: dict[str, tuple[str, tuple[str, ...]]] = {
     ),
     "unknown reward": (
         MINIMAL + '[agents.a]\n[decision]\nreward = "nice"\n',
-        ("reward must be 'relative', 'log', 'goals', 'information' or 'contrast'", "nice"),
+        ("reward must be 'relative', 'log', 'goals', 'information', 'contrast',", "nice"),
     ),
     "window beyond any memory": (
         MINIMAL + "[agents.a]\n[decision]\nwindow = 100000000000\n",
