@@ -8,12 +8,6 @@ from pathlib import Path
 from ..description import Listing, path_from, unknown
 
 SHIPPED = Path(__file__).parent / "shipped"
-_PACKAGE = Path(__file__).parents[1]
-EXAMPLES = next(
-    (own for own in (_PACKAGE / "examples", _PACKAGE.parents[1] / "examples") if own.is_dir()),
-    SHIPPED,
-)
-"""The examples, which a shipped study may name: in the package, or beside it in a clone."""
 
 
 def studies() -> Listing:

@@ -36,7 +36,7 @@ from ..plant.uncertainty import Uncertainty
 from ..training.settings import GradientSettings, PPOSettings
 from ..training.signals import CLAIRVOYANT, CLAIRVOYANT_STARTS
 from .agent import REWARD_TABLES, Agent, AgentSettings, DecisionSettings
-from .catalogue import EXAMPLES, SHIPPED, study_path
+from .catalogue import study_path
 from .settings import (
     Choice,
     Count,
@@ -418,11 +418,8 @@ def read_study(path: str | Path) -> Study:
 def _beside(study: Study, folder: Path) -> Study:
     """The study with its file names relative to its folder resolved."""
     plant, methods = study.plant, study.model_dump()["methods"]
-    is_shipped = folder.resolve() == SHIPPED.resolve()
-    for place in (folder, EXAMPLES) if is_shipped else (folder,):
-        if ":" in plant and (place / plant.rpartition(":")[0]).is_file():
-            plant = str(place / plant)
-            break
+    if ":" in plant and (folder / plant.rpartition(":")[0]).is_file():
+        plant = str(folder / plant)
     for method in methods.values():
         method["excitation"] = excitation_beside(folder, method["excitation"])
     return study.changed(plant=plant, methods=methods)
