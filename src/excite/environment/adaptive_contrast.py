@@ -10,14 +10,11 @@ import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from ..description import require_whole
-from ..estimation.prior import PriorPlants
 from ..plant import AbstractPlant, Params
-from ..plant.fields import floats
 from ..safety import safe_input
 from ..simulation import require_likelihood, step
-from .contrast import IMPOSSIBLE, with_finite_gradient
-from .objective import AbstractObjective, StepData, require_same_steps
+from .contrast import IMPOSSIBLE, AbstractFinalContrast, with_finite_gradient
+from .objective import StepData
 
 _STEPS = 8  # of the fit
 _FROM_PRIOR = 0.2  # of the compared plants
@@ -43,7 +40,7 @@ class RecordMemory(eqx.Module):
     key: PRNGKeyArray
 
 
-class AdaptiveContrastiveGain(AbstractObjective):
+class AdaptiveContrastiveGain(AbstractFinalContrast):
     """A lower bound of the expected information gain in nats that needs few plants: ACE.
 
     As `ContrastiveGain`, but the other plants are drawn from what the record tells, and weighted by
@@ -66,20 +63,7 @@ class AdaptiveContrastiveGain(AbstractObjective):
         change_price: of the squared change of the input, subtracted at every step.
     """
 
-    prior: PriorPlants
-    num_steps: int = eqx.field(static=True)
     num_plants: int = eqx.field(static=True, default=15)
-    weight: Float[Array, ""] = eqx.field(converter=floats, default=1.0)
-    change_price: Float[Array, ""] = eqx.field(converter=floats, default=0.0)
-
-    def __check_init__(self) -> None:
-        """Raises ValueError without another plant, or a step."""
-        require_whole("num_plants", self.num_plants, 1)
-        require_whole("num_steps", self.num_steps, 1)
-
-    def require_steps(self, num_steps: int) -> None:
-        """Raises ValueError for experiments of another length."""
-        require_same_steps(self.num_steps, num_steps)
 
     def init(
         self, plant: AbstractPlant, measured: Float[Array, " output"], key: PRNGKeyArray

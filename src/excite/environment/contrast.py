@@ -34,6 +34,36 @@ with_finite_gradient.defvjp(
 )
 
 
+class AbstractFinalContrast(AbstractObjective):
+    """A comparison of the true plant with others that is rewarded at the last step.
+
+    Attributes:
+        prior: of the parameters.
+        num_steps: of an experiment.
+        num_plants: that are compared with the true one.
+        weight: factor of the reward.
+        change_price: of the squared change of the input, subtracted at every step.
+    """
+
+    prior: PriorPlants
+    num_steps: int = eqx.field(static=True)
+    num_plants: int = eqx.field(static=True, default=255)
+    weight: Float[Array, ""] = eqx.field(converter=floats, default=1.0)
+    change_price: Float[Array, ""] = eqx.field(converter=floats, default=0.0)
+
+    def __check_init__(self) -> None:
+        """Raises ValueError without another plant, or a step."""
+        require_whole("num_plants", self.num_plants, 1)
+        require_whole("num_steps", self.num_steps, 1)
+
+    def require_steps(self, num_steps: int) -> None:
+        """Raises ValueError for experiments of another length."""
+        if self.num_steps != num_steps:
+            raise ValueError(
+                f"the objective is for {self.num_steps} steps: got experiments of {num_steps}"
+            )
+
+
 class ContrastMemory(eqx.Module):
     """The other plants, and what the outcomes so far tell.
 

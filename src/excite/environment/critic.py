@@ -11,14 +11,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from ..description import require_whole
-from ..estimation.prior import PriorPlants
 from ..plant import AbstractPlant, Params
-from ..plant.fields import floats
 from ..policy import Weights
 from ..policy.contract import network
 from ..safety import safe_input
-from .objective import AbstractObjective, StepData, require_same_steps
+from .contrast import AbstractFinalContrast
+from .objective import StepData
 
 _WIDTH, _SIZE = 64, 32  # of the hidden layers, and of what a record and a plant are encoded to
 
@@ -67,7 +65,7 @@ class CriticMemory(eqx.Module):
     input: Float[Array, " input"]
 
 
-class CriticGain(AbstractObjective):
+class CriticGain(AbstractFinalContrast):
     """A lower bound of the expected information gain in nats that needs no likelihood: InfoNCE.
 
     A critic, which is trained with the policy, scores how well parameters fit a record. The reward,
@@ -88,17 +86,7 @@ class CriticGain(AbstractObjective):
         critic: with which records are scored; without one, the reward is zero.
     """
 
-    prior: PriorPlants
-    num_steps: int = eqx.field(static=True)
-    num_plants: int = eqx.field(static=True, default=255)
-    weight: Float[Array, ""] = eqx.field(converter=floats, default=1.0)
-    change_price: Float[Array, ""] = eqx.field(converter=floats, default=0.0)
     critic: Critic | None = None
-
-    def __check_init__(self) -> None:
-        """Raises ValueError without another plant, or a step."""
-        require_whole("num_plants", self.num_plants, 1)
-        require_whole("num_steps", self.num_steps, 1)
 
     def first_trained(self, plant: AbstractPlant, key: PRNGKeyArray) -> Critic:
         """A critic that has learnt nothing."""
@@ -107,10 +95,6 @@ class CriticGain(AbstractObjective):
     def with_trained(self, trained: Critic | None) -> Self:
         """With this critic."""
         return dataclasses.replace(self, critic=trained)
-
-    def require_steps(self, num_steps: int) -> None:
-        """Raises ValueError for experiments of another length."""
-        require_same_steps(self.num_steps, num_steps)
 
     def init(
         self, plant: AbstractPlant, measured: Float[Array, " output"], key: PRNGKeyArray

@@ -96,12 +96,6 @@ class AbstractObjective(eqx.Module):
         return jnp.mean(outcomes)
 
 
-def require_same_steps(own: int, num_steps: int) -> None:
-    """Raises ValueError where an objective and the experiments have not the same length."""
-    if own != num_steps:
-        raise ValueError(f"the objective is for {own} steps: got experiments of {num_steps}")
-
-
 def toward_goals(
     errors: Float[Array, "plant param"],
     goals: Float[Array, " param"],

@@ -16,6 +16,7 @@ import sys
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple, TypeAlias
@@ -130,15 +131,15 @@ class Layout:
         outputs = range(first - len(self.output_scale), first)
         return (*outputs, *range(self.progress - len(self.input_half), self.progress))
 
-    @property
-    def beside_memory(self) -> tuple[int, ...]:
+    @cached_property
+    def beside_memory(self) -> np.ndarray:
         """Where an observation has what the layers after a memory see too.
 
         All of it; with attention, which has read the window, the newest sample and the time.
         """
         if self.memory_kind == "attention":
-            return (*self.newest, *range(self.progress, self.size))
-        return tuple(range(self.size))
+            return np.array([*self.newest, *range(self.progress, self.size)])
+        return np.arange(self.size)
 
     @property
     def unit(self) -> tuple[tuple[int, int], ...]:
@@ -264,7 +265,7 @@ def attended(
 
 
 MEMORIES = {"gru": gated, "sum": added, "attention": attended}
-"""Kinds of memory, and how each goes on with one more observation."""
+"""Kinds of memory, each with the function that gives it after one more observation."""
 
 NO_MEMORY = "memory_kind needs a memory: set memory, or leave memory_kind out"
 
@@ -289,7 +290,7 @@ def act(
         remembered = MEMORIES[layout.memory_kind]
         first = len(layout.unit)
         memory = remembered(xp, layout, weights[:first], window.memory, seen)
-        beside = seen[np.array(layout.beside_memory)]
+        beside = seen[layout.beside_memory]
         action = network(xp, weights[first:], xp.concatenate([memory, beside]))
         memory = xp.where(xp.all(xp.isfinite(seen)), memory, window.memory)
         action = xp.where(xp.isfinite(action), xp.tanh(action), if_not_finite)
@@ -565,14 +566,13 @@ def _check_certificate(certificate: Any) -> None:
 
 def _check_layers(weights: Weights, layout: Layout) -> None:
     """Raises ValueError where the layers do not fit each other, the layout or the plant."""
-    width, first = layout.size, len(layout.unit)
+    width, first = layout.memory + len(layout.beside_memory), len(layout.unit)
     if layout.memory:
         inner = weights[0][1].size if weights else 0
         matrices = [[inner if n == -1 else n for n in matrix] for matrix in layout.unit]
         shapes = [tuple(shape) for matrix in matrices for shape in (matrix, matrix[:1])]
         if [part.shape for layer in weights[:first] for part in layer] != shapes:
             raise ValueError(f"the unit of a memory of {layout.memory} numbers has other weights")
-        width = layout.memory + len(layout.beside_memory)
     if len(weights) <= first:
         raise ValueError("a policy needs at least one layer")
     for matrix, bias in weights[:first]:

@@ -123,7 +123,7 @@ def _unit(policy: Policy) -> tuple[list[NodeProto], dict[str, np.ndarray]]:
     nodes, constants = {"gru": _gru, "sum": _sum, "attention": _attention}[
         policy.layout.memory_kind
     ](policy)
-    constants["beside"] = np.array(policy.layout.beside_memory, np.int64)
+    constants["beside"] = policy.layout.beside_memory.astype(np.int64)
     nodes += [
         helper.make_node("Gather", ["observation", "beside"], ["also"], axis=1),
         helper.make_node("Concat", ["new", "also"], ["seen"], axis=1),
