@@ -37,7 +37,7 @@ test-science: .venv/dev ## promises of the shipped policies, baselines, training
 	XLA_FLAGS="$(FEWER_PASSES)" $(PYTEST) --dist worksteal -m science
 
 check-results: .venv/dev ## the committed results are what the documentation says of them
-	$(BIN)/python -m pytest tests/results
+	$(PYTEST) --dist worksteal tests/results
 
 # In one pass with the unit tests, the slow ones find compiled what they share with them.
 test-all: UNITS := -m 'not science'
@@ -63,7 +63,8 @@ results: .venv/core ## computes the committed results again (minutes in docs/ref
 
 agents: .venv/dev ## trains the agents of the studies again (hours; rerun to resume)
 	for study in table1 paper frontier robust wide emps dc_motor cart_pole aero2_lag half amplitude nls_reward spread reward \
-	    two_minutes sim_to_real; do \
+	    two_minutes sim_to_real oed_linear_pendulum oed_nonlinear_pendulum oed_cart_pole oed_double_pendulum \
+	    oed_location_finding; do \
 	  $(BIN)/excite study run $$study --out runs/$$study || exit 1; \
 	done
 

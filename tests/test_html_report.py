@@ -294,6 +294,15 @@ def test_a_study_with_expected_gains_is_answered_in_nats():
     assert of_study(table) == "chirp: 9.00 ± 0.05 nats, violations 0/100 (0.0–3.7 %)"
 
 
+def test_two_bounds_are_explained_where_a_cell_has_two():
+    alone = with_gain(ROWS[1], 9.0)
+    wide = alone.data()
+    wide["expected_gain"]["upper"] = {"mean": 9.2, "std_error": 0.05}
+    told = "Two figures are a lower and an upper bound."
+    assert told not in " ".join(footnotes(FACTS, [alone]))
+    assert told in " ".join(footnotes(FACTS, [alone, Row.model_validate(wide)]))
+
+
 def test_a_campaign_is_answered_by_its_targets_and_its_nearness():
     known = {
         "J_p": {"estimate": 0.02, "ci95_half": 0.0004},

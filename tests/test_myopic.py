@@ -12,7 +12,7 @@ import excite as ex
 from excite.estimation.information_gain import gains
 from excite.estimation.myopic import Myopic
 from excite.excitation import Random
-from excite.plant import AbstractStaticTask, static_description
+from excite.plant import AbstractPlant, AbstractStaticTask, static_description
 
 SD = 0.5
 
@@ -46,6 +46,28 @@ class Beacon(AbstractStaticTask):
 
     def outcome(self, design, params):
         return 1 / (1 + (design - params.at) ** 2)
+
+
+class Climb(AbstractPlant):
+    """A height to which each step adds what the line would measure."""
+
+    definition = ex.PlantDescription(
+        name="climb",
+        states=(ex.State("height", "m", initial=0.7, noise_sd=SD),),
+        inputs=Line.definition.inputs,
+        outputs=(ex.Output("height", "m", scale=1.0),),
+        parameters=Line.definition.parameters,
+        dt=1.0,
+        integrator="euler",
+    )
+
+    def derivative(self, state, input, params):
+        del state
+        return params.offset + input * params.slope
+
+    def output(self, state, params):
+        del params
+        return state
 
 
 PRIOR = {"offset": "normal:0:1", "slope": "normal:0:1"}
@@ -87,6 +109,19 @@ def test_the_next_design_tells_most():
     told = 0.5 * np.log1p(np.einsum("ij,jk,ik->i", rows, covariance, rows) / SD**2)
     own = np.interp(designs[1, 0], places, told)
     assert own > told.max() - 0.1 * np.ptp(told)
+
+
+def test_of_a_plant_whose_state_is_observed_each_step_tells_what_a_design_does():
+    """With the same random numbers, of its increments the same is learnt as of the line."""
+    known, designs = played(Myopic.of(Line, PRIOR), OUTCOMES)
+    chosen = Myopic.of(Climb, PRIOR)
+    state, inputs = chosen.init(Climb(), 6, jax.random.key(3)), []
+    for height in np.cumsum([0.7, *OUTCOMES]):
+        state, input = chosen(state, jnp.array([height]))
+        inputs.append(np.asarray(input))
+    np.testing.assert_allclose(inputs, designs, atol=1e-9)
+    np.testing.assert_allclose(state.particles, known.particles, atol=1e-9)
+    np.testing.assert_allclose(chosen.posterior(state).slope, known.particles[:, 1], atol=1e-9)
 
 
 def test_of_a_pool_only_its_designs_are_chosen():
@@ -144,8 +179,8 @@ def test_a_pool_that_is_none_is_refused(pool, sentence):
         Myopic.of(Line, PRIOR, pool=pool)
 
 
-def test_a_plant_with_states_is_refused():
-    with pytest.raises(ValueError, match=r"tasks without memory.*'aero2' has states"):
+def test_a_plant_whose_state_is_not_observed_is_refused():
+    with pytest.raises(ValueError, match=r"tasks without memory.*plant 'aero2' are not its states"):
         Myopic.of("aero2")
     with pytest.raises(ValueError, match="tasks without memory"):
         ex.information_gain("aero2", "myopic")
@@ -153,7 +188,7 @@ def test_a_plant_with_states_is_refused():
 
 
 def test_another_task_is_refused():
-    with pytest.raises(ValueError, match="for the task 'line': got 'beacon'"):
+    with pytest.raises(ValueError, match="for the plant 'line': got 'beacon'"):
         ex.information_gain(Beacon, Myopic.of(Line, PRIOR), steps=2)
 
 

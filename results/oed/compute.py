@@ -73,8 +73,9 @@ class Task:
         chains: trainings side by side of a seed; for each price the best on validation is kept.
         evaluation: of every row.
         also: another evaluation of every row, near the posterior.
-        myopic: evaluation of designs chosen one after the other, for each seed; none for a plant
-            with states. Another one has as many plants and 1,000 samples near the posterior.
+        myopic: evaluation of designs chosen one after the other, for each seed; for plants with
+            states, `evaluation` with fewer plants, once. Another one of a task without memory has
+            as many plants and 1,000 samples near the posterior.
         pool: number of designs, drawn at random, that are allowed to these; 0 for all.
         rivals: other methods, by their names.
     """
@@ -181,14 +182,14 @@ TASKS = {
                 memory=16, memory_kind="sum", compared=1023,
                 settings=GradientSettings(
                     num_updates=8000, num_plants=128, learning_rate=1e-3, hidden=(256,),
-                    last_gain=0.3, watch_every=500, watch_episodes=512,
+                    last_gain=0.3, watch_every=500, watch_episodes=512, through_measurements=False,
                 ),
             ),
             "iDAD": Rival(
                 memory=16, memory_kind="attention", window=30, objective="InfoNCE", compared=255,
                 settings=GradientSettings(
                     num_updates=2500, num_plants=128, learning_rate=1e-3, hidden=(256,),
-                    last_gain=0.3, watch_every=500, watch_episodes=256,
+                    last_gain=0.3, watch_every=500, watch_episodes=256, through_measurements=False,
                 ),
             ),
         },
@@ -356,6 +357,8 @@ def main():
             keep_input("PRBS", PRBS(clock=1))
             keep_input("constant", Replay(np.tile(limit, (own.steps, 1))))
             keep("open loop", lambda task=task: [open_loop_row(task)])
+            few = {**own.evaluation, "plants": 128}
+            keep("myopic", lambda task=task, few=few: [row(task, "myopic", "myopic", few)])
         if own.archive and asked.published is not None:
             module = module_at(EXAMPLES / "smc_policies.py")
             keep_input("published", module.RecurrentPolicy.read(asked.published / own.archive))

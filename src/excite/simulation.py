@@ -235,6 +235,38 @@ def require_likelihood(plant: AbstractPlant) -> bool:
     return d.observes_state
 
 
+def next_measurement(
+    plant: AbstractPlant,
+    before: Float[Array, " value"],
+    input: Float[Array, " input"],
+    params: Params,
+    noise: Float[Array, " output"],
+) -> Float[Array, " output"]:
+    """What is measured after one step, of a static task or a plant whose state is observed.
+
+    Args:
+        before: what was measured before the step; a static task has no use for it.
+        noise: standard normal.
+    """
+    if isinstance(plant, AbstractStaticTask):
+        return plant.measured(input, params, noise)
+    return step(plant, before, input, params) + plant.process_noise_sd * noise
+
+
+def log_likelihood(
+    plant: AbstractPlant,
+    measured: Float[Array, " output"],
+    before: Float[Array, " value"],
+    input: Float[Array, " input"],
+    params: Params,
+) -> Float[Array, ""]:
+    """Logarithm of the density of `next_measurement`, but for a constant."""
+    if isinstance(plant, AbstractStaticTask):
+        return plant.log_likelihood(measured, input, params)
+    misses = (measured - step(plant, before, input, params)) / plant.process_noise_sd
+    return -0.5 * jnp.sum(misses**2)
+
+
 @eqx.filter_jit
 def measure(
     plant: AbstractPlant,

@@ -67,8 +67,8 @@ def gain(
     """What an experiment on PLANT is expected to tell of its parameters, in nats.
 
     For an excitation, a policy, or the recorded or designed input in INPUT_FILE. The bounds are
-    means over plants drawn from the prior. For a task without memory, the excitation "myopic"
-    chooses each design where its outcome is expected to tell most.
+    means over plants drawn from the prior. For a task without memory, or a plant whose state is
+    observed, the excitation "myopic" makes each input that whose outcome is expected to tell most.
     """
     from ..estimation.information_gain import information_gain
 

@@ -15,7 +15,7 @@ from ..plant import AbstractPlant, Params
 from ..plant.fields import floats
 from ..plant.static import AbstractStaticTask
 from ..safety import safe_input
-from ..simulation import require_likelihood, step
+from ..simulation import log_likelihood, require_likelihood, step
 from .objective import AbstractObjective, StepData
 
 IMPOSSIBLE = -1e6
@@ -127,19 +127,16 @@ class ContrastiveGain(AbstractObjective):
     ) -> tuple[ContrastMemory, Float[Array, ""]]:
         """The likelihood of one more outcome, for every plant."""
         del k
-        is_task = isinstance(plant, AbstractStaticTask)
-        observes_state = not is_task and require_likelihood(plant)
+        by_steps = isinstance(plant, AbstractStaticTask) or require_likelihood(plant)
 
         def likely(
             state: Array, params: Params, true_state: Array, input: Array, measured: Array
         ) -> tuple[Array, Array]:
-            if is_task:
-                return state, plant.log_likelihood(measured, input, params)
-            after = step(plant, true_state if observes_state else state, input, params)
-            expected = after if observes_state else plant.output(after, params)
-            sd = plant.process_noise_sd if observes_state else plant.sensor.sd
-            found = -0.5 * jnp.sum(((measured - expected) / sd) ** 2)
-            return jnp.where(jnp.all(jnp.isfinite(after)), after, state), found
+            if by_steps:
+                return state, log_likelihood(plant, measured, true_state, input, params)
+            after = step(plant, state, input, params)
+            misses = (measured - plant.output(after, params)) / plant.sensor.sd
+            return jnp.where(jnp.all(jnp.isfinite(after)), after, state), -0.5 * jnp.sum(misses**2)
 
         made = sample.state, sample.input, sample.measured
         shape = (self.num_plants,)

@@ -1,20 +1,22 @@
-"""Designs of a static task, each where its outcome is expected to tell most of the parameters.
+"""Inputs, each where the next measurement is expected to tell most of the parameters.
 
-What is known is a set of particles: parameters as probable as the outcomes so far leave them.
-Each outcome weights the particles; they are drawn again, and moved without changing their
-distribution, in several stages where it tells much (sequential Monte Carlo; N. Chopin, A sequential
-particle filter method for static models, 2002; moves of C. ter Braak, A Markov chain Monte Carlo
-version of the genetic algorithm differential evolution, 2006). The next design has the largest
-expected information gain of its own outcome, by nested Monte Carlo, among designs at random: first
-anywhere and near the designs before, then near the best of these. It looks one outcome ahead, and
-is not trained.
+They are the designs of a static task, or the inputs of a plant whose state is observed: there one
+step is an experiment of its own. What is known is a set of particles: parameters as probable as the
+outcomes so far leave them. Each outcome weights the particles; they are drawn again, and moved
+without changing their distribution, in several stages where it tells much (sequential Monte Carlo;
+N. Chopin, A sequential particle filter method for static models, 2002; moves of C. ter Braak, A
+Markov chain Monte Carlo version of the genetic algorithm differential evolution, 2006). The next
+design has the largest expected information gain of its own outcome, by nested Monte Carlo, among
+designs at random: first anywhere and near the designs before, then near the best of these. It looks
+one outcome ahead, and is not trained.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from typing import cast
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -29,6 +31,7 @@ from ..information import require_bound
 from ..plant import AbstractPlant, Params, floats
 from ..plant.catalogue import PlantLike, plant_from
 from ..plant.static import AbstractStaticTask, has_own_noise
+from ..simulation import log_likelihood, next_measurement
 from .prior import PriorPlants
 from .prior_knowledge import PriorLike, plants_of
 
@@ -45,10 +48,11 @@ _FINE = 1e-3  # part of a move that no difference has, in the particles' standar
 
 
 class Known(eqx.Module):
-    """What a static task's outcomes so far tell.
+    """What the outcomes so far tell.
 
     Attributes:
         particles: normal coordinates of equally probable parameters.
+        first: what was measured before the first design.
         designs: so far, by step; zero from step k.
         outcomes: of these.
         k: number of designs made.
@@ -56,10 +60,16 @@ class Known(eqx.Module):
     """
 
     particles: Float[Array, "particle param"]
+    first: Float[Array, " output"]
     designs: Float[Array, "time input"]
     outcomes: Float[Array, "time output"]
     k: Int[Array, ""]
     key: PRNGKeyArray
+
+    @property
+    def before(self) -> Float[Array, "time output"]:
+        """What was measured before each design."""
+        return jnp.concatenate([self.first[None], self.outcomes[:-1]])
 
 
 @eqx.filter_jit
@@ -71,7 +81,7 @@ def posterior_particles(
     num_moves: int,
     key: PRNGKeyArray,
 ) -> Float[Array, "particle param"]:
-    """Normal coordinates of parameters as probable as the outcomes of these designs leave them."""
+    """Normal coordinates of parameters as probable as a static task's outcomes leave them."""
     chosen = Myopic(prior, num_particles=num_particles, num_moves=num_moves, num_outcomes=1)
     state = chosen.init(prior.plant, len(designs), key)
     state = eqx.tree_at(lambda known: known.designs, state, designs)
@@ -84,7 +94,9 @@ def posterior_particles(
 
 
 class Myopic(AbstractExcitation):
-    """Each design of a static task where its outcome is expected to tell most.
+    """Each design where its outcome is expected to tell most.
+
+    The designs are those of a static task, or the inputs of a plant whose state is observed.
 
         >>> import jax
         >>> import excite as ex
@@ -148,11 +160,11 @@ class Myopic(AbstractExcitation):
             pool: the only designs that are allowed, by row [input units].
 
         Raises:
-            ValueError: for a plant that is no static task, a sensor without noise, or a pool of
-                another shape or outside the limits.
+            ValueError: for a plant that is neither a static task nor has a state that is
+                observed, a sensor without noise, or a pool of another shape or outside the limits.
         """
         plant = plant_from(task)
-        _require_static(plant)
+        _require_one_step(plant)
         if not has_own_noise(plant):
             require_bound(plant)
         if pool is None:
@@ -169,20 +181,22 @@ class Myopic(AbstractExcitation):
         return cls(plants_of(plant, prior, spread), floats(rows))
 
     def init(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> Known:
-        """The prior; for at most `num_steps` designs. ValueError for another task."""
+        """The prior; for at most `num_steps` designs. ValueError for another plant."""
         d, own = plant.definition, self.prior.plant.definition
         if d.name != own.name:
-            raise ValueError(f"these designs are for the task {own.name!r}: got {d.name!r}")
+            raise ValueError(f"these designs are for the plant {own.name!r}: got {d.name!r}")
         require_whole("num_steps", num_steps, 1)
         key, draw_key = jax.random.split(key)
         drawn = jax.random.normal(draw_key, (self.num_particles, len(d.parameters)), float)
-        designs = jnp.zeros((num_steps, len(d.inputs)))
-        return Known(drawn, designs, jnp.zeros((num_steps, len(d.outputs))), jnp.asarray(0), key)
+        designs, outcomes = (jnp.zeros((num_steps, len(own))) for own in (d.inputs, d.outputs))
+        return Known(drawn, outcomes[0], designs, outcomes, jnp.asarray(0), key)
 
     def __call__(
         self, state: Known, measurement: Float[Array, " output"]
     ) -> tuple[Known, Float[Array, " input"]]:
-        """The next design, after the outcome of the last one; the first call has none yet.
+        """The next design, after the outcome of the last one.
+
+        The first call has no outcome yet: the state of a plant, anything for a static task.
 
         Raises:
             ValueError: for more designs than the state was made for, and for an outcome of another
@@ -192,7 +206,7 @@ class Myopic(AbstractExcitation):
         if not isinstance(state.k, jax.core.Tracer):
             if int(state.k) >= count:
                 raise ValueError(f"all {count} designs are chosen: make a state for more (init)")
-            _require_numbers("an outcome", measurement, self._task.definition.outputs)
+            _require_numbers("an outcome", measurement, self.prior.plant.definition.outputs)
         return self._next(state, measurement)
 
     @eqx.filter_jit
@@ -200,11 +214,12 @@ class Myopic(AbstractExcitation):
         self, state: Known, measurement: Float[Array, " output"]
     ) -> tuple[Known, Float[Array, " input"]]:
         learnt = self.learnt(state, measurement)
-        known = jax.tree.map(lambda new, old: jnp.where(state.k > 0, new, old), learnt, state)
+        begun = dataclasses.replace(state, first=measurement)
+        known = jax.tree.map(lambda new, old: jnp.where(state.k > 0, new, old), learnt, begun)
         key, own = jax.random.split(known.key)
-        design = self._best(known, own)
+        design = self._best(known, measurement, own)
         designs = known.designs.at[known.k].set(design)
-        return Known(known.particles, designs, known.outcomes, known.k + 1, key), design
+        return dataclasses.replace(known, designs=designs, k=known.k + 1, key=key), design
 
     def applied(self, state: Known, input: Float[Array, " input"]) -> Known:
         """The state after another design than the proposed one.
@@ -213,15 +228,14 @@ class Myopic(AbstractExcitation):
             ValueError: for a design of another size, that is not a number, or outside the limits.
         """
         if not isinstance(state.k, jax.core.Tracer) and not isinstance(input, jax.core.Tracer):
-            _require_numbers("a design", input, self._task.definition.inputs)
-            lower, upper = (np.asarray(limit) for limit in self._task.input_limits)
+            _require_numbers("a design", input, self.prior.plant.definition.inputs)
+            lower, upper = (np.asarray(limit) for limit in self.prior.plant.input_limits)
             if not np.all((lower <= input) & (input <= upper)):
                 raise ValueError(
                     f"a design lies from {lower.tolist()} to {upper.tolist()}: got "
                     f"{np.asarray(input).tolist()}"
                 )
-        designs = state.designs.at[state.k - 1].set(input)
-        return Known(state.particles, designs, state.outcomes, state.k, state.key)
+        return dataclasses.replace(state, designs=state.designs.at[state.k - 1].set(input))
 
     def posterior(self, state: Known) -> Params:
         """Parameters as probable as the outcomes so far leave them, an array of each."""
@@ -235,33 +249,32 @@ class Myopic(AbstractExcitation):
         key, own = jax.random.split(state.key)
 
         def log_before(z: Array) -> Array:
-            found = jax.vmap(lambda *made: self._log_likelihoods(z, *made))(outcomes, state.designs)
+            made = outcomes, state.before, state.designs
+            found = jax.vmap(partial(self._log_likelihoods, z))(*made)
             told = jnp.sum(jnp.where(is_before[:, None], found, 0.0), axis=0)
             return told - 0.5 * jnp.sum(z**2, axis=1)
 
         def log_now(z: Array) -> Array:
-            return self._log_likelihoods(z, outcome, state.designs[last])
+            return self._log_likelihoods(z, outcome, state.before[last], state.designs[last])
 
         particles = _weighted(state.particles, log_before, log_now, self.num_moves, own)
-        return Known(particles, state.designs, outcomes, state.k, key)
+        return dataclasses.replace(state, particles=particles, outcomes=outcomes, key=key)
 
     def _log_likelihoods(
         self,
         z: Float[Array, "particle param"],
         measured: Float[Array, " output"],
+        before: Float[Array, " output"],
         design: Float[Array, " input"],
     ) -> Float[Array, " particle"]:
         """Of what was measured of a design, by particle."""
-        found = jax.vmap(
-            lambda own: self._task.log_likelihood(measured, design, self.prior.params(own))
-        )(z)
+        of = partial(log_likelihood, self.prior.plant, measured, before, design)
+        found = jax.vmap(lambda own: of(self.prior.params(own)))(z)
         return jnp.where(jnp.isfinite(found), found, _IMPOSSIBLE)
 
-    @property
-    def _task(self) -> AbstractStaticTask:
-        return cast(AbstractStaticTask, self.prior.plant)
-
-    def _best(self, known: Known, key: PRNGKeyArray) -> Float[Array, " input"]:
+    def _best(
+        self, known: Known, measured: Float[Array, " output"], key: PRNGKeyArray
+    ) -> Float[Array, " input"]:
         """The design whose outcome is expected to tell most, of those tried."""
         plant = self.prior.plant
         lower, upper = plant.input_limits
@@ -276,9 +289,10 @@ class Myopic(AbstractExcitation):
             """Expected gain: the mean over outcomes that are simulated from some particles."""
             params = jax.vmap(self.prior.params)(particles)
             some = jax.tree.map(lambda values: values[:count], params)
-            seen = jax.vmap(lambda own, noise: self._task.measured(design, own, noise))(some, noise)
-            likely = jax.vmap(lambda measured: self._log_likelihoods(particles, measured, design))
-            of_all = likely(seen)
+            seen = jax.vmap(partial(next_measurement, plant, measured, design))(some, noise)
+            of_all = jax.vmap(
+                lambda outcome: self._log_likelihoods(particles, outcome, measured, design)
+            )(seen)
             own = of_all[np.arange(count), np.arange(count)]
             found = jnp.mean(own - jax.nn.logsumexp(of_all, axis=1))
             return jnp.where(jnp.isfinite(found), found, -jnp.inf)
@@ -391,9 +405,10 @@ def _require_numbers(what: str, given: ArrayLike, signals: Sequence[Input | Outp
         raise ValueError(f"{what} has one finite number for each of {names}: got {values.tolist()}")
 
 
-def _require_static(plant: AbstractPlant) -> None:
-    if not isinstance(plant, AbstractStaticTask):
+def _require_one_step(plant: AbstractPlant) -> None:
+    if not (isinstance(plant, AbstractStaticTask) or plant.definition.observes_state):
         raise ValueError(
-            f"myopic designs are for tasks without memory (AbstractStaticTask): plant "
-            f"{plant.definition.name!r} has states; `excite next` chooses its next experiment"
+            "myopic designs are for tasks without memory (AbstractStaticTask) and for plants whose "
+            f"state is observed: the outputs of plant {plant.definition.name!r} are not its "
+            "states, or not each state has a noise_sd; `excite next` chooses its next experiment"
         )

@@ -296,8 +296,11 @@ def gain_cell(gain: ExpectedGain | None) -> str:
     if gain is None:
         return "–"
     bounds = [f"{bound.mean:.2f} ± {bound.std_error:.2f}" for bound in (gain.lower, gain.upper)]
-    is_tight = gain.upper.mean - gain.lower.mean < gain.lower.std_error
-    return bounds[0] if is_tight else " to ".join(bounds)
+    return " to ".join(bounds) if _has_two_bounds(gain) else bounds[0]
+
+
+def _has_two_bounds(gain: ExpectedGain) -> bool:
+    return gain.upper.mean - gain.lower.mean >= gain.lower.std_error
 
 
 def violations_cell(row: Row) -> str:
@@ -375,10 +378,11 @@ def footnotes(study: StudyFacts, rows: Sequence[Row]) -> list[str]:
         kind = "near the posterior"
         if gain.from_prior:
             kind = "of the prior: figures of other numbers cannot be compared"
+        has_two = any(_has_two_bounds(gain) for gain in gains.values())
         notes.append(
             "gain is the expected information gain: mean and standard error over "
-            f"{gain.plants:,} plants, its evidence from {gain.samples:,} samples {kind}. "
-            "Two figures are a lower and an upper bound."
+            f"{gain.plants:,} plants, its evidence from {gain.samples:,} samples {kind}."
+            f"{' Two figures are a lower and an upper bound.' * has_two}"
         )
     notes += [f"{method}: {told}." for method, gain in gains.items() for told in gain.warnings]
     if study.uncertainty:

@@ -31,7 +31,6 @@ from ..plant.catalogue import (
     with_sensor,
     word_of,
 )
-from ..plant.static import AbstractStaticTask
 from ..plant.uncertainty import Uncertainty
 from ..training.settings import GradientSettings, PPOSettings
 from ..training.signals import CLAIRVOYANT, CLAIRVOYANT_STARTS
@@ -240,7 +239,7 @@ class Study(Settings):
             if not 2 <= length <= self.num_steps:
                 raise ValueError(f"lengths must lie between 2 and num_steps: got {length}")
         for name, method in self.methods.items():
-            if _is_myopic(method, plant):
+            if _is_myopic(method):
                 made = Myopic.of(plant, self.prior or None, self.spread)
             else:
                 made = excitation_named(method.excitation, method.options, plant)
@@ -264,7 +263,7 @@ class Study(Settings):
         own = {
             name: excitation_and_origin(m.excitation, m.options, plant)[1]
             for name, m in self.methods.items()
-            if not _is_myopic(m, plant)
+            if not _is_myopic(m)
         }
         return {name: origin for name, origin in own.items() if origin}
 
@@ -373,9 +372,9 @@ class Study(Settings):
         return study_from({**self.model_dump(), **settings}, "settings")
 
 
-def _is_myopic(method: MethodSettings, plant: AbstractPlant) -> bool:
+def _is_myopic(method: MethodSettings) -> bool:
     """Whether a method chooses designs for the study's prior; ValueError for options."""
-    if method.excitation != MYOPIC or not isinstance(plant, AbstractStaticTask):
+    if method.excitation != MYOPIC:
         return False
     if method.options:
         raise ValueError(f"excitation {MYOPIC!r} has no option {next(iter(method.options))!r}")
