@@ -7,6 +7,7 @@ import json
 import pickle
 import re
 import struct
+import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -302,6 +303,14 @@ HUGE = 10**400  # JSON has no largest number
 def test_a_contract_that_is_not_sound_is_refused(path, value):
     Policy.from_bytes(file_of())  # what is spoilt here is sound
     refusal(file_of(**{path: value}))
+
+
+def test_a_window_that_no_memory_holds_is_refused_without_taking_it():
+    tracemalloc.start()
+    refusal(file_of(layout__window=10**9))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 1e7
 
 
 @pytest.mark.parametrize("key", ["plant", "layout", "provenance"])

@@ -185,6 +185,11 @@ def test_the_gradient_is_that_of_differences(layout):
     np.testing.assert_allclose(slope, (high - low) / 2e-3, rtol=1e-2)
 
 
+@EACH
+def test_what_stands_beside_a_memory_is_counted(layout):
+    assert layout.size_beside_memory == len(layout.beside_memory)
+
+
 def test_a_sum_does_not_depend_on_the_order_of_the_samples_and_a_unit_does():
     """The action depends on the window, too: here of the newest two samples; of attention, one."""
     orders = [[3, 0, 2, 1, 4, 5], [2, 3, 1, 0, 4, 5]]

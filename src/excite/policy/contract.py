@@ -131,6 +131,12 @@ class Layout:
         outputs = range(first - len(self.output_scale), first)
         return (*outputs, *range(self.progress - len(self.input_half), self.progress))
 
+    @property
+    def size_beside_memory(self) -> int:
+        """Numbers in `beside_memory`."""
+        used = self.progress - len(self.newest) if self.memory_kind == "attention" else 0
+        return self.size - used
+
     @cached_property
     def beside_memory(self) -> np.ndarray:
         """Where an observation has what the layers after a memory see too.
@@ -566,7 +572,7 @@ def _check_certificate(certificate: Any) -> None:
 
 def _check_layers(weights: Weights, layout: Layout) -> None:
     """Raises ValueError where the layers do not fit each other, the layout or the plant."""
-    width, first = layout.memory + len(layout.beside_memory), len(layout.unit)
+    width, first = layout.memory + layout.size_beside_memory, len(layout.unit)
     if layout.memory:
         inner = weights[0][1].size if weights else 0
         matrices = [[inner if n == -1 else n for n in matrix] for matrix in layout.unit]

@@ -447,7 +447,7 @@ def optimiser(settings: GradientSettings) -> optax.GradientTransformation:
 def _first_weights(env: Env, settings: GradientSettings, key: PRNGKeyArray) -> Weights:
     """Glorot's weights (X. Glorot, Y. Bengio, 2010), those of the last layer made small."""
     layout, memory = env.layout, env.layout.memory
-    widths = [memory + len(layout.beside_memory), *settings.hidden, len(layout.input_half)]
+    widths = [memory + layout.size_beside_memory, *settings.hidden, len(layout.input_half)]
     gains = [1.0] * len(settings.hidden) + [settings.last_gain]
     keys = jax.random.split(key, len(gains))
     layers = tuple(
