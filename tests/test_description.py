@@ -20,6 +20,7 @@ from excite.description import (
     State,
     names_of,
     told,
+    with_unit,
 )
 
 PARTS = ("states", "inputs", "outputs", "parameters", "constants")
@@ -39,6 +40,14 @@ def simple(**changes) -> PlantDescription:
         "substeps": 3,
     }
     return PlantDescription(**{**fields, **changes})
+
+
+def test_what_has_no_unit_is_shown_without_brackets():
+    assert (with_unit("pitch", "deg"), with_unit("answer", "")) == ("pitch [deg]", "answer")
+    shown = repr(
+        simple(inputs=(Input("price", "", 0.0, 2.0),), outputs=(Output("answer", "", scale=1.0),))
+    )
+    assert shown.splitlines()[1:3] == ["  input price: 0 to 2", "  output answer"]
 
 
 def test_hash_is_the_sha256_of_the_canonical_json():

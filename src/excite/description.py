@@ -362,12 +362,14 @@ class PlantDescription:
 
     def __repr__(self) -> str:
         lines = [f"plant {self.name}, sampled every {self.dt:g} s"]
-        lines += [f"  input {i.name}: {i.lower:g} to {i.upper:g} {i.unit}" for i in self.inputs]
+        lines += [
+            f"  input {i.name}: {i.lower:g} to {i.upper:g} {i.unit}".rstrip() for i in self.inputs
+        ]
         for o in self.outputs:
             unit, factor = display_unit(o.unit)
             level = o.critical_level
             words = "" if level is None else f", critical level {factor * level:g} {unit}"
-            lines.append(f"  output {o.name} [{o.unit}]{words}")
+            lines.append(f"  output {with_unit(o.name, o.unit)}{words}")
         named = [f"{p.name} = {p.nominal:g} {p.unit}".rstrip() for p in self.parameters[:12]]
         rest = f", and {len(self.parameters) - 12} more" if len(self.parameters) > 12 else ""
         return "\n".join([*lines, f"  parameters {', '.join(named)}{rest}"])
@@ -474,6 +476,11 @@ def display_unit(unit: str) -> tuple[str, float]:
     if unit in ("rad", "rad/s"):
         return unit.replace("rad", "deg"), 180 / math.pi
     return unit, 1.0
+
+
+def with_unit(name: str, unit: str) -> str:
+    """A name and, in brackets, its unit, if it has one."""
+    return f"{name} [{unit}]" if unit else name
 
 
 def unknown(kind: str, word: str, allowed: Iterable[str]) -> ValueError:

@@ -17,7 +17,7 @@ import matplotlib.axes
 import matplotlib.figure
 import numpy as np
 
-from ..description import Input, Output, PlantDescription, display_unit
+from ..description import Input, Output, PlantDescription, display_unit, with_unit
 from ..files import require_folder, write_bytes
 
 Axes = np.ndarray
@@ -120,7 +120,7 @@ def add_legend(figure: matplotlib.figure.Figure, *axes: matplotlib.axes.Axes) ->
 
 def axis_label(part: Input | Output) -> str:
     """Name and display unit."""
-    return f"{part.name} [{display_unit(part.unit)[0]}]"
+    return with_unit(part.name, display_unit(part.unit)[0])
 
 
 @contextlib.contextmanager

@@ -12,7 +12,7 @@ import matplotlib.figure
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..description import HALF_95, PlantDescription, display_unit
+from ..description import HALF_95, PlantDescription, display_unit, with_unit
 from ..record import Record
 from ..record.figure import (
     BLUE,
@@ -58,7 +58,7 @@ def identification_figure(
         fit = number(result.model_fit_percent[part.name], 4)
         top.set(ylabel=axis_label(part), title=f"{part.name}: fit {fit} %")
         below.plot(time, factor * residual, color=ORANGE, lw=0.8)
-        below.set(ylabel=f"residual [{display_unit(part.unit)[0]}]")
+        below.set(ylabel=with_unit("residual", display_unit(part.unit)[0]))
     axes[-2, 0].set(xlabel="time [s]")
     _draw_intervals(axes[-1, 0], result.params)
     add_legend(figure, axes[0, 0])
@@ -171,7 +171,7 @@ def candidates_figure(
         for row, part in enumerate(description.inputs):
             axis = axes[row, column]
             axis.step(time[: len(own)], own[:, row], where="post", color=colour_of(0), lw=1.0)
-            axis.set(ylabel=f"{part.name} [{part.unit}]" if column == 0 else "")
+            axis.set(ylabel="" if column else with_unit(part.name, part.unit))
         axes[0, column].set(title=name)
         axis = axes[-1, column]
         for i, (parameter, share) in enumerate(known.items()):
@@ -201,7 +201,7 @@ def rivals_figure(
     names = (*description.inputs, *description.outputs)
     figure, axes = new_figure(len(names))
     for row, part in enumerate(names):
-        axes[row, 0].set(ylabel=f"{part.name} [{part.unit}]")
+        axes[row, 0].set(ylabel=with_unit(part.name, part.unit))
     for i in range(len(description.inputs)):
         own = np.append(inputs[:, i], inputs[-1, i])
         axes[i, 0].step(time, own, where="post", color="black", lw=1.0)
@@ -326,7 +326,7 @@ def _draw_profile(axis: matplotlib.axes.Axes, result: EstimateSummary, name: str
     for end in result.params[name].ci95:
         if math.isfinite(end):
             axis.axvline(end, color=GREY, lw=0.8)
-    axis.set(title=f"profile of {name}", xlabel=f"{name} [{result.params[name].unit}]")
+    axis.set(title=f"profile of {name}", xlabel=with_unit(name, result.params[name].unit))
     axis.set(ylabel="growth of squares / limit", ylim=(-0.1, None))
     axis.locator_params(axis="x", nbins=4)
 

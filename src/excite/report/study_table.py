@@ -262,7 +262,7 @@ def _header(rows: Sequence[Row]) -> list[str]:
     header = ["method", "estimator"]
     for name in rows[0].parameters:
         header += [f"{name} error %", "bound %"]
-    header += [f"max {largest.output} {largest.unit}", "violations (95 %)", "failed"]
+    header += [f"max {largest.output} {largest.unit}".rstrip(), "violations (95 %)", "failed"]
     header += [*_rig_cells(rows[0].on_rig, rows[0].evaluations), "log det"]
     header += ["gain nats"] * has_gain(rows)
     header += ["D-efficiency"] * any(row.d_efficiency is not None for row in rows)
