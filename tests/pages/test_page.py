@@ -97,7 +97,7 @@ def test_a_run_from_choosing_to_the_report(address: str, page: Page, tmp_path: P
     assert "±" in page.locator("#estimates figure").first.inner_text()
     assert "largest" in page.locator("#signals figure").nth(1).inner_text()
     for name in ("report.html", "record.csv", "estimate.json"):
-        with page.expect_download() as waiting:
+        with page.expect_download(timeout=WAIT) as waiting:
             page.locator(f"#outcome a[href$='{name}']").click()
         waiting.value.save_as(tmp_path / name)
     report = (tmp_path / "report.html").read_text()
@@ -148,7 +148,7 @@ def test_a_plant_of_ones_own_is_played_with_a_policy_of_which_is_told_what_was_s
         page.get_by_label(label, exact=True).select_option("aero2")  # nothing to compare with
     page.get_by_role("button", name="Run", exact=True).click()
     expect(status(page)).to_have_text("Done.", timeout=WAIT)
-    with page.expect_download() as waiting:
+    with page.expect_download(timeout=WAIT) as waiting:
         page.locator("#outcome a[href$='record.csv']").click()
     waiting.value.save_as(tmp_path / "record.csv")
     expected = ex.simulate(with_nominal(Aero2(), {"J_p": 0.017}), "aero2", seed=0)
@@ -307,7 +307,7 @@ def test_a_file_is_dropped_mapped_and_identified(address: str, page: Page, tmp_p
     page.get_by_label("Played in").select_option("0")
     page.get_by_role("button", name="Run", exact=True).click()
     expect(page.locator("#outcome a[href$='record.csv']")).to_be_visible(timeout=WAIT)
-    with page.expect_download() as waiting:
+    with page.expect_download(timeout=WAIT) as waiting:
         page.locator("#outcome a[href$='record.csv']").click()
     record = tmp_path / "log.csv"
     waiting.value.save_as(record)
@@ -321,7 +321,7 @@ def test_a_file_is_dropped_mapped_and_identified(address: str, page: Page, tmp_p
     expect(status(page, "record")).to_have_text("Done: successful.", timeout=WAIT)
     assert page.locator("#identified tbody tr").count() == 3
     assert page.locator("#record img").count() == 0
-    with page.expect_download() as waiting:
+    with page.expect_download(timeout=WAIT) as waiting:
         page.locator("#record a[href$='report.html']").click()
     assert waiting.value.suggested_filename == "report.html"
     require_no_sideways_scroll(page)
@@ -540,7 +540,7 @@ def test_a_line_is_hidden_and_a_plot_is_saved(address: str, page: Page, tmp_path
     expect(toggle).to_be_focused()
     made = {}
     for kind in ("PNG", "SVG", "CSV"):
-        with page.expect_download() as waiting:
+        with page.expect_download(timeout=WAIT) as waiting:
             figure.get_by_role("button", name=kind).click()
         assert waiting.value.suggested_filename == f"pitch_deg.{kind.lower()}"
         waiting.value.save_as(tmp_path / kind)
@@ -579,7 +579,7 @@ def test_a_plot_is_saved_as_it_is_shown(address: str, page: Page, tmp_path: Path
     poll(page, PLOT.format("#place .chart", 0) + ".u?.scales.x.max === 4.25")
     made = {}
     for kind in ("SVG", "CSV"):
-        with page.expect_download() as waiting:
+        with page.expect_download(timeout=WAIT) as waiting:
             page.locator("#place").get_by_role("button", name=kind).click()
         waiting.value.save_as(tmp_path / kind)
         made[kind] = (tmp_path / kind).read_text()
@@ -611,7 +611,7 @@ def test_labels_of_an_axis_differ_and_the_last_one_is_not_cut(
       plot.show({ x: [x[0], x[4]], y: [x[0], x[4]], unit: "s", lines });
     }""")
     poll(page, PLOT.format("#place .chart", 0) + ".u?.scales.x.max === 1732718860")
-    with page.expect_download() as waiting:
+    with page.expect_download(timeout=WAIT) as waiting:
         page.locator("#place").get_by_role("button", name="SVG").click()
     waiting.value.save_as(tmp_path / "SVG")
     drawing = ElementTree.fromstring((tmp_path / "SVG").read_text())
@@ -645,7 +645,7 @@ def test_very_many_samples_are_saved_in_a_small_drawing(address: str, page: Page
       return [0, 31415, 62831, 99999].map((k) => [k / 99999, (y[k] + 2) / 4]);
     }""")
     poll(page, PLOT.format("#place .chart", 0) + ".u")
-    with page.expect_download() as waiting:
+    with page.expect_download(timeout=WAIT) as waiting:
         page.locator("#place").get_by_role("button", name="SVG").click()
     waiting.value.save_as(tmp_path / "many.svg")
     text = (tmp_path / "many.svg").read_text()
@@ -889,7 +889,7 @@ def test_an_experiment_comes_back_when_the_page_is_loaded_again(address: str, pa
     page.reload()
     expect(status(page)).to_have_text("Done.", timeout=WAIT)
     assert seen(page, "experiment") == before
-    with page.expect_download() as waiting:
+    with page.expect_download(timeout=WAIT) as waiting:
         page.locator("#outcome a[href$='record.csv']").click()
     assert len(waiting.value.path().read_text().splitlines()) == 502
     # The tabs beside it were open before: each has its own form, and no result.
@@ -1220,7 +1220,7 @@ def test_a_download_that_is_refused_says_why(address: str, page: Page):
     page.locator("#run-view .downloads a").first.click()
     expect(status(page, "runs")).to_have_text("4 jobs already running")
     expect(status(page, "runs")).to_have_class(re.compile("bad"))
-    with page.expect_download() as waiting:
+    with page.expect_download(timeout=WAIT) as waiting:
         page.locator("#run-view a[href$='table.md']").click()
     assert waiting.value.suggested_filename == "table.md"
 
