@@ -218,6 +218,10 @@ MISTAKES = {
     "changed(band=jnp.ones(3))": "band must be two frequencies in Hz",
     "ex.simulate('aero2', np.full((9, 1), np.nan))": "inputs must be finite: got [nan] at sample 0",
     "ex.simulate('aero2', np.ones(9))": "inputs need a row for each sample: got shape (9,)",
+    "ex.simulate('aero2', np.ones((0, 1)))": "a row for each sample: got shape (0, 1)",
+    "ex.simulate('aero2', np.full((9, 1), 30.0))": (
+        "inputs: 'voltage' runs from 30 to 30 V; the plant's limits are -24 to 24 V"
+    ),
     "ex.identify(record, 'cart_pole')": "has 1 inputs and 1 outputs; plant 'cart_pole'",
     "ex.identify(record, estimator='nsl')": "did you mean 'nls'",
     "ex.identify(record, estimator=3)": "estimator must be a name, an estimator or its class",

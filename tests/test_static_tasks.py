@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 from pathlib import Path
 
 import jax
@@ -72,6 +73,17 @@ def test_a_trained_policy_is_compared_with_random_designs(tmp_path):
         "random",
         "gradient(D)",
     }
+
+
+def test_a_design_outside_its_limits_is_refused_not_moved(tmp_path):
+    file = tmp_path / "designs.csv"
+    file.write_text("time,place\n0,0.5\n1,-1.5\n2,0.5\n")
+    for designs, what in ((np.array([[0.5], [-1.5], [0.5]]), "inputs"), (file, str(file))):
+        said = f"{what}: 'place' runs from -1.5 to 0.5 m; the plant's limits are -1 to 1 m"
+        with pytest.raises(ValueError, match=re.escape(said)):
+            ex.simulate(Slope, designs)
+        with pytest.raises(ValueError, match=re.escape(said)):
+            ex.information_gain(Slope, designs, steps=3, prior={"slope": "normal:0:1"})
 
 
 def test_what_the_likelihood_expects_is_the_response():

@@ -17,7 +17,7 @@ from ..plant import AbstractPlant, floats
 from ..plant.fields import with_options
 from ..plant.static import AbstractStaticTask
 from ..policy import POLICY_ENDING, Policy, mismatch, policy_path, read_policy, shipped_policies
-from ..record import Record, read_signal, require_playable
+from ..record import Record, read_signal, require_playable, require_within_limits
 from ..record.read import SIGNAL_ENDINGS
 from .contract import AbstractExcitation, AbstractShape
 from .feedback import PolicyExcitation, PositionLoop
@@ -152,7 +152,7 @@ def _object(
         return with_options(given, name, options) if options else given
     inputs = given.inputs if isinstance(given, HasInputs) else given
     is_array = isinstance(inputs, np.ndarray | Array) and inputs.dtype.kind in "fiu"
-    if is_array and inputs.ndim != 2:
+    if is_array and (inputs.ndim != 2 or not len(inputs)):
         raise ValueError(f"inputs need a row for each sample: got shape {inputs.shape}")
     if not is_array:
         raise wrong_type(
@@ -168,6 +168,7 @@ def _object(
     rows = np.asarray(inputs, float)
     if (bad := np.flatnonzero(~np.isfinite(rows).all(axis=1))).size:
         raise ValueError(f"inputs must be finite: got {rows[bad[0]].tolist()} at sample {bad[0]}")
+    require_within_limits(rows, plant.description, "inputs")
     return Replay(floats(rows))
 
 

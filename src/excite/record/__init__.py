@@ -10,6 +10,7 @@ from .prepare import is_even as is_even
 from .prepare import require_columns as require_columns
 from .prepare import require_even as require_even
 from .prepare import require_playable as require_playable
+from .prepare import require_within_limits as require_within_limits
 from .prepare import unbroken as unbroken
 from .read import SIGNAL_ENDINGS as SIGNAL_ENDINGS
 from .read import read_record as read_record

@@ -6,6 +6,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from ..description import Input, Output, PlantDescription, names_of
 from .record import Record
@@ -39,14 +40,27 @@ def require_columns(
 
 
 def require_playable(record: Record, description: PlantDescription) -> None:
-    """Raises ValueError for another plant's inputs, or beyond limits: they would be clipped."""
+    """Raises ValueError for another plant's inputs, and for inputs beyond its limits."""
     require_columns(record, description, inputs_only=True)
     require_even(record, "an input to play needs one sampling time")
-    for part, values in zip(description.inputs, record.inputs.T, strict=True):
-        if values.min() < part.lower - 1e-9 or values.max() > part.upper + 1e-9:
+    require_within_limits(record.inputs, description, str(record.source or "the record"))
+
+
+def require_within_limits(
+    inputs: Float[np.ndarray, "time input"], description: PlantDescription, what: str
+) -> None:
+    """Raises ValueError for inputs to play that would be clipped.
+
+    Another number of inputs is refused where they are played.
+    """
+    for part, values in zip(description.inputs, inputs.T, strict=False):
+        rounding = 1e-6 * (part.upper - part.lower)
+        low, high = values.min(), values.max()
+        if low < part.lower - rounding or high > part.upper + rounding:
+            unit = f" {part.unit}" if part.unit else ""
             raise ValueError(
-                f"{record.source}: {part.name!r} runs from {values.min():g} to {values.max():g} "
-                f"{part.unit}; the plant's limits are {part.lower:g} to {part.upper:g} {part.unit}"
+                f"{what}: {part.name!r} runs from {low:g} to {high:g}{unit}; the plant's limits "
+                f"are {part.lower:g} to {part.upper:g}{unit}"
             )
 
 
