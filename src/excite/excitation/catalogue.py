@@ -151,16 +151,15 @@ def _object(
     if isinstance(given, AbstractExcitation):
         return with_options(given, name, options) if options else given
     inputs = given.inputs if isinstance(given, HasInputs) else given
-    is_array = isinstance(inputs, np.ndarray | Array) and inputs.dtype.kind in "fiu"
-    if is_array and (inputs.ndim != 2 or not len(inputs)):
-        raise ValueError(f"inputs need a row for each sample: got shape {inputs.shape}")
-    if not is_array:
+    if not (isinstance(inputs, np.ndarray | Array) and inputs.dtype.kind in "fiu"):
         raise wrong_type(
             "excitation",
             given,
             "a name, an excitation or its class, a policy, a record, or an array of inputs by "
             "sample and input",
         )
+    if inputs.ndim != 2 or not len(inputs):
+        raise ValueError(f"inputs need a row for each sample: got shape {inputs.shape}")
     if options:
         raise ValueError(f"recorded inputs have no options: got {', '.join(options)}")
     if isinstance(given, Record):
