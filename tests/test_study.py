@@ -372,7 +372,15 @@ BAD_STUDIES: dict[str, tuple[str, tuple[str, ...]]] = {
     ),
     "widths as one number": (
         MINIMAL + "[agents.a]\n[training]\nhidden = 5\n",
-        ("training: hidden must be a list, got 5",),
+        ("training: hidden must be a list such as [5], got 5",),
+    ),
+    "no term of a reward": (
+        MINIMAL + "[agents.a]\n[decision]\nterms = []\n",
+        ("decision: terms needs at least 1 in its list, got []",),
+    ),
+    "a term of a reward twice": (
+        MINIMAL + '[agents.a]\n[decision]\nterms = [{ reward = "log" }, { reward = "log" }]\n',
+        ("decision: terms must differ: got 'log' twice",),
     ),
     "truth as a word": (
         MINIMAL + '[agents.a]\n[decision]\nnormalise_penalty = "yes"\n',

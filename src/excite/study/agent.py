@@ -428,10 +428,13 @@ def _ends(
 
 
 def _require_one_reward(process: DecisionSettings) -> None:
-    """Raises ValueError for a reward together with terms, each of which has its reward."""
+    """Raises ValueError for a reward beside terms, which have their own, and for a term twice."""
     beside = sorted(set(RewardSettings.model_fields) & process.model_fields_set)
     if process.terms and beside:
         raise ValueError(f"decision: with terms, set {beside[0]!r} in one of them")
+    for i, term in enumerate(process.terms):
+        if term in process.terms[:i]:
+            raise ValueError(f"decision: terms must differ: got {term.reward!r} twice, the same")
 
 
 _USED = {

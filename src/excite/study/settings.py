@@ -133,8 +133,12 @@ def sentence(
     got = json.dumps(first["input"], default=str)
     if isinstance(first["input"], float) and not math.isfinite(first["input"]):
         got = str(first["input"])
+    if first["type"] == "too_short" and "ctx" in first:
+        return f"{location} needs at least {first['ctx']['min_length']} in its list, got {got}"
     msg, _, rest = first["msg"].partition("Input should be ")
     kind = re.match(r"([a-z]+)_(type|parsing|from|attributes)", first["type"])
     allowed = _ALLOWED.get(kind[1], rest) if kind else rest
+    if allowed == "a list" and not isinstance(first["input"], dict | list):
+        allowed = f"a list such as [{got}]"
     what = f" must be {allowed}" if allowed else f": {msg}"
     return f"{location}{what}, got {got}"
