@@ -9,6 +9,7 @@ import pytest
 import scipy.integrate
 
 import excite as ex
+from excite.environment import Env
 from excite.plant import Aero2, DCMotor
 from excite.plant.catalogue import plant_from
 from excite.plant.extension import extended, extensions_of
@@ -96,8 +97,9 @@ def test_an_input_that_would_act_before_it_is_chosen_is_refused():
         lambda out: ex.design("aero2+delay", steps=10, out=out),
         lambda out: ex.train("aero2+delay", out=out),
         lambda out: ex.run(plant="aero2+delay", out=out),
+        lambda out: Env.of(plant_from("aero2+delay")),
     ],
-    ids=["design", "train", "run"],
+    ids=["design", "train", "run", "process"],
 )
 def test_designs_policies_and_rigs_refuse_a_delay(use, tmp_path):
     with pytest.raises(ValueError, match=r"plant 'aero2\+delay_voltage' delays its inputs"):

@@ -1,6 +1,7 @@
 """Designs that are chosen one after the other: what is known, and where the next one lies."""
 
 import dataclasses
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -179,12 +180,30 @@ def test_a_pool_that_is_none_is_refused(pool, sentence):
         Myopic.of(Line, PRIOR, pool=pool)
 
 
+def test_what_is_no_outcome_or_comes_before_a_design_is_refused():
+    chosen = Myopic.of(Line, PRIOR)
+    nothing = chosen.init(Line(), 3, jax.random.key(0))
+    for too_early in (chosen.learnt, chosen.applied):
+        with pytest.raises(ValueError, match="no design is chosen yet"):
+            too_early(nothing, jnp.array([0.4]))
+    state, _ = chosen(nothing, jnp.zeros(1))
+    for outcome in (jnp.array([jnp.nan]), jnp.ones(2)):
+        with pytest.raises(ValueError, match="an outcome has one finite number for each of"):
+            chosen.learnt(state, outcome)
+
+
 def test_a_plant_whose_state_is_not_observed_is_refused():
     with pytest.raises(ValueError, match=r"tasks without memory.*plant 'aero2' are not its states"):
         Myopic.of("aero2")
     with pytest.raises(ValueError, match="tasks without memory"):
         ex.information_gain("aero2", "myopic")
     assert excite("gain", "aero2", "--excitation", "myopic").returncode == 2
+
+
+def test_a_plant_that_delays_its_inputs_is_refused():
+    late = Path(__file__).parent.parent / "examples" / "smc_pendulums.py"
+    with pytest.raises(ValueError, match="delays its inputs"):
+        Myopic.of(f"{late}:LinearPendulum+delay")
 
 
 def test_another_task_is_refused():

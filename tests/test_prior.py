@@ -17,8 +17,9 @@ from excite.description import Input, Output, Parameter, PlantDescription, State
 from excite.estimation import NLS, Prior, stack_experiments
 from excite.estimation.diagnosis import half_95
 from excite.estimation.identify import identify
+from excite.estimation.prior_knowledge import plants_of
 from excite.files import json_ready
-from excite.plant import AbstractPlant
+from excite.plant import AbstractPlant, Aero2
 from excite.record import Record, write_record
 
 SD = 0.1
@@ -102,6 +103,19 @@ def test_the_estimate_of_other_records_is_a_prior_for_these(tmp_path):
 
 
 @pytest.mark.slow
+def test_parameters_change_by_their_standard_deviations_and_known_ones_do_not():
+    plant, nominal = Aero2(), {n: float(v) for n, v in Aero2().nominal._asdict().items()}
+    prior = plants_of(plant, {"J_p": "lognormal:0.02:10%", "D_p": "uniform:0.001:0.004"})
+    changes = np.asarray(prior.changes(plant.nominal))
+    at = {name: i for i, name in enumerate(plant.nominal._fields)}
+    expected = np.zeros((3, 3))
+    log_sd = np.sqrt(np.log1p(0.1**2))
+    expected[at["J_p"], at["J_p"]] = changes[at["J_p"], at["J_p"]]
+    assert changes[at["J_p"], at["J_p"]] == pytest.approx(log_sd * nominal["J_p"], rel=0.01)
+    expected[at["D_p"], at["D_p"]] = 0.003 / np.sqrt(12)
+    np.testing.assert_allclose(changes, expected, rtol=1e-9)
+
+
 def test_a_prior_holds_what_the_data_do_not_tell_and_says_so():
     still = dataclasses.replace(noisy(), inputs=0 * INPUT)
     without = identify(still, Ramp)

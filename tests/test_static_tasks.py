@@ -86,6 +86,39 @@ def test_a_design_outside_its_limits_is_refused_not_moved(tmp_path):
             ex.information_gain(Slope, designs, steps=3, prior={"slope": "normal:0:1"})
 
 
+class Root(AbstractStaticTask):
+    """Without an outcome where the parameter is above two, which the bounded one may not be."""
+
+    definition = static_description(
+        "root",
+        designs=(ex.Input("place", "m", -1.0, 1.0),),
+        outcomes=(ex.Output("height", "m", scale=1.0, noise_sd=SD),),
+        parameters=(ex.Parameter("at", "", 0.0, scale=1.0, positive=False),),
+    )
+
+    def outcome(self, design, params):
+        return design * jnp.sqrt(2 - params.at)
+
+
+def test_a_prior_where_the_task_is_not_defined_is_refused():
+    def gain(prior):
+        return ex.information_gain(Root, steps=3, prior={"at": prior}, plants=64, samples=20)
+
+    assert gain("uniform:-1:1.9").lower.value > 0
+    with pytest.raises(ValueError, match=r"\d of 64 experiments have outputs .* not finite"):
+        gain("normal:1:1")
+
+
+def test_a_prior_beyond_a_bound_is_refused():
+    bounded = dataclasses.replace(
+        Slope.definition, parameters=(ex.Parameter("slope", "", 0.5, scale=1.0, upper=1.0),)
+    )
+    task = type("Bounded", (Slope,), {"definition": bounded})
+    for prior in ("lognormal:0.5:50%", "normal:0.9:0.05", "uniform:0.5:2"):
+        with pytest.raises(ValueError, match=r"prior of 'slope' .* (above|and) 1"):
+            ex.information_gain(task, steps=3, prior={"slope": prior}, plants=8, samples=20)
+
+
 def test_what_the_likelihood_expects_is_the_response():
     sources = plant_named(f"{EXAMPLE}:TwoSources")
     designs = jnp.asarray(np.random.default_rng(1).uniform(-4, 4, (30, 2)))

@@ -222,7 +222,7 @@ def test_train_and_evaluate_take_a_prior(tmp_path):
         ({"clairvoyant": {}, "agents": {}}, "clairvoyant is for plants of the spread"),
         ({"prior": {"J_q": "normal:1:1"}}, "did you mean 'J_p'"),
         ({"prior": {"J_p": "uniform:-1:0.03"}}, "'J_p' is -1 to 0.03, and it must lie between 0"),
-        ({"prior": {"J_p": "normal:0.02:30%"}}, "'J_p' reaches below zero"),
+        ({"prior": {"J_p": "normal:0.02:30%"}}, "'J_p' reaches below 0"),
         ({"prior": {"J_p": "normal:0.02:-1"}}, "needs finite numbers, SD and"),
         ({"prior": {"J_p": "normal:0.02"}}, "prior of 'J_p' must be normal:MEAN:SD"),
         ({"prior": {}, "uncertainty": {"d_S": "10%"}}, "leave it or uncertainty out"),

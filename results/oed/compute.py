@@ -65,7 +65,8 @@ class Task:
         plant: its file and class.
         prior: of its parameters.
         trainings: settings by the price of squared input changes, in the order in which they are
-            made: each begins with the policy of the one before. The last price is the authors'.
+            made: each begins with the policy of the one before. The last price of a pendulum is the
+            authors'.
         archive: of their policy.
         steps: of an experiment.
         memory: of the policies.
@@ -312,7 +313,7 @@ def rows_of(task):
 
 
 def lines(task):
-    """The lines of a task in docs/explanation/expected-information.md; ranges are over seeds."""
+    """The lines of a task, as the page has them for the pendulums; ranges are over seeds."""
     rows, told = rows_of(task), []
     for method in dict.fromkeys((r["method"], r.get("price")) for r in rows):
         own = [r for r in rows if (r["method"], r.get("price")) == method]

@@ -591,7 +591,7 @@ LARGEST_FACTOR = 1000.0
 
 def prior_sd_of(spread: SpreadLike) -> float:
     """Standard deviation of a relative parameter, uniform within the spread."""
-    # Without a spread, the prior standard deviation is one percent.
+    # Without a spread, it is as if it were one percent.
     return max(Spread.of(spread).relative, 0.01) / 3**0.5
 
 

@@ -71,13 +71,17 @@ def gain(
     observed, the excitation "myopic" makes each input that whose outcome is expected to tell most.
     """
     from ..estimation.information_gain import information_gain
+    from ..simulation import DivergedError
 
     given = given_experiment(plant, input_file, options)
     if given.pop("params"):
         raise ValueError("the parameters are drawn from the prior: leave --params out")
     own = {name: options[name] for name in ("spread", "plants", "samples", "from_prior")}
     with progress_bar("information gain") as progress:
-        found = information_gain(**given, prior=given_priors(prior), progress=progress, **own)
+        try:
+            found = information_gain(**given, prior=given_priors(prior), progress=progress, **own)
+        except DivergedError as error:  # its prior, or its plant, is not one
+            raise ValueError(str(error)) from None
     show_warnings(found.warnings)
     if as_json:
         show_json(found.to_dict())

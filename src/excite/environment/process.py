@@ -22,6 +22,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
 from ..description import Spread, SpreadLike, prior_sd_of
 from ..estimation.prior import PriorPlants
 from ..plant import AbstractARXPlant, AbstractPlant, Params, draw_params
+from ..plant.catalogue import require_inputs
 from ..plant.fields import floats
 from ..plant.uncertainty import Uncertainty
 from ..policy import (
@@ -118,7 +119,8 @@ class Env(eqx.Module):
     prior: PriorPlants | None = None
 
     def __check_init__(self) -> None:
-        """Raises ValueError for an objective of experiments of another length."""
+        """Raises ValueError for inputs that act late, and an objective of another length."""
+        require_inputs(self.plant)
         self.objective.require_steps(self.layout.num_steps)
 
     @classmethod

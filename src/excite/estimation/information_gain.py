@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, PRNGKeyArray
 
-from ..description import LARGEST_SEED, SpreadLike, require_whole
+from ..description import LARGEST_SEED, SpreadLike, require_whole, wrong_type
 from ..excitation import AbstractExcitation
 from ..excitation.catalogue import ExcitationLike
 from ..information import require_bound
@@ -37,7 +37,7 @@ from ..plant.static import AbstractStaticTask, has_own_noise
 from ..progress import SHOWN, Progress
 from ..report.tables import html_table, text_table
 from ..safety import safe_input
-from ..simulation import Experiment, Trajectory, predicted, run_episode
+from ..simulation import DivergedError, Experiment, Trajectory, predicted, run_episode
 from .evidence import Fit, nearest
 from .myopic import MYOPIC, Myopic, posterior_particles
 from .prior import PriorPlants
@@ -371,7 +371,8 @@ def information_gain(
         spread: of parameters without such a distribution: uniform, in the logarithm for a factor
             (`factor:3`).
         plants: that are drawn, each with a record.
-        samples: of the evidence of each record.
+        samples: of the evidence of each record; many are rounded up to whole blocks of 1,000, on
+            an accelerator 20,000.
         from_prior: draws these samples from the prior: the usual figure of benchmarks, which
             can only be compared for the same number of samples.
         seed: of plants, noise and samples, which are other ones on an accelerator.
@@ -382,12 +383,14 @@ def information_gain(
 
     Raises:
         ValueError: as `simulate`, for a sensor without noise, for process noise of a state that is
-            not observed.
+            not observed, where a plant of the prior has outputs that are not finite.
         TypeError: for an argument of another type.
     """
     require_whole("plants", plants, 2, 1_000_000)
     require_whole("samples", samples, 1, 100_000_000)
     require_whole("seed", seed, 0, LARGEST_SEED)
+    if not isinstance(from_prior, bool):
+        raise wrong_type("from_prior", from_prior, "True or False")
     if isinstance(excitation, str) and excitation == MYOPIC:
         excitation = Myopic.of(with_sensor(plant_from(plant), noise, resolution), prior, spread)
     e = Experiment.of(
@@ -410,8 +413,21 @@ def information_gain(
     lower, upper, laplace, changes = (
         Mean.of(v, found.controls) for v in (found.lower, found.upper, found.laplace, found.changes)
     )
+    is_finite = np.isfinite(found.lower) & np.isfinite(found.laplace)
+    if not is_finite.all():
+        raise DivergedError(
+            f"{np.sum(~is_finite)} of {plants} experiments have outputs or likelihoods that are "
+            "not finite, with their own plants or with others of the prior: take a narrower prior, "
+            "or a plant that is defined everywhere in it"
+        )
     few = int(np.sum(~(found.effective >= _FEW)))  # NaN, too
     warnings = list(e.warnings)
+    coarse = np.asarray(e.plant.sensor.resolution) > 2 * np.asarray(e.plant.sensor.noise_sd)
+    if not has_own_noise(e.plant) and coarse.any():
+        warnings.append(
+            "an encoder's step is more than twice the noise: rounding counts as normal noise, so "
+            "that neither bound holds strictly"
+        )
     if from_prior and lower.value > math.log(number + 1) - _NEAR_CAP:
         warnings.append(
             f"the lower bound is near its largest value, log({number} + 1) = "

@@ -29,7 +29,7 @@ from ..description import Input, Output, SpreadLike, names_of, require_whole
 from ..excitation import AbstractExcitation
 from ..information import require_bound
 from ..plant import AbstractPlant, Params, floats
-from ..plant.catalogue import PlantLike, plant_from
+from ..plant.catalogue import PlantLike, plant_from, require_inputs
 from ..plant.static import AbstractStaticTask, has_own_noise
 from ..simulation import log_likelihood, next_measurement
 from .prior import PriorPlants
@@ -225,9 +225,11 @@ class Myopic(AbstractExcitation):
         """The state after another design than the proposed one.
 
         Raises:
-            ValueError: for a design of another size, that is not a number, or outside the limits.
+            ValueError: for a design of another size, that is not a number, or outside the limits,
+                and before the first design is chosen.
         """
         if not isinstance(state.k, jax.core.Tracer) and not isinstance(input, jax.core.Tracer):
+            _require_begun(state)
             _require_numbers("a design", input, self.prior.plant.definition.inputs)
             lower, upper = (np.asarray(limit) for limit in self.prior.plant.input_limits)
             if not np.all((lower <= input) & (input <= upper)):
@@ -242,7 +244,17 @@ class Myopic(AbstractExcitation):
         return jax.vmap(self.prior.params)(state.particles)
 
     def learnt(self, state: Known, outcome: Float[Array, " output"]) -> Known:
-        """What is known after the outcome of the last design."""
+        """What is known after the outcome of the last design.
+
+        It is for the very last one: a call for the next design learns from its outcome itself.
+
+        Raises:
+            ValueError: for an outcome of another size or that is not a number, and before the
+                first design is chosen.
+        """
+        if not isinstance(state.k, jax.core.Tracer) and not isinstance(outcome, jax.core.Tracer):
+            _require_begun(state)
+            _require_numbers("an outcome", outcome, self.prior.plant.definition.outputs)
         last = state.k - 1
         outcomes = state.outcomes.at[last].set(outcome)
         is_before = jnp.arange(len(outcomes)) < last
@@ -400,12 +412,20 @@ def _moved(
 def _require_numbers(what: str, given: ArrayLike, signals: Sequence[Input | Output]) -> None:
     """Raises ValueError for something else than one finite number for each signal."""
     values = np.asarray(given)
-    if values.shape != (len(signals),) or not np.isfinite(values).all():
+    is_number = values.dtype.kind in "fiu"
+    if not is_number or values.shape != (len(signals),) or not np.isfinite(values).all():
         names = ", ".join(names_of(signals))
         raise ValueError(f"{what} has one finite number for each of {names}: got {values.tolist()}")
 
 
+def _require_begun(state: Known) -> None:
+    """Raises ValueError where no design is chosen yet."""
+    if int(state.k) == 0:
+        raise ValueError("no design is chosen yet: call with the state and a first measurement")
+
+
 def _require_one_step(plant: AbstractPlant) -> None:
+    require_inputs(plant)
     if not (isinstance(plant, AbstractStaticTask) or plant.definition.observes_state):
         raise ValueError(
             "myopic designs are for tasks without memory (AbstractStaticTask) and for plants whose "

@@ -19,7 +19,7 @@ import numpy as np
 from jax.scipy.special import ndtr, ndtri
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from ..description import RARE, Parameter, Spread, names_of, prior_sd_of
+from ..description import RARE, Parameter, Spread, names_of
 from ..information import relative_size
 from ..plant import AbstractPlant, Params
 from .diagnosis import chi2_tail
@@ -139,11 +139,13 @@ class Prior(eqx.Module):
         parts = zip(self.names, self.logarithmic, np.asarray(self.mean).tolist(), strict=True)
         return {name: math.exp(mean) if is_log else mean for name, is_log, mean in parts}
 
-    def below_zero(self) -> list[str]:
-        """Names of parameters that are normal, and negative more often than once in 30,000."""
-        sd = np.linalg.norm(np.linalg.inv(np.asarray(self.root)), axis=1)
-        parts = zip(self.names, self.logarithmic, np.asarray(self.mean), sd, strict=True)
-        return [name for name, is_log, mean, own in parts if not is_log and mean < 4 * own]
+    def reach(self) -> dict[str, tuple[float, float]]:
+        """By parameter, values beyond which it lies less often than once in 30,000 on each side."""
+        sd = 4 * np.linalg.norm(np.linalg.inv(np.asarray(self.root)), axis=1)
+        ends = np.stack([np.asarray(self.mean) - sd, np.asarray(self.mean) + sd], axis=1)
+        with np.errstate(over="ignore"):
+            ends = np.where(np.array(self.logarithmic)[:, None], np.exp(ends), ends)
+        return {name: (own[0], own[1]) for name, own in zip(self.names, ends.tolist(), strict=True)}
 
     def contradicted(self, values: Mapping[str, float], sd: Mapping[str, float]) -> list[str]:
         """Names of parameters in which the data contradict the distribution; see `verdict`."""
@@ -213,10 +215,11 @@ class PriorPlants(eqx.Module):
     def changes(self, params: Params) -> Float[Array, "param param"]:
         """Changes of the parameters, by row, by a standard deviation of each coordinate.
 
-        That of a uniform distribution is a third of its width over the root of three, everywhere.
+        That of a uniform distribution is its width over the root of twelve, everywhere. A parameter
+        that is known does not change.
         """
         names = names_of(self.plant.definition.parameters)
-        spread = jnp.eye(len(names)) * prior_sd_of(self.spread)
+        spread = jnp.eye(len(names)) * (self.spread.relative / math.sqrt(3))
         changes = spread * relative_size(self.plant, params)[:, None]
         for name, low, high in self.ranges:
             i = names.index(name)

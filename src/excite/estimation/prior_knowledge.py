@@ -37,7 +37,7 @@ def plants_of(
         spread: of parameters without one.
 
     Raises:
-        ValueError: as `with_prior`, and for a uniform prior beyond a parameter's bounds.
+        ValueError: as `with_prior`, and for a prior beyond a parameter's bounds.
         TypeError: for something else than a prior.
     """
     reach = Spread.of(spread)
@@ -52,11 +52,13 @@ def plants_of(
                 f"and {most:g}"
             )
     joint = Prior.joined(normal) if normal else None
-    for name in () if joint is None else joint.below_zero():
-        if plant.definition.parameter(name).positive:
+    for name, (low, high) in joint.reach().items() if joint else ():
+        least, most = plant.definition.parameter(name).support
+        if low < least or high > most:
+            end = f"below {least:g}" if low < least else f"above {most:g}"
             raise ValueError(
-                f"the normal prior of {name!r} reaches below zero, where there is no plant: take a "
-                "lognormal or a narrower one"
+                f"the prior of {name!r} reaches {end}, where there is no plant: take a narrower "
+                "one, or another distribution"
             )
     return PriorPlants(plant, joint, reach, tuple(bounds))
 

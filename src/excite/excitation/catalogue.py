@@ -167,7 +167,6 @@ def _object(
     rows = np.asarray(inputs, float)
     if (bad := np.flatnonzero(~np.isfinite(rows).all(axis=1))).size:
         raise ValueError(f"inputs must be finite: got {rows[bad[0]].tolist()} at sample {bad[0]}")
-    require_within_limits(rows, plant.description, "inputs")
     return Replay(floats(rows))
 
 
@@ -181,6 +180,11 @@ def _recorded(name: str, options: Mapping[str, Any], plant: AbstractPlant) -> Re
 def _classical(name: str, options: Mapping[str, Any], plant: AbstractPlant) -> AbstractExcitation:
     """A signal, or one as the reference of a position loop, which shares its options."""
     shape = name.removeprefix(LOOP)
+    if shape == "myopic":
+        raise ValueError(
+            "excitation 'myopic' chooses inputs for a prior: it is for `excite gain`, studies with "
+            "a prior, and `ex.Myopic`"
+        )
     if shape not in EXCITATIONS:
         known = [*EXCITATIONS, *(LOOP + word for word in EXCITATIONS), *shipped_policies()]
         files = [f"path/to/policy{POLICY_ENDING}", "path/to/file.py:ClassName"]
@@ -196,7 +200,9 @@ def _classical(name: str, options: Mapping[str, Any], plant: AbstractPlant) -> A
 
 def _check_excitation(excitation: Any, plant: AbstractPlant) -> None:
     """Raises ValueError for values of an excitation that the plant does not allow."""
-    if isinstance(excitation, PositionLoop):
+    if isinstance(excitation, Replay):
+        require_within_limits(np.asarray(excitation.inputs), plant.description, "inputs")
+    elif isinstance(excitation, PositionLoop):
         _check_loop(excitation)
     else:
         _check_amplitude(excitation, plant)

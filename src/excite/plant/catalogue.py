@@ -241,6 +241,8 @@ def _check_plant(plant: AbstractPlant, where: str) -> None:
         ("output", (state, plant.nominal), len(d.outputs)),
         ("delay", (plant.nominal,), len(d.inputs)),
     ]
+    if isinstance(plant, AbstractStaticTask):  # its other functions follow from this one
+        functions = [("outcome", (inputs, plant.nominal), len(d.outputs))]
     if has_own_noise(plant):
         noise = jnp.zeros(len(d.outputs))
         functions.append(("measured", (inputs, plant.nominal, noise), len(d.outputs)))

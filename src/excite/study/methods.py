@@ -6,6 +6,7 @@ estimator sees the same data.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
@@ -29,7 +30,7 @@ from ..report.study_table import StudyTable
 from ..rig.filter import SafetyFilter
 from ..rig.simulated import drawn_hardware, evaluate_on_rig, readings_per_sample
 from ..safety import Supervision, Trip
-from ..simulation import Trajectory
+from ..simulation import DivergedError, Trajectory
 from .spec import GainSettings, Study
 from .statistics import Scores, table_row
 
@@ -140,10 +141,14 @@ def _expected_gain(
 ) -> ExpectedGain:
     """What an experiment of the study is expected to tell."""
     own = (study.gain or GainSettings()).model_dump()
-    found = information_gain(
-        plant, excitation, steps=study.num_steps, prior=study.prior or None, spread=study.spread,
-        seed=study.seed, progress=lambda *_: None, **own,
-    )  # fmt: skip
+    try:
+        found = information_gain(
+            plant, excitation, steps=study.num_steps, prior=study.prior or None,
+            spread=study.spread, seed=study.seed, progress=lambda *_: None, **own,
+        )  # fmt: skip
+    except DivergedError as error:  # other methods have their figures
+        unknown = Nats(mean=math.nan, std_error=math.nan)
+        return ExpectedGain(lower=unknown, upper=unknown, warnings=(str(error),), **own)
     lower, upper = (
         Nats(mean=bound.value, std_error=bound.std_error) for bound in (found.lower, found.upper)
     )
