@@ -15,6 +15,7 @@ from excite.excitation import Random, Replay
 from excite.plant import AbstractStaticTask, static_description
 from excite.plant.catalogue import plant_named
 from excite.policy import Layout, Policy
+from excite.record import Record
 from excite.simulation import predicted, response, run_episode
 from excite.study.table import finished_table
 
@@ -158,6 +159,17 @@ def test_identify_is_linear_regression(dt):
     used = designs[:-1]
     assert found.params.slope == pytest.approx(used @ outcomes[1:] / (used @ used), rel=1e-6)
     assert not any("coarse" in sentence for sentence in found.verdict)
+
+
+def test_a_prior_is_the_answer_where_the_record_tells_nothing():
+    inputs, measured = np.full((6, 1), 1e-6), np.array([[0], [0.3], [-0.2], [0.4], [-0.5], [0.1]])
+    time = np.arange(6.0)
+    record = Record(time, inputs, measured, {})
+    with pytest.raises(ValueError, match="no parameter is identifiable"):
+        ex.identify(record, Slope)
+    found = ex.identify(record, Slope, prior={"slope": "normal:0.7:0.1"})
+    assert found.params["slope"] == pytest.approx(0.7, abs=1e-3)
+    assert found.std_error["slope"] == pytest.approx(0.1, rel=1e-2)
 
 
 def test_an_outcome_that_is_infinite_at_zero_has_a_gradient():

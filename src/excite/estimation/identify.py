@@ -207,8 +207,8 @@ def identify(
             raise ValueError(f"a prior needs the estimator nls: got {estimator.name}")
         if estimator.prior is not None:
             raise ValueError("the estimator has a prior already; give one of the two")
-        plant, known_before, begin = with_prior(plant, prior, begin, start or {}, hold or {})
-        estimator = dataclasses.replace(estimator, prior=known_before)
+        plant, joint, begin = with_prior(plant, prior, begin, start or {}, hold or {})
+        estimator = dataclasses.replace(estimator, prior=joint)
     if intervals not in get_args(Intervals):
         raise ValueError(f"intervals {intervals!r} are not one of: linear, profile")
     if intervals == "profile" and not isinstance(estimator, NLS):
@@ -255,7 +255,10 @@ def identify(
         residual = _residuals(plant, records, experiments, estimator, fit)
     fitted = fitted_all(plant, records, whole, params, residual, prediction)
     is_normal = isinstance(estimator, NLS) and estimator.likelihood == "normal"
-    is_judged = is_normal and not fit.has_ended_in(Status.NOT_FINITE)
+    free = {n for n, own in zip(params._fields, fit.free, strict=True) if own}
+    known_before = set() if not is_normal or estimator.prior is None else {*estimator.prior.names}
+    # What the data do not tell of parameters that all have a prior, the prior does.
+    is_judged = is_normal and not fit.has_ended_in(Status.NOT_FINITE) and not free <= known_before
     is_fit = not is_judged or _explains(records, residual, int(fit.free.sum()) - num_priors)
     found, where = find(fit, is_fit and fit.is_successful)
     if not is_fit:
