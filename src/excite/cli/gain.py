@@ -80,7 +80,7 @@ def gain(
     with progress_bar("information gain") as progress:
         try:
             found = information_gain(**given, prior=given_priors(prior), progress=progress, **own)
-        except DivergedError as error:  # its prior, or its plant, is not one
+        except DivergedError as error:  # by what was given
             raise ValueError(str(error)) from None
     show_warnings(found.warnings)
     if as_json:

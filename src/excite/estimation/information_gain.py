@@ -100,15 +100,22 @@ def _near_modes(
     log_likelihood: Callable[[Float[Array, " param"]], Float[Array, ""]],
     drawn: Float[Array, "draw param"],
 ) -> _Near:
-    """At the most probable parameters, from several starts: the likeliest of the prior."""
+    """At the most probable parameters, from several starts: the likeliest of the prior.
+
+    A search that ended where the outputs are not finite is left out.
+    """
     count = drawn.shape[1]
     unknown = Fit(jnp.zeros(count), jnp.eye(count), jnp.zeros(()), jnp.zeros(()))
     likely = jax.lax.top_k(jax.lax.map(log_likelihood, drawn, batch_size=64), _STARTS - 1)[1]
     starts = jnp.concatenate([unknown.z[None], drawn[likely]])
     search = partial(nearest, residual, unknown, num_steps=_STEPS)
     ends, costs = jax.lax.map(search, starts, batch_size=_SIDE_BY_SIDE)
-    best = jnp.argmin(costs)
     S = jax.vmap(jax.jacfwd(residual))(ends)
+    is_sound = jnp.isfinite(costs) & jnp.all(jnp.isfinite(S), axis=(1, 2))
+    ends = jnp.where(is_sound[:, None], ends, 0.0)
+    S = jnp.where(is_sound[:, None, None], S, 0.0)
+    costs = jnp.where(is_sound, costs, jnp.inf)
+    best = jnp.argmin(costs)
     information = jnp.einsum("eoi,eoj->eij", S, S) + unknown.information[None]
     log_dets = jnp.linalg.slogdet(information)[1]
     laplace = _divergence(ends[best], jnp.linalg.inv(information[best]), log_dets[best])
@@ -410,16 +417,17 @@ def information_gain(
     progress("done", plants, plants)
     found = jax.tree.map(lambda *rows: np.concatenate([np.asarray(r) for r in rows]), *parts)
     number = -(-samples // min(samples, block)) * min(samples, block)
+    bad = np.flatnonzero(~np.isfinite(found.lower) | ~np.isfinite(found.laplace))
+    if bad.size:
+        true = population.params(jnp.asarray(found.controls[bad[0], : len(e.plant.nominal)]))
+        first = ", ".join(f"{name} = {float(value):.4g}" for name, value in true._asdict().items())
+        raise DivergedError(
+            f"{bad.size} of {plants} experiments have outputs or a likelihood that are not finite, "
+            f"the first with {first}: take a narrower prior, or a plant that is defined there"
+        )
     lower, upper, laplace, changes = (
         Mean.of(v, found.controls) for v in (found.lower, found.upper, found.laplace, found.changes)
     )
-    is_finite = np.isfinite(found.lower) & np.isfinite(found.laplace)
-    if not is_finite.all():
-        raise DivergedError(
-            f"{np.sum(~is_finite)} of {plants} experiments have outputs or likelihoods that are "
-            "not finite, with their own plants or with others of the prior: take a narrower prior, "
-            "or a plant that is defined everywhere in it"
-        )
     few = int(np.sum(~(found.effective >= _FEW)))  # NaN, too
     warnings = list(e.warnings)
     coarse = np.asarray(e.plant.sensor.resolution) > 2 * np.asarray(e.plant.sensor.noise_sd)
