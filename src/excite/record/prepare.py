@@ -6,7 +6,6 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 
 from ..description import Input, Output, PlantDescription, names_of
 from .record import Record
@@ -46,10 +45,8 @@ def require_playable(record: Record, description: PlantDescription) -> None:
     require_within_limits(record.inputs, description, str(record.source or "the record"))
 
 
-def require_within_limits(
-    inputs: Float[np.ndarray, "time input"], description: PlantDescription, what: str
-) -> None:
-    """Raises ValueError for inputs to play that would be clipped.
+def require_within_limits(inputs: np.ndarray, description: PlantDescription, what: str) -> None:
+    """Raises ValueError for inputs to play, by sample and input, that would be clipped.
 
     Another number of inputs is refused where they are played.
     """
