@@ -102,7 +102,6 @@ def test_the_estimate_of_other_records_is_a_prior_for_these(tmp_path):
             assert found.std_error[name] == pytest.approx(both.std_error[name], rel=0.15)
 
 
-@pytest.mark.slow
 def test_parameters_change_by_their_standard_deviations_and_known_ones_do_not():
     plant, nominal = Aero2(), {n: float(v) for n, v in Aero2().nominal._asdict().items()}
     prior = plants_of(plant, {"J_p": "lognormal:0.02:10%", "D_p": "uniform:0.001:0.004"})
@@ -116,6 +115,7 @@ def test_parameters_change_by_their_standard_deviations_and_known_ones_do_not():
     np.testing.assert_allclose(changes, expected, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_prior_holds_what_the_data_do_not_tell_and_says_so():
     still = dataclasses.replace(noisy(), inputs=0 * INPUT)
     without = identify(still, Ramp)

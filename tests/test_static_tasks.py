@@ -87,26 +87,21 @@ def test_a_design_outside_its_limits_is_refused_not_moved(tmp_path):
             ex.information_gain(Slope, designs, steps=3, prior={"slope": "normal:0:1"})
 
 
-class Root(AbstractStaticTask):
-    """Without an outcome where the parameter is above two, which the bounded one may not be."""
-
-    definition = static_description(
-        "root",
-        designs=(ex.Input("place", "m", -1.0, 1.0),),
-        outcomes=(ex.Output("height", "m", scale=1.0, noise_sd=SD),),
-        parameters=(ex.Parameter("at", "", 0.0, scale=1.0, positive=False),),
-    )
+class Root(Slope):
+    """Without an outcome where the parameter is above two."""
 
     def outcome(self, design, params):
-        return design * jnp.sqrt(2 - params.at)
+        return design * jnp.sqrt(2 - params.slope)
 
 
 def test_a_prior_where_the_task_is_not_defined_is_refused():
     def gain(prior):
-        return ex.information_gain(Root, steps=3, prior={"at": prior}, plants=64, samples=20)
+        return ex.information_gain(Root, steps=3, prior={"slope": prior}, plants=64, samples=20)
 
     assert gain("uniform:-1:1.9").lower.value > 0
-    with pytest.raises(ValueError, match=r"\d of 64 experiments have outputs .* with at = 2\.\d"):
+    with pytest.raises(
+        ValueError, match=r"\d of 64 experiments have outputs .* with slope = 2\.\d"
+    ):
         gain("normal:1:1")
 
 

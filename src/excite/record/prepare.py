@@ -51,9 +51,8 @@ def require_within_limits(inputs: np.ndarray, description: PlantDescription, wha
     Another number of inputs is refused where they are played.
     """
     for part, values in zip(description.inputs, inputs.T, strict=False):
-        rounding = 1e-6 * (part.upper - part.lower)
         low, high = values.min(), values.max()
-        if low < part.lower - rounding or high > part.upper + rounding:
+        if low < part.lower - 1e-9 or high > part.upper + 1e-9:
             unit = f" {part.unit}" if part.unit else ""
             raise ValueError(
                 f"{what}: {part.name!r} runs from {low:g} to {high:g}{unit}; the plant's limits "
