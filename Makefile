@@ -5,10 +5,9 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --co
 
 PYTEST := $(BIN)/python -m pytest -n 2
 # Thousands of small programs are compiled in the tests and run once: compiling is most of their time.
-# Without optimisation the gradient of a training was NaN on some processors: the commands of the pages
-# and the long tests keep the optimisation level of users. The flags are of the jaxlib in constraints.txt.
-FEWER_PASSES := --xla_cpu_use_fusion_emitters=false
-QUICK := XLA_FLAGS="$(FEWER_PASSES) --xla_backend_optimization_level=0"
+# Tests with the fixture `optimised` compute for longer. The flags are of the jaxlib in constraints.txt: without
+# optimisation, its gradients of trainings are NaN where additions and multiplications are fused. AVX does not fuse.
+QUICK := JAX_DISABLE_MOST_OPTIMIZATIONS=1 XLA_FLAGS="--xla_cpu_use_fusion_emitters=false --xla_cpu_max_isa=AVX --xla_cpu_parallel_codegen_split_count=1"
 
 .PHONY: help demo test units test-slow test-pages test-science test-all check-results coverage lint types docs results \
     agents policies certificates evaluations clean
@@ -30,11 +29,12 @@ units: .venv/dev ## unit and command-line tests
 test-slow: .venv/dev ## the unit and command-line tests that take more than about three seconds
 	$(QUICK) $(PYTEST) --dist loadfile -m 'slow and not science'
 
+# A test of the page waits for a browser and a server most of its time: three processes keep two cores busy.
 test-pages: .venv/dev ## commands of the documentation, and the bench page in a browser
-	XLA_FLAGS="$(FEWER_PASSES)" $(PYTEST) --dist worksteal tests/pages
+	$(QUICK) $(PYTEST) -n 3 --dist worksteal tests/pages
 
 test-science: .venv/dev ## promises of the shipped policies, baselines, trainings from end to end
-	XLA_FLAGS="$(FEWER_PASSES)" $(PYTEST) --dist worksteal -m science
+	$(QUICK) $(PYTEST) --dist worksteal -m science
 
 check-results: .venv/dev ## the committed results are what the documentation says of them
 	$(PYTEST) --dist worksteal tests/results

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 from catalogue import FEW_AND_ALL, PLANTS
+from compiled import optimised
 
 from excite.estimation import NLS, Status, stack_experiments
 from excite.estimation.multiple_shooting import MultipleShooting, Point, Segments
@@ -132,6 +133,7 @@ def test_the_length_of_segments_changes_nothing(known):
 @pytest.mark.science
 @pytest.mark.parametrize("count", [20, 1000])
 @pytest.mark.parametrize("excitation", [Chirp(), PRBS(), Random()], ids=["chirp", "prbs", "random"])
+@optimised()
 def test_plants_within_a_factor_of_three_are_found(excitation, count):
     plant = Aero2()
     draw, play = jax.random.split(KEY)
@@ -161,6 +163,7 @@ def test_plants_within_a_factor_of_three_are_found(excitation, count):
         ("cart_pole", "cart_pole", 0.3),  # the shipped policy: nearly chaotic
     ],
 )
+@optimised()
 def test_plants_far_from_the_start_are_found(name, excitation, spread):
     plant, count = PLANTS[name], 50
     draw, play = jax.random.split(KEY)

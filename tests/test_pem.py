@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
+from compiled import optimised
 from experiments import record_of, spread_params
 
 from excite.description import Input, Output, Parameter, PlantDescription, State
@@ -219,6 +220,7 @@ DISTURBED = {
 
 @pytest.mark.science
 @pytest.mark.parametrize("name", DISTURBED)
+@optimised()
 def test_the_intervals_of_disturbed_plants_hold_what_they_promise(name):
     plant, true, sigma, known = DISTURBED[name]
     found = fitted_to_many(plant, true, sigma, 300, known)

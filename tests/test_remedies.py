@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from catalogue import LONG
+from compiled import optimised
 
 import excite as ex
 from excite.estimation import NLS, stack_experiments
@@ -262,6 +263,7 @@ def test_a_refusal_names_what_would_explain_the_record():
 
 @pytest.mark.science
 @pytest.mark.parametrize("plant", list(PLAYED))
+@optimised()
 def test_what_each_plant_leaves_out_is_named_first(plant):
     missed = []
     for effect in effects(plant):
@@ -277,6 +279,7 @@ def test_what_each_plant_leaves_out_is_named_first(plant):
 
 @pytest.mark.science
 @pytest.mark.parametrize("plant", sorted(PLANTS))
+@optimised()
 def test_a_record_of_the_very_plant_is_no_alarm(plant):
     """At most 1.5 % of 2,000 records: 8 alarms in 2,160 records were counted, 4 of 72 are rare."""
     d, alarms = plant_from(plant).definition, 0

@@ -3,6 +3,7 @@
 from typing import Any
 
 import pytest
+from compiled import optimised
 
 from excite.study.methods import method_rows
 from excite.study.spec import study_from
@@ -11,6 +12,7 @@ POLICIES = ("aero2", "aero2-goals", "aero2-damping")
 
 
 @pytest.fixture(scope="module")
+@optimised()
 def rows() -> dict[tuple[str, str], Any]:
     """By method and estimator, on 1000 plants that nothing was trained or chosen on."""
     study = study_from(
