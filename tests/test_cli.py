@@ -195,7 +195,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "short.csv": "\n".join(good.splitlines()[:6]) + "\n",
         "silent.csv": scaled(good, pitch=0.0),
         "rest.csv": scaled(good, voltage=0.0, pitch=0.0),
-        "truncated.csv": good[:-20],
+        "truncated.csv": good[: good.rindex(",")],
         "empty.csv": "",
         "header.csv": good.splitlines()[0] + "\n",
         "long.csv": "a" * 200_000 + "\n",
