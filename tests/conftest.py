@@ -48,7 +48,7 @@ class Memory:
     They stay as long as the process, and there are thousands of them.
     """
 
-    limit = 1.6e9
+    limit = 1.4e9
     step = 0.2e9
 
     def used(self) -> int:
