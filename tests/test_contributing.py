@@ -6,7 +6,7 @@ import shlex
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import jax
@@ -20,6 +20,7 @@ from commands import excite
 import excite as ex
 from excite import estimation
 from excite.environment import StepData
+from excite.excitation import Chirp
 from excite.excitation.catalogue import EXCITATIONS
 from excite.plant import Aero2
 from excite.safety import critical_levels, is_violation
@@ -66,7 +67,11 @@ def test_the_plant_obeys_its_equations_and_the_classical_signals_are_safe(added,
 
 
 def test_the_excitation_swings_twice_as_fast_for_every_further_input(added):
-    [text] = examples("Add an excitation")
+    text, check = examples("Add an excitation")
+    for allowed in (Chirp(), SimpleNamespace(duty=jnp.array(1.0))):
+        exec(check, {"excitation": allowed})
+    with pytest.raises(ValueError, match=r"duty is 1\.5; it must lie between 0 and 1"):
+        exec(check, {"excitation": SimpleNamespace(duty=jnp.array(1.5))})
     signals = (ROOT / "src" / "excite" / "excitation" / "signals.py").read_text()
     Triangle = added("excitation", "signals_and_triangle", f"{signals}\n\n{text}").Triangle
     wave = Triangle(frequency=0.5).shape(TwoMasses(), 200, jax.random.key(0))  # 40 samples

@@ -237,7 +237,7 @@ def test_a_record_from_elsewhere_is_refused():
     moving = dataclasses.replace(ex.simulate("aero2", "chirp", steps=40), metadata={})
     with pytest.raises(ValueError, match="does not say that it starts at rest"):
         ex.discriminate(RIVALS, moving)
-    with pytest.raises(ValueError, match="has 1 inputs and 2 outputs; plant 'aero2' has 1 and 1"):
+    with pytest.raises(ValueError, match="has 1 input and 2 outputs; plant 'aero2' has 1 and 1"):
         ex.discriminate(RIVALS, ex.simulate(DCMotor(), "chirp", steps=40))
     with pytest.raises(TypeError, match="plants must be a list of at least two plants"):
         ex.discriminate("aero2")

@@ -222,7 +222,7 @@ MISTAKES = {
     "ex.simulate('aero2', np.full((9, 1), 30.0))": (
         "inputs: 'voltage' runs from 30 to 30 V; the plant's limits are -24 to 24 V"
     ),
-    "ex.identify(record, 'cart_pole')": "has 1 inputs and 1 outputs; plant 'cart_pole'",
+    "ex.identify(record, 'cart_pole')": "has 1 input and 1 output; plant 'cart_pole'",
     "ex.identify(record, estimator='nsl')": "did you mean 'nls'",
     "ex.identify(record, estimator=3)": "estimator must be a name, an estimator or its class",
     "ex.identify(record, start=[1])": "start must be a dict by name",

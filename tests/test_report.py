@@ -24,6 +24,7 @@ from excite.record.figure import (
     require_plot_path,
     save,
 )
+from excite.report.estimates import largest_correlation
 from excite.report.figures import (
     autocorrelation_figure,
     benchmark_figure,
@@ -571,6 +572,20 @@ def test_an_ellipse_holds_95_percent_of_a_normal_distribution():
 
 def test_without_a_pair_there_is_no_ellipse():
     assert correlation_figure(summary({"a": (2.0, 0.02, "")}, correlation=[[1.0]])) is None
+
+
+@pytest.mark.parametrize(
+    ("correlation", "words"),
+    [
+        (np.eye(2), "+0.000 between k and m"),
+        (np.array([[1, -0.5], [-0.5, 1]]), "-0.500 between k and m"),
+        (np.array([[1, 0.1, np.nan], [0.1, 1, 0.3], [np.nan, 0.3, 1]]), "+0.300 between m and d"),
+    ],
+)
+def test_the_largest_correlation_is_one_of_two_parameters(correlation, words):
+    names = dict.fromkeys("kmd"[: len(correlation)])
+    result = EstimateSummary.model_construct(params=names, correlation=correlation)
+    assert largest_correlation(result) == words
 
 
 def test_the_autocorrelation_of_white_noise_lies_between_the_dashed_lines():

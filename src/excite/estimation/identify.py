@@ -392,9 +392,13 @@ def record_for(description: PlantDescription, given: RecordLike, **options: Any)
         return read_record(given, description, **options)
     found = given.inputs.shape[1], given.outputs.shape[1]
     if found != (len(description.inputs), len(description.outputs)):
+        has = " and ".join(
+            f"{count} {word}{'s' * (count != 1)}"
+            for count, word in zip(found, ("input", "output"), strict=True)
+        )
         raise ValueError(
-            f"{given.source or 'the record'} has {found[0]} inputs and {found[1]} outputs; plant "
-            f"{description.name!r} has {len(description.inputs)} and {len(description.outputs)}"
+            f"{given.source or 'the record'} has {has}; plant {description.name!r} has "
+            f"{len(description.inputs)} and {len(description.outputs)}"
         )
     require_columns(given, description)
     return given

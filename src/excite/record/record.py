@@ -137,7 +137,9 @@ class Record:
     def description(self) -> PlantDescription:
         """The plant that the sidecar names; ValueError without one."""
         if not self.metadata.get("plant"):
-            raise ValueError(f"{self.source or 'the record'} has no sidecar that names its plant")
+            raise ValueError(
+                f"{self.source or 'the record'} does not tell its plant: name the plant"
+            )
         return PlantDescription.from_dict(self.metadata["plant"])
 
     def save(self, path: str | os.PathLike[str], overwrite: bool = False) -> None:
@@ -277,7 +279,10 @@ def described_in(path: Path | DataFrame) -> PlantDescription:
     require_readable(path)
     content = read_sidecar(path).get("plant")
     if not content:
-        raise ValueError(f"{path} has no sidecar that names its plant: name the plant")
+        raise ValueError(
+            f"{path} does not tell its plant (no file {path.stem}.json beside it does): "
+            "name the plant (--plant in a command)"
+        )
     return PlantDescription.from_dict(content)
 
 

@@ -67,9 +67,9 @@ def residual_in_words(result: EstimateSummary, output: str) -> str:
 
 def largest_correlation(result: EstimateSummary) -> str:
     """The largest correlation between two estimates, and between which."""
-    names, table = list(result.params), np.array(result.correlation, float)
-    table = np.nan_to_num(np.triu(table, 1))
-    i, j = np.unravel_index(np.argmax(np.abs(table)), table.shape)
+    names, table = list(result.params), np.nan_to_num(np.array(result.correlation, float))
+    pairs = np.stack(np.triu_indices(len(names), 1), axis=1)
+    i, j = max(pairs, key=lambda pair: abs(table[*pair]))
     return f"{table[i, j]:+.3f} between {names[i]} and {names[j]}"
 
 
