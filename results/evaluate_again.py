@@ -4,8 +4,9 @@
     python results/evaluate_again.py cart_pole --write  # all agents of one; keeps their rows
 
 Only the first seed of an agent is evaluated. Numbers are compared as they are printed: three digits
-of the errors and the bound, four of the information. After `--write`, `excite study run` with
-the same folder makes the table again.
+of the errors and the bound, four of the information. The errors of `oed_location_finding` depend on
+rounding, and so on the processor: two sources have many local optima. After `--write`, `excite
+study run` with the same folder makes the table again.
 """
 
 from __future__ import annotations
