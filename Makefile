@@ -5,9 +5,10 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --co
 
 PYTEST := $(BIN)/python -m pytest -n 2
 # Thousands of small programs are compiled in the tests and run once: compiling is most of their time.
-# Tests with the fixture `optimised` compute for longer. The flags are of the jaxlib in constraints.txt: without
+# What `optimised` of tests/compiled.py decorates computes for longer. The flags are of the jaxlib in constraints.txt: without
 # optimisation, its gradients of trainings are NaN where additions and multiplications are fused. AVX does not fuse.
-QUICK := JAX_DISABLE_MOST_OPTIMIZATIONS=1 XLA_FLAGS="--xla_cpu_use_fusion_emitters=false --xla_cpu_max_isa=AVX --xla_cpu_parallel_codegen_split_count=1"
+QUICK := JAX_DISABLE_MOST_OPTIMIZATIONS=1 XLA_FLAGS="--xla_cpu_use_fusion_emitters=false --xla_cpu_max_isa=AVX \
+    --xla_cpu_parallel_codegen_split_count=1"
 
 .PHONY: help demo test units test-slow test-pages test-science test-all check-results coverage lint types docs results \
     agents policies certificates evaluations clean

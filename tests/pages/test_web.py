@@ -198,11 +198,8 @@ def test_what_the_page_shows_first_is_what_its_workers_compute():
         assert before["row"]["is_violation"] == after["row"]["is_violation"]
         for name in ("time", "inputs", "outputs", "log_det"):  # None becomes NaN
             old, new = (np.array(e["traces"][name], float) for e in (before, after))
-            if (
-                name == "log_det"
-            ):  # of the first samples the information is singular, but for rounding
-                np.testing.assert_array_equal(np.isfinite(old[3:]), True)
-                old, new = old[3:], new[3:]
+            if name == "log_det":  # below, the information is singular but for rounding
+                old, new = (np.where(x > -35, x, np.nan) for x in (old, new))
             np.testing.assert_allclose(old, new, rtol=1e-3, atol=1e-6)
         for old, new in zip(before.get("estimates", []), after.get("estimates", []), strict=True):
             assert old["k"] == new["k"]

@@ -280,8 +280,8 @@ def described_in(path: Path | DataFrame) -> PlantDescription:
     content = read_sidecar(path).get("plant")
     if not content:
         raise ValueError(
-            f"{path} does not tell its plant (no file {path.stem}.json beside it does): "
-            "name the plant (--plant in a command)"
+            f"{path} does not tell its plant (no file {path.with_suffix('.json').name} beside it "
+            "does): name the plant (--plant in a command)"
         )
     return PlantDescription.from_dict(content)
 
