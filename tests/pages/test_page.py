@@ -1041,6 +1041,62 @@ def test_a_file_and_its_result_come_back_when_the_page_is_loaded_again(
     expect(page.locator("#scale-voltage")).to_have_value("")
 
 
+def test_records_and_plants_are_compared_side_by_side(address: str, page: Page, tmp_path: Path):
+    """Two files without time and input, fitted or held out; two plants; results before."""
+    page.goto(f"{address}/#record")
+    expect(page.locator("#record-plant option").first).to_be_attached(timeout=WAIT)
+    for seed, name in enumerate(("a.csv", "b.csv")):
+        pitch = ex.simulate("aero2", np.full((200, 1), 5.0), seed=seed).outputs[:, 0]
+        (tmp_path / name).write_text("\n".join(["pitch", *map(str, pitch.tolist()), ""]))
+    page.locator("#file").set_input_files(tmp_path / "a.csv")
+    expect(status(page, "record")).to_contain_text("a.csv: 1 column,", timeout=WAIT)
+    identify = page.get_by_role("button", name="Identify")
+    page.locator("#column-time").select_option(label="none: a sampling time")
+    page.locator("#column-voltage").select_option(label="none: a constant")
+    page.locator("#value-time").fill("0.1")
+    expect(identify).to_be_disabled()
+    page.locator("#value-voltage").fill("5")
+    expect(identify).to_be_enabled()
+    page.locator("#record form summary").click()
+    page.get_by_label("Rows start:stop:step").fill(":150")
+    page.get_by_label("Initial state").select_option("known")
+    page.get_by_label("aero2_lag").check()
+    identify.click()
+    expect(status(page, "record")).to_have_text("Done: successful.", timeout=WAIT)
+    plants = page.locator("#compared-plants tbody th")
+    assert sorted(plants.all_inner_texts()) == ["aero2", "aero2_lag"]
+    expect(page.locator("#side-by-side")).to_be_hidden()
+    commands = page.locator("#record-again pre")
+    expect(commands).to_contain_text("excite compare-plants aero2 aero2_lag --record a.csv")
+    # A second file, held out; then fitted together with the first.
+    page.get_by_label("aero2_lag").uncheck()
+    more = page.get_by_label("Add a file")
+    more.set_input_files(tmp_path / "b.csv")
+    expect(status(page, "record")).to_contain_text("b.csv: 1 column,", timeout=WAIT)
+    more.set_input_files(tmp_path / "b.csv")
+    expect(status(page, "record")).to_contain_text("b.csv is there already", timeout=WAIT)
+    expect(page.locator("#value-voltage")).to_have_value("5")  # assigned as before
+    page.get_by_label("b.csv", exact=True).select_option("held out")
+    identify.click()
+    told = page.locator("#record-verdict")
+    expect(told).to_contain_text("b.csv: held-out pitch fit", timeout=WAIT)
+    expect(page.locator("#record-signals figcaption b").nth(3)).to_contain_text("b.csv, held out")
+    assert page.locator("#compared-plants table").count() == 0
+    page.get_by_label("b.csv", exact=True).select_option("fitted")
+    identify.click()
+    beside = page.locator("#side-by-side thead th")
+    titles = ["1: a.csv, aero2", "2: a.csv, aero2", "3: a.csv, b.csv, aero2"]
+    expect(beside).to_have_text(["unit", *titles], timeout=WAIT)
+    expect(page.locator("#side-by-side")).to_contain_text("held-out fit of pitch")
+    assert Axe().run(page).response["violations"] == []
+    require_no_sideways_scroll(page)
+    page.reload()
+    expect(beside).to_have_text(["unit", *titles], timeout=WAIT)
+    expect(page.get_by_label("b.csv", exact=True)).to_have_value("fitted")
+    page.get_by_role("button", name="Forget the earlier ones").click()
+    expect(page.locator("#side-by-side")).to_be_hidden()
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [1440, 1024, 390])
 def test_nothing_hinders_people_who_do_not_see_or_point(

@@ -295,7 +295,7 @@ def test_a_stream_has_no_gaps(told: Told):
 def test_an_uploaded_file_is_identified_as_at_the_command_line(client, told: Told, temporary: Path):
     text = told.of("record.csv")[0]["text"].replace("pitch", "theta")
     uploaded = client.post("/api/uploads?name=my log.csv", content=text).json()
-    assert uploaded["columns"] == {"time": 501, "voltage": 501, "theta": 501}
+    assert uploaded["files"][0]["columns"] == {"time": 501, "voltage": 501, "theta": 501}
     asked = {"upload": uploaded["upload"], "plant": "aero2", "estimator": "nls"}
     asked |= {"columns": {"pitch": "theta"}, "scales": {}, "initial_state": "known"}
     [event] = streamed(client, "/api/identifications", asked).of("identified")
@@ -336,7 +336,7 @@ def test_an_uploaded_mat_file_is_identified(client, told: Told, tmp_path: Path):
     table = {name: [float(row[name]) for row in rows] for name in rows[0]}
     scipy.io.savemat(path, {**table, "notes": "text"}, do_compression=True)
     uploaded = client.post("/api/uploads?name=log.mat", content=path.read_bytes()).json()
-    assert uploaded["columns"] == dict.fromkeys(("time", "voltage", "pitch"), 501)
+    assert uploaded["files"][0]["columns"] == dict.fromkeys(("time", "voltage", "pitch"), 501)
     asked = {"upload": uploaded["upload"], "plant": "aero2", "estimator": "nls"}
     asked |= {"columns": {}, "scales": {}, "initial_state": "known"}
     [event] = streamed(client, "/api/identifications", asked).of("identified")
@@ -363,7 +363,8 @@ def test_the_page_takes_every_file_that_is_read(ending: str, client, told: Told,
     content = path.read_bytes()
     answer = client.post(f"/api/uploads?name={path.name}", content=content).json()
     names = ("time", "/force.data") if ending in BAG_ENDINGS else ("t", "a b")
-    assert answer["columns"] == dict.fromkeys(names if ending != ".mat" else ("t", "a"), 2)
+    names = names if ending != ".mat" else ("t", "a")
+    assert answer["files"][0]["columns"] == dict.fromkeys(names, 2)
     assert ending in client.get("/").text.partition('accept="')[2].partition('"')[0].split(",")
 
 
@@ -664,7 +665,7 @@ def test_a_file_of_names_alone_leaves_the_others_alone(header: str, client, told
     assert len(answer.json()["sentence"]) < 1100
     for _ in range(3):  # one worker and the other
         again = client.post("/api/uploads?name=a.csv", content="time,x\n0,1\n1,2\n")
-        assert again.json()["columns"] == {"time": 2, "x": 2}
+        assert again.json()["files"][0]["columns"] == {"time": 2, "x": 2}
 
 
 def test_a_script_in_a_column_stays_text(client, told: Told):
@@ -674,9 +675,9 @@ def test_a_script_in_a_column_stays_text(client, told: Told):
     answer = client.post(f"/api/uploads?name=../../{script}.csv", content=text)
     assert answer.headers["content-type"] == "application/json"
     assert answer.headers["x-content-type-options"] == "nosniff"
-    assert script in answer.json()["columns"]
-    assert answer.json()["file"] == f".._.._{script.replace('/', '_')}.csv"
-    assert "/" not in answer.json()["file"]
+    assert script in answer.json()["files"][0]["columns"]
+    assert answer.json()["files"][0]["file"] == f".._.._{script.replace('/', '_')}.csv"
+    assert "/" not in answer.json()["files"][0]["file"]
 
 
 # ------------------------------------------- who may ask for what, on a server without workers

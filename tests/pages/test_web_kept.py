@@ -14,7 +14,7 @@ from starlette.testclient import TestClient
 from excite.files import write_json
 from excite.web import application, sessions, streams
 from excite.web.requests import RefusedError
-from excite.web.sessions import MAX_JOBS, MAX_KEPT, Job, PageSettings, Session
+from excite.web.sessions import MAX_FILES, MAX_JOBS, MAX_KEPT, Job, PageSettings, Session
 from excite.web.workers import Workers
 
 HERE = "http://127.0.0.1:8000"
@@ -136,13 +136,57 @@ def test_what_was_shown_is_told_again(page: TestClient):
     again = page.get(f"/api/results/{first['job']}/events")
     assert (again.status_code, again.text) == (200, told.text)
     assert page.get(f"/api/uploads/{upload}").json() == {
-        "upload": upload, "file": "a.csv", "columns": {"time": 2}, "previews": {},
+        "upload": upload, "files": [{"file": "a.csv", "columns": {"time": 2}, "previews": {}}],
     }  # fmt: skip
     for name in (upload, "none"):
         answer = page.get(f"/api/results/{name}/events")
         assert (answer.status_code, "run it again" in answer.text) == (404, True)
     answer = page.get(f"/api/uploads/{first['job']}")
     assert (answer.status_code, "choose it again" in answer.text) == (404, True)
+
+
+def test_files_of_an_upload_have_different_names_and_are_few(page: TestClient):
+    upload, csv = uploaded(page), "time\n0\n1\n"
+    for number in range(1, MAX_FILES):
+        answer = page.post(f"/api/uploads/{upload}?name={number}.csv", content=csv)
+        assert [own["file"] for own in answer.json()["files"]][1:] == [
+            f"{i}.csv" for i in range(1, number + 1)
+        ]
+    for name, sentence in (("1.csv", "there already"), ("many.csv", f"at most {MAX_FILES} files")):
+        answer = page.post(f"/api/uploads/{upload}?name={name}", content=csv)
+        assert (answer.status_code, sentence in answer.text) == (409, True)
+    assert len(page.get(f"/api/uploads/{upload}").json()["files"]) == MAX_FILES
+    assert page.post("/api/uploads/none?name=a.csv", content=csv).status_code == 404
+
+
+def test_a_file_that_is_not_read_is_no_part_of_an_upload(page: TestClient):
+    upload = uploaded(page)
+    for tried in ("", "time\n0\n1\n"):  # refused, then taken under the same name
+        answer = page.post(f"/api/uploads/{upload}?name=b.csv", content=tried)
+        assert answer.status_code == (200 if tried else 400)
+    assert [own["file"] for own in answer.json()["files"]] == ["a.csv", "b.csv"]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"fitted": ["other.csv"]}, {"held_out": ["../a.csv"]}, {"fitted": "a.csv"},
+        {"rows": 3}, {"rows": "1" * 201}, {"dt": -1}, {"dt": "0.1"}, {"others": ["a.py:B"]},
+        {"start": {"J_p": "x"}}, {"uncertain": {"m": 0.1}}, {"likelihood": "a b"},
+        {"set_inputs": [1]}, {"validate_columns": {"u": 1}},
+    ],
+)  # fmt: skip
+def test_an_identification_takes_names_and_numbers_alone(change: dict[str, Any], page: TestClient):
+    asked = {**ASKED, "upload": uploaded(page), "columns": {"time": "time"}, **change}
+    answer = page.post("/api/identifications", json=asked)
+    assert (answer.status_code, bool(answer.json()["sentence"])) == (400, True)
+
+
+def test_results_of_this_browser_stand_side_by_side(page: TestClient):
+    """A result without an estimate, and those of others, are left out."""
+    result = identified(page, uploaded(page))
+    answer = page.get("/api/results/compared", params={"name": [result, "none"]})
+    assert answer.json()["header"] == ["", "unit"]
 
 
 def test_another_browser_is_told_nothing_again(page: TestClient):

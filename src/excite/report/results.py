@@ -43,7 +43,7 @@ def _estimates(result: EstimateSummary) -> tuple[str, Table]:
     return title, (parameter_header()[:-1], rows)
 
 
-def _judgement(result: EstimateSummary) -> list[str]:
+def judgement(result: EstimateSummary) -> list[str]:
     """Fits, tests of the residual, verdict and correlation, one a line."""
     if not result.is_usable:
         return list(result.verdict)
@@ -87,7 +87,7 @@ def _named(values: Mapping[str, float]) -> str:
 def identification_text(result: EstimateSummary) -> str:
     """Parameters with their intervals, tests and verdict, as plain text."""
     title, (header, rows) = _estimates(result)
-    return "\n".join([text_table(title, header, rows), "", *_judgement(result)])
+    return "\n".join([text_table(title, header, rows), "", *judgement(result)])
 
 
 def posterior_text(posterior: Data) -> str:
@@ -114,7 +114,7 @@ def posterior_text(posterior: Data) -> str:
 def identification_html(result: EstimateSummary) -> str:
     """The same for a notebook."""
     title, (header, rows) = _estimates(result)
-    return html_table(title, header, rows) + _paragraphs(_judgement(result))
+    return html_table(title, header, rows) + _paragraphs(judgement(result))
 
 
 def _paragraphs(lines: list[str]) -> str:
@@ -124,7 +124,8 @@ def _paragraphs(lines: list[str]) -> str:
 # ----------------------------------------------------------------------------- comparison
 
 
-def _compared(result: Data) -> tuple[str, Table]:
+def compared_plants(result: Data) -> tuple[str, Table]:
+    """Title and table of several plants of the same records."""
     best = min(p["bic"] for p in result["plants"])
     found = [EstimateSummary.of(p["identification"]) for p in result["plants"]]
     outputs, held_out = list(found[0].fit_percent), bool(found[0].validation)
@@ -161,13 +162,13 @@ def _residuals(result: Data) -> list[str]:
 
 def comparison_text(result: Data) -> str:
     """Several plants, the likeliest first, as plain text."""
-    title, (header, rows) = _compared(result)
+    title, (header, rows) = compared_plants(result)
     return "\n".join([text_table(title, header, rows), "", *_residuals(result)])
 
 
 def comparison_html(result: Data) -> str:
     """The same for a notebook."""
-    title, (header, rows) = _compared(result)
+    title, (header, rows) = compared_plants(result)
     return html_table(title, header, rows) + _paragraphs(_residuals(result))
 
 

@@ -16,12 +16,14 @@ from ..files import json_ready
 from ..record import Record
 from ..record.figure import kept_samples
 from ..report.estimates import beside
+from ..report.rows import EstimateSummary
 from ..report.sections.elements import record_in
 from ..report.study_table import StudyTable, common_table
-from ..report.tables import Table
-from .plants import shown_plant
+from .events import ShownTable
 from .requests import RefusedError
 from .runs import estimate_of, files_of, found, plant_of_run, run_named, table_of
+from .sessions import MAX_KEPT, Session
+from .shown import shown_plant, shown_table
 
 _MAX_RUNS, _MAX_EXPERIMENTS = 12, 12
 _MAX_POINTS = 20_000  # of a record; longer ones show the extremes of each section
@@ -29,7 +31,7 @@ _RECORD = re.compile(r"(record(_\d+)?|round-\d+)\.csv")
 
 
 def routes(folder: Path) -> list[Route]:
-    """The route that compares runs."""
+    """The routes that compare runs, and results of a browser."""
 
     def compared(request: Request) -> JSONResponse:
         names = list(dict.fromkeys(request.query_params.getlist("name")))
@@ -38,7 +40,22 @@ def routes(folder: Path) -> list[Route]:
         every = found(folder)
         return JSONResponse(_compared({name: run_named(every, name) for name in names}))
 
-    return [Route("/api/runs/compared", compared)]
+    def beside_each_other(request: Request) -> JSONResponse:
+        names = list(dict.fromkeys(request.query_params.getlist("name")))
+        session: Session = request.state.session
+        found = dict[str, EstimateSummary]()
+        for name in names[-MAX_KEPT:]:
+            with contextlib.suppress(RefusedError), session.using(name, "result") as place:
+                own = estimate_of(place / "run")
+                if own is not None:
+                    title = f"{len(found) + 1}: {', '.join(own.files)}, {own.plant}"
+                    found[title] = own
+        return JSONResponse(shown_table("Identified in this tab", beside(found)))
+
+    return [
+        Route("/api/runs/compared", compared),
+        Route("/api/results/compared", beside_each_other),
+    ]
 
 
 def _compared(runs: Mapping[str, Path]) -> dict[str, object]:
@@ -48,24 +65,20 @@ def _compared(runs: Mapping[str, Path]) -> dict[str, object]:
     for name, run in runs.items():
         with contextlib.suppress(ValueError):  # no study, or not finished
             studies[name] = table_of(run)
-    tables, notes = list[dict[str, object]](), list[str]()
+    tables, notes = list[ShownTable](), list[str]()
     if len(estimates) > 1:
-        tables.append(_table("Estimates with 95 % intervals", beside(estimates)))
+        tables.append(shown_table("Estimates with 95 % intervals", beside(estimates)))
     if len(studies) > 1:
         common = common_table(studies) if _are_alike(studies) else None
         if common is None:
             notes.append(f"{', '.join(studies)}: no method and estimator in common.")
         else:
-            tables.append(_table("Methods in several studies", common))
+            tables.append(shown_table("Methods in several studies", common))
     experiments, unlike = _experiments(runs)
     notes += [f"{name}: other inputs or outputs, which are not drawn." for name in unlike]
     if not tables and not experiments:
         notes.append("These runs have nothing in common that can be compared.")
     return {"tables": tables, "notes": notes, "experiments": experiments}
-
-
-def _table(title: str, table: Table) -> dict[str, object]:
-    return {"title": title, "header": table[0], "rows": table[1]}
 
 
 def _are_alike(studies: Mapping[str, StudyTable]) -> bool:

@@ -28,19 +28,33 @@ class ExperimentRequest(TypedDict):
 
 
 class IdentificationRequest(TypedDict):
-    """How an uploaded file is identified."""
+    """How uploaded files are identified; but for these, the arguments of `identify`.
+
+    `effects` are what the plant leaves out; `others` are plants that are compared with it; `fitted`
+    and `held_out` are names of files.
+    """
 
     plant: str
+    effects: list[str]
+    others: list[str]
+    fitted: list[str]
+    held_out: list[str]
     estimator: str
     initial_state: str
+    intervals: str
+    likelihood: str
+    hold_input: str
     columns: dict[str, str]
+    validate_columns: dict[str, str]
     scales: Numbers
     units: dict[str, str]
-    intervals: str
-    hold_input: str
-    effects: list[str]
+    set_inputs: Numbers
+    dt: float | None
+    rows: str | None
+    start: Numbers
     hold: Numbers
     priors: dict[str, str]
+    uncertain: dict[str, str]
 
 
 class StartedEvent(TypedDict):
@@ -181,21 +195,40 @@ class Columns(TypedDict):
     previews: dict[str, Preview]
 
 
-class Identified(TypedDict):
-    """Parameters of an uploaded record, and the samples of it that a screen can show.
+class ShownTable(TypedDict):
+    """A table of texts."""
+
+    title: str
+    header: list[str]
+    rows: list[list[str]]
+
+
+class ShownRecord(TypedDict):
+    """A record and what the fitted plant does in it: the samples that a screen can show.
 
     `is_whole` says whether these are all samples.
+    """
+
+    file: str
+    time: list[float]
+    inputs: Rows
+    outputs: Rows
+    simulated: Rows
+    is_whole: bool
+
+
+class Identified(TypedDict):
+    """Parameters from uploaded records; those held out come last.
+
+    `comparison` is the table of several plants, None where there is one.
     """
 
     kind: Literal["identified"]
     command: str
     plant: dict[str, object]
     identification: dict[str, object]
-    time: list[float]
-    inputs: Rows
-    outputs: Rows
-    simulated: Rows
-    is_whole: bool
+    records: list[ShownRecord]
+    comparison: ShownTable | None
     result: NotRequired[str]
 
 

@@ -1,8 +1,8 @@
 """The experiment that the page shows before anything is run: the events of the default one.
 
 `python -m excite.web.first` writes them to `static/first.json`, with five digits a number,
-eight of an estimate, which is shown by its small distance from the true value, and four of
-information and bounds over time, as many as a plot tells.
+eight of an estimate, which is shown by its small distance from the true value, four of inputs and
+information over time and three of bounds, as many as a plot tells.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from ..files import json_ready, write_bytes
 from . import jobs
 
 FILE = Path(__file__).with_name("static") / "first.json"
-DIGITS = {"estimate": 8, "log_det": 4, "bound_percent": 4}
+DIGITS = {"estimate": 8, "inputs": 4, "log_det": 4, "bound_percent": 3}
 
 
 def events() -> list[dict[str, Any]]:

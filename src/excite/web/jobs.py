@@ -34,9 +34,11 @@ from ..description import (
 )
 from ..estimation import NLS, Experiments, Status, stack_experiments
 from ..estimation.catalogue import ESTIMATORS
+from ..estimation.comparison import compare_plants
 from ..estimation.diagnosis import half_95
-from ..estimation.identify import InitialState, Intervals, identify
-from ..estimation.result import Identification
+from ..estimation.identify import Intervals, identify
+from ..estimation.nls import Likelihood
+from ..estimation.result import Fitted, Identification
 from ..excitation.catalogue import EXCITATIONS, LOOP
 from ..files import write_bytes
 from ..information import (
@@ -55,6 +57,8 @@ from ..record.bags import is_bag
 from ..record.figure import kept_samples
 from ..record.formats import columns_in
 from ..report.html import report_html
+from ..report.results import compared_plants, judgement
+from ..report.rows import EstimateSummary
 from ..safety import critical_levels, is_violation, max_abs_output
 from ..simulation import Experiment, Trajectory
 from .events import (
@@ -64,10 +68,11 @@ from .events import (
     ParameterRow,
     Preview,
     Row,
+    ShownRecord,
     Traces,
 )
 from .events import JobEvent as Event
-from .plants import shown_plant
+from .shown import shown_plant, shown_table
 
 NUM_ESTIMATES = 20
 _FIRST = 40  # samples before the first estimate
@@ -254,21 +259,53 @@ def _experiment_again(asked: ExperimentRequest) -> str:
     return f"{shlex.join(simulate)}\n{shlex.join(identify)}"
 
 
-def _identification_again(asked: IdentificationRequest, name: str) -> str:
-    """The command that makes the same run folder of a file."""
+def _identification_again(asked: IdentificationRequest) -> str:
+    """The command that makes the same run folder, and that which compares the same plants."""
     plant = "+".join([asked["plant"], *asked["effects"]])
-    words = [
-        "excite", "identify", f"./{name}" if name[0] == "-" else name,
-        "--plant", plant, "--estimator", asked["estimator"],
-        "--initial-state", asked["initial_state"],
-        *(["--intervals", asked["intervals"]] if asked["intervals"] != "linear" else []),
-        *(["--hold-input", asked["hold_input"]] if asked["hold_input"] != "constant" else []),
-        *_given("--hold", asked["hold"]),
-        *itertools.chain(*(_given("--prior", {n: text}) for n, text in asked["priors"].items())),
+    fitted, held_out = (
+        [f"./{name}" if name[0] == "-" else name for name in asked[kind]]
+        for kind in ("fitted", "held_out")
+    )
+    options = [
+        "--initial-state", asked["initial_state"], *_named("--validate", held_out),
+        *_given("--validate-column", asked["validate_columns"]),
         *_given("--column", asked["columns"]),
-        *_given("--scale", asked["scales"]), *_given("--unit", asked["units"]), "--out", "run",
+        *_given("--scale", asked["scales"]), *_given("--unit", asked["units"]),
+        *_given("--set-input", asked["set_inputs"]), *_unusual(asked, "dt", "rows", "hold_input"),
     ]  # fmt: skip
-    return shlex.join(words)
+    again = [
+        "excite", "identify", *fitted, "--plant", plant, "--estimator", asked["estimator"],
+        *_unusual(asked, "intervals", "likelihood"),
+        *_given("--start", asked["start"]), *_given("--hold", asked["hold"]),
+        *itertools.chain(*(_given("--prior", {n: text}) for n, text in asked["priors"].items())),
+        *_given("--uncertain", asked["uncertain"]), *options, "--out", "run",
+    ]  # fmt: skip
+    plants = [plant, *_others(asked)]
+    compare = ["excite", "compare-plants", *plants, *_named("--record", fitted), *options]
+    return "\n".join(shlex.join(words) for words in (again, compare)[: len(plants)])
+
+
+_USUAL = {
+    "intervals": "linear", "likelihood": "normal", "hold_input": "constant", "dt": None,
+    "rows": None,
+}  # fmt: skip
+
+
+def _unusual(asked: IdentificationRequest, *names: str) -> list[str]:
+    """The options of these arguments that are not the usual ones."""
+    values = {name: asked[name] for name in names if asked[name] != _USUAL[name]}
+    return [w for n, value in values.items() for w in (f"--{n.replace('_', '-')}", str(value))]
+
+
+def _named(option: str, values: Iterable[str]) -> list[str]:
+    """An option that is repeated."""
+    return [word for value in values for word in (option, value)]
+
+
+def _others(asked: IdentificationRequest) -> list[str]:
+    """The plants to compare with: none of them is the plant itself, and none is there twice."""
+    whole = "+".join([asked["plant"], *asked["effects"]])
+    return [name for name in dict.fromkeys(asked["others"]) if name != whole]
 
 
 def _given(option: str, values: Mapping[str, object]) -> list[str]:
@@ -402,36 +439,59 @@ def _noted(values: np.ndarray) -> str:
     return ", ".join(notes)
 
 
-def identified(
-    asked: IdentificationRequest, source: str, name: str, folder: str
-) -> Iterator[Event]:
-    """Parameters from an uploaded file; writes a run folder like `excite identify`."""
+def identified(asked: IdentificationRequest, source: str, folder: str) -> Iterator[Event]:
+    """Parameters from uploaded files; writes a run folder like `excite identify`."""
     plant = _plant(asked["plant"])
-    with contextlib.chdir(source):
+    plant = extended(plant, asked["effects"]) if asked["effects"] else plant
+    records = [Path(name) for name in asked["fitted"]]
+    options = {
+        "initial_state": asked["initial_state"],
+        "hold_input": asked["hold_input"],
+        "validate": [Path(name) for name in asked["held_out"]],
+        "validate_columns": asked["validate_columns"] or None,
+        "columns": asked["columns"],
+        "scales": asked["scales"],
+        "units": asked["units"],
+        "set_inputs": asked["set_inputs"] or None,
+        "dt": asked["dt"],
+        "rows": asked["rows"],
+    }
+    with contextlib.chdir(source):  # so that messages have the files' names without their folder
         result = identify(
-            Path(name),
-            extended(plant, asked["effects"]) if asked["effects"] else plant,
+            records,
+            plant,
             asked["estimator"],
-            intervals=cast(Intervals, asked["intervals"]),
-            hold_input=asked["hold_input"],
+            start=asked["start"] or None,
             hold=asked["hold"],
             prior=asked["priors"] or None,
-            initial_state=cast(InitialState, asked["initial_state"]),  # checked there
-            columns=asked["columns"],
-            scales=asked["scales"],
-            units=asked["units"],
+            uncertain=asked["uncertain"] or None,
+            likelihood=cast(Likelihood, asked["likelihood"]),  # checked there, as the others
+            intervals=cast(Intervals, asked["intervals"]),
+            **options,
         )
-    command = _identification_again(asked, name)
-    result.save(folder, command=command)
-    fitted = result.fitted[0]
-    record = fitted.record
-    signals = [*record.inputs.T, *record.outputs.T, *fitted.simulated.T]
-    kept = kept_samples(signals, _MAX_POINTS)
+        plants = [plant, *map(_plant, _others(asked))]
+        compared = compare_plants(records, plants, **options).to_dict() if plants[1:] else None
+    comparison = None if compared is None else shown_table(*compared_plants(compared))
+    command = _identification_again(asked)
+    result.save(folder, command=command.partition("\n")[0])
+    data = result.to_dict()
+    data["verdict"] = judgement(EstimateSummary.of(data))
     yield {
         "kind": "identified",
         "command": command,
         "plant": shown_plant(result.plant),
-        "identification": result.to_dict(),
+        "identification": data,
+        "records": [_shown(fitted) for fitted in (*result.fitted, *result.validation)],
+        "comparison": comparison,
+    }
+
+
+def _shown(fitted: Fitted) -> ShownRecord:
+    """The samples of a record that a screen can show."""
+    record = fitted.record
+    kept = kept_samples([*record.inputs.T, *record.outputs.T, *fitted.simulated.T], _MAX_POINTS)
+    return {
+        "file": record.source,
         "time": record.time[kept].tolist(),
         "inputs": record.inputs[kept].tolist(),
         "outputs": record.outputs[kept].tolist(),

@@ -11,14 +11,13 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, Response
 from starlette.routing import Route
 
-from ..files import write_json
+from ..files import read_json, write_json
 from ..record import READ_ENDINGS, WRONG_ENDING
 from .events import JobEvent
 from .requests import MAX_UPLOAD, RefusedError, parts
-from .sessions import MAX_STORED, UPLOADED, Session
+from .sessions import COLUMNS, MAX_FILES, MAX_STORED, UPLOADED, Session, files_of_upload
 from .workers import Call, Workers
 
-_COLUMNS = "columns.json"
 _MAX_NAME = 200  # bytes of a file's name
 _DOWNLOADS = {
     "record.csv": "text/csv",
@@ -35,27 +34,53 @@ def routes(workers: Workers, run_of: Callable[[Request], Path]) -> list[Route]:
     """
 
     async def upload(request: Request) -> FileResponse:
+        """A new upload."""
         session: Session = request.state.session
         file = _file_name(request.query_params.get("name", ""))
         name = session.begin()
         try:
             with session.making("upload", name) as place:
-                folder = place.folder / UPLOADED
-                folder.mkdir()
-                await _receive(request, folder / file, session.folder.parent)
-                wanted = {"folder": str(folder), "name": file}
-                told = await _last(workers, "columns", wanted, True)
-                columns = told if told["kind"] == "columns" else {"columns": {}, "previews": {}}
-                found = {"columns": columns["columns"], "previews": columns["previews"]}
-                write_json(place.folder / _COLUMNS, {"upload": name, "file": file, **found})
+                (place.folder / UPLOADED).mkdir()
+                own = await take(request, place.folder, file)
+                write_json(place.folder / COLUMNS, {"upload": name, "files": [own]})
                 place.is_done = True
         finally:
             session.end(name)
-        return FileResponse(place.folder / _COLUMNS)
+        return FileResponse(place.folder / COLUMNS)
+
+    async def another(request: Request) -> FileResponse:
+        """One more file of an upload."""
+        session: Session = request.state.session
+        upload, file = request.path_params["name"], _file_name(request.query_params.get("name", ""))
+        with session.using(upload, "upload") as folder:
+            if (folder / UPLOADED / file).exists():
+                raise RefusedError(409, f"{file} is there already; rename one of the two files")
+            if len(files_of_upload(folder)) >= MAX_FILES:
+                raise RefusedError(409, f"at most {MAX_FILES} files are identified together")
+            job = session.begin()
+            try:
+                own = await take(request, folder, file)
+            except BaseException:
+                (folder / UPLOADED / file).unlink(missing_ok=True)
+                raise
+            finally:
+                session.end(job)
+            before = read_json(folder / COLUMNS)
+            write_json(folder / COLUMNS, {**before, "files": [*before["files"], own]})
+            return FileResponse(folder / COLUMNS)
+
+    async def take(request: Request, folder: Path, file: str) -> dict[str, object]:
+        """Receives a file of an upload, and says what its columns are."""
+        source = folder / UPLOADED
+        await _receive(request, source / file, request.state.session.folder.parent)
+        wanted = {"folder": str(source), "name": file}
+        told = await _last(workers, "columns", wanted, True)
+        columns = told if told["kind"] == "columns" else {"columns": {}, "previews": {}}
+        return {"file": file, "columns": columns["columns"], "previews": columns["previews"]}
 
     def uploaded(request: Request) -> FileResponse:
         with request.state.session.using(request.path_params["name"], "upload") as folder:
-            return FileResponse(folder / _COLUMNS)
+            return FileResponse(folder / COLUMNS)
 
     def file(request: Request) -> FileResponse:
         asked = request.path_params
@@ -81,6 +106,7 @@ def routes(workers: Workers, run_of: Callable[[Request], Path]) -> list[Route]:
     return [
         Route("/api/uploads", upload, methods=["POST"]),
         Route("/api/uploads/{name}", uploaded),
+        Route("/api/uploads/{name}", another, methods=["POST"]),
         Route("/api/results/{name}/report.html", report),
         Route("/api/results/{name}/{file}", file),
         Route("/api/run/report.html", run_report),

@@ -24,6 +24,7 @@ Asked = Mapping[str, object]
 Body = Callable[[Request], Awaitable[dict[str, object]]]
 """Reads it."""
 
+_MAX_TEXT = 200  # characters
 _FOLDERS = re.compile(r"(?<![\w.:/])/(?:[^\s/:'\"]+/)+")
 WORD = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
 """A name from a browser: without dots, slashes and colons, so that it is never a path."""
@@ -110,12 +111,17 @@ def numbers(asked: Asked, key: str) -> dict[str, float]:
     return {str(name): number(value, name, -1e12, 1e12) for name in value}
 
 
+def text(asked: Asked, key: str) -> str:
+    """A short text."""
+    value = asked.get(key)
+    if not isinstance(value, str) or len(value) > _MAX_TEXT:
+        raise RefusedError(400, f"{key}: a short text is needed")
+    return value
+
+
 def texts(asked: Asked, key: str) -> dict[str, str]:
     """Short texts by name; at most 32."""
     value = asked.get(key, {})
     if not isinstance(value, dict) or len(value) > 32:
         raise RefusedError(400, f"{key}: texts by name are needed")
-    found = {str(name): text for name, text in value.items() if isinstance(text, str)}
-    if len(found) < len(value) or any(len(text) > 200 for text in found.values()):
-        raise RefusedError(400, f"{key}: texts by name are needed")
-    return found
+    return {str(name): text(value, name) for name in value}

@@ -13,6 +13,7 @@ from collections.abc import AsyncGenerator, Coroutine, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from ..files import read_json
 from ..study.pool import num_cores
 from .requests import RefusedError
 
@@ -23,8 +24,10 @@ MAX_STORED = 2 * 2**30
 """Limit of the data stored for all browsers [bytes]; beyond it uploads are refused."""
 MAX_KEPT = 8
 """Number of results, and of uploads, stored for a browser; the oldest is removed first."""
-UPLOADED = "file"
-"""The folder of an uploaded file, in that of its upload."""
+UPLOADED, COLUMNS = "files", "columns.json"
+"""The folder of uploaded files, in that of their upload, and what they contain."""
+MAX_FILES = 8
+"""Largest number of files of an upload."""
 GRACE = 10.0
 """A job that no page follows ends after so many seconds; loading a page again takes fewer."""
 GONE = {
@@ -76,6 +79,15 @@ class PageSettings:
         if token is None and not is_loopback(host):
             token = secrets.token_urlsafe(16)
         return cls(runs.absolute(), host, token, workers or min(4, num_cores()), cache, plants)
+
+
+def files_of_upload(folder: Path) -> list[str]:
+    """Names of the files of an upload, in the order in which they came.
+
+    Args:
+        folder: of the upload.
+    """
+    return [own["file"] for own in read_json(folder / COLUMNS)["files"]]
 
 
 def is_loopback(host: str) -> bool:

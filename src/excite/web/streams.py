@@ -10,7 +10,7 @@ import asyncio
 import contextlib
 import json
 import math
-from collections.abc import AsyncGenerator, Callable, Mapping
+from collections.abc import AsyncGenerator, Callable, Mapping, Sequence
 from contextlib import aclosing
 from pathlib import Path
 
@@ -36,12 +36,13 @@ from .requests import (
     number,
     numbers,
     plant_of,
+    text,
     texts,
     whole,
     word,
     words,
 )
-from .sessions import GONE, UPLOADED, Job, Session
+from .sessions import GONE, UPLOADED, Job, Session, files_of_upload
 from .workers import Workers
 
 FRAME = 0.04
@@ -73,8 +74,8 @@ def routes(workers: Workers, plants: Mapping[str, str], body: Body) -> list[Rout
     async def identification(request: Request) -> StreamingResponse:
         session, wanted = request.state.session, await body(request)
         upload = str(wanted.get("upload"))
-        with session.using(upload, "upload"):  # or there is none
-            asked = _identification(wanted, plants)
+        with session.using(upload, "upload") as kept:  # or there is none
+            asked = _identification(wanted, plants, files_of_upload(kept))
 
         def events(folder: Path, stop: asyncio.Event) -> Events:
             return _identified(workers, session, asked, upload, folder, stop)
@@ -121,21 +122,41 @@ def _experiment(asked: Asked, plants: Mapping[str, str]) -> ExperimentRequest:
     }
 
 
-def _identification(asked: Asked, plants: Mapping[str, str]) -> IdentificationRequest:
-    """An identification, likewise."""
+def _identification(
+    asked: Asked, plants: Mapping[str, str], files: Sequence[str]
+) -> IdentificationRequest:
+    """An identification, likewise; `files` are those of the upload."""
     return {
         "plant": plant_of(asked, plants),
+        "effects": words(asked, "effects", 32),
+        "others": [plants.get(name, name) for name in words(asked, "others", 8)],
+        "fitted": _files({"fitted": files, **asked}, "fitted", files),
+        "held_out": _files({"held_out": [], **asked}, "held_out", files),
         "estimator": _estimator(word(asked, "estimator")),
         "initial_state": word(asked, "initial_state"),
+        "intervals": word({"intervals": "linear", **asked}, "intervals"),
+        "likelihood": word({"likelihood": "normal", **asked}, "likelihood"),
+        "hold_input": word({"hold_input": "constant", **asked}, "hold_input"),
         "columns": texts(asked, "columns"),
+        "validate_columns": texts(asked, "validate_columns"),
         "scales": numbers(asked, "scales"),
         "units": texts(asked, "units"),
-        "intervals": word({"intervals": "linear", **asked}, "intervals"),
-        "hold_input": word({"hold_input": "constant", **asked}, "hold_input"),
-        "effects": words(asked, "effects", 32),
+        "set_inputs": numbers(asked, "set_inputs"),
+        "dt": None if asked.get("dt") is None else number(asked, "dt", 0, 1e9),
+        "rows": text({"rows": "", **asked}, "rows") or None,
+        "start": numbers(asked, "start"),
         "hold": numbers(asked, "hold"),
         "priors": texts(asked, "priors"),
+        "uncertain": texts(asked, "uncertain"),
     }
+
+
+def _files(asked: Asked, key: str, files: Sequence[str]) -> list[str]:
+    """Names of files of the upload."""
+    value = asked[key]
+    if not isinstance(value, list) or any(name not in files for name in value):
+        raise RefusedError(400, f"{key}: names of files of the upload are needed")
+    return [name for name in files if name in value]
 
 
 def _estimator(name: str) -> str:
@@ -223,10 +244,7 @@ async def _identified(
     stop: asyncio.Event,
 ) -> Events:
     with session.using(upload, "upload") as kept:
-        source = kept / UPLOADED
-        [file] = source.iterdir()
-        paths = {"source": str(source), "name": file.name, "folder": str(folder)}
-        arguments = {"asked": asked, **paths}
+        arguments = {"asked": asked, "source": str(kept / UPLOADED), "folder": str(folder)}
         async with aclosing(_lively(workers.events("identified", arguments), stop)) as events:
             async for event in events:
                 yield event

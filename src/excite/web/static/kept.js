@@ -25,10 +25,10 @@ export function store(storage, name, state) {
 }
 
 export class Kept {
-  /** What was kept for this form in this tab, or else in the tab that was used last. */
-  constructor(form) {
-    Object.assign(this, { form, name: `excite-${form.parentElement.id}`, details: form.querySelector("details"), isFilling: false, isRunning: false });
-    this.state = recall(this.name, { fields: {}, isOpen: false, shown: null, upload: null, mapped: null });
+  /** What was kept for this form in this tab, or else in the tab that was used last; where a plant is gone, fields that are of it stay as they are. */
+  constructor(form, areOfPlant = true) {
+    Object.assign(this, { form, areOfPlant, name: `excite-${form.parentElement.id}`, details: form.querySelector("details"), isFilling: false, isRunning: false });
+    this.state = recall(this.name, { fields: {}, isOpen: false, shown: null, upload: null, mapped: null, results: [] });
     ["input", "change", "click"].forEach((kind) => form.addEventListener(kind, () => this.save()));
     this.details?.addEventListener("toggle", () => { if (this.details.open !== this.state.isOpen) this.save(); }); // not when it is filled
   }
@@ -56,7 +56,8 @@ export class Kept {
       if (field.options && ![...field.options].some(({ value }) => value === before)) {
         if (!id.endsWith("plant")) continue;
         gone = `the plant ${before} is no longer on the server`;
-        break; // the other fields are of this plant
+        if (this.areOfPlant) break;
+        continue;
       }
       field[is] = before;
       ["input", "change"].forEach((kind) => field.dispatchEvent(new Event(kind, { bubbles: true })));

@@ -2,26 +2,32 @@
 
 import { command, download, el, get, options, say, symbol, Task, tell, upload } from "./api.js";
 import { digits, empty, Plot, range, shown } from "./plot.js";
+import { rows } from "./view.js";
 
 const section = document.getElementById("record"), form = section.querySelector("form");
 const at = (id) => document.getElementById(id);
-let catalogue, task, file = null, reading = 0;
+const NONE = " "; // of a choice of columns: there is none, but one value
+let catalogue, task, given = null, reading = 0;
 
 export function begin(known) {
   catalogue = known;
-  task = new Task(form, () => file !== null && needed().every((name) => at(`column-${name}`)?.value));
+  task = new Task(form, () => given !== null && needed().every((name) => at(`column-${name}`)?.value && (at(`column-${name}`).value !== NONE || at(`value-${name}`).value !== "")));
   options(at("record-plant"), Object.keys(catalogue.plants), "aero2");
   options(at("estimator"), catalogue.estimators, "nls");
-  at("record-plant").addEventListener("change", () => { effects(); beforehand(); showMapping(); });
+  at("record-plant").addEventListener("change", () => { ofPlant(); showMapping(); });
   at("effects").addEventListener("change", beforehand);
-  effects();
-  beforehand();
-  at("file").addEventListener("change", () => take(at("file").files[0]));
+  ofPlant();
+  at("file").addEventListener("change", () => take([...at("file").files]));
+  at("more").addEventListener("change", () => take([...at("more").files], given));
   const drop = section.querySelector(".drop");
   const over = (is) => (event) => { event.preventDefault(); drop.classList.toggle("over", is); };
   section.addEventListener("dragover", over(true));
   section.addEventListener("dragleave", over(false));
-  section.addEventListener("drop", (event) => { over(false)(event); take(event.dataTransfer.files[0]); });
+  section.addEventListener("drop", (event) => { over(false)(event); take([...event.dataTransfer.files]); });
+  at("side-by-side").querySelector("button").addEventListener("click", () => {
+    task.kept.save({ results: task.kept.state.results.slice(-1) });
+    at("side-by-side").hidden = true;
+  });
   form.addEventListener("submit", (event) => { event.preventDefault(); identify(asked()); });
   again(task.kept.fill());
 }
@@ -39,40 +45,61 @@ async function again(gone) {
   if (own === reading && gone) say(form, gone, true);
 }
 
-/** Shows a file that the server has read; its columns as they were assigned if it is the one before, by name and columns. */
+/** Shows files that the server has read; columns as they were assigned if these are the files before, by names and columns, and one more. */
 function put(taken) {
-  file = taken;
-  const mapped = JSON.stringify([file.file, Object.keys(file.columns)]);
+  const isAdded = given?.upload === taken.upload;
+  given = taken;
+  const mapped = JSON.stringify(given.files.map(({ file, columns }) => [file, Object.keys(columns)]));
+  roles();
   showMapping();
-  if (mapped === task.kept.state.mapped) task.kept.fill();
-  task.kept.save({ upload: file.upload, mapped });
+  if (isAdded || mapped === task.kept.state.mapped) task.kept.fill();
+  task.kept.save({ upload: given.upload, mapped });
   preview();
   task.refresh();
-  const counts = Object.values(file.columns);
-  say(form, `${file.file}: ${counts.length} columns, ${Math.max(...counts)} samples. ${task.isBusy ? "Another file is still being identified; wait, or stop it." : "Map them, then identify."}`);
+  const { file, columns } = given.files.at(-1), counts = Object.values(columns);
+  say(form, `${file}: ${counts.length} ${counts.length > 1 ? "columns" : "column"}, ${Math.max(...counts)} samples. ${task.isBusy ? "Another file is still being identified; wait, or stop it." : "Map them, then identify."}`);
 }
 
-async function take(chosen) {
-  if (!chosen) return;
+/** Reads files, one after the other; they replace those before, or are added to them. */
+async function take(chosen, before = null) {
+  if (!chosen.length) return;
   const own = (reading += 1);
-  file = null;
-  task.refresh();
-  if (!task.isBusy) hideResults();
-  task.kept.save({ upload: null, shown: task.job });
-  at("mapping").hidden = true;
-  say(form, `Reading ${chosen.name}…`);
-  try {
-    const taken = await upload(`api/uploads?name=${encodeURIComponent(chosen.name)}`, chosen);
-    if (own !== reading) return; // another was chosen while this one was read
-    put(taken);
-  } catch (error) {
-    if (own === reading) say(form, error.message, true);
+  let taken = before;
+  if (!before) {
+    given = null;
+    task.refresh();
+    if (!task.isBusy) hideResults();
+    task.kept.save({ upload: null, shown: task.job });
+    ["mapping", "files"].forEach((id) => { at(id).hidden = true; });
+  }
+  for (const one of chosen) {
+    say(form, `Reading ${one.name}…`);
+    try {
+      taken = await upload(`api/uploads${taken ? `/${taken.upload}` : ""}?name=${encodeURIComponent(one.name)}`, one);
+      if (own !== reading) return; // another was chosen while this one was read
+      put(taken);
+    } catch (error) {
+      if (own === reading) say(form, error.message, true);
+      return;
+    }
   }
 }
 
-/** The first rows of the file, and a small plot of every column over its rows. */
+/** What each file is for. */
+function roles() {
+  at("files").hidden = false;
+  at("more").value = "";
+  at("files").querySelector("div").replaceChildren(...given.files.map(({ file }, i) => {
+    const select = el("select", { id: `role-${i}` });
+    options(select, ["fitted", "held out", "not used"]);
+    return el("div", { class: "field" }, el("label", { for: select.id }, file), select);
+  }));
+}
+const filesAs = (role) => given.files.map(({ file }) => file).filter((_, i) => at(`role-${i}`).value === role);
+
+/** The first rows of the newest file, and a small plot of every column over its rows. */
 function preview() {
-  const names = Object.keys(file.previews), rows = names.length ? file.previews[names[0]].first.length : 0;
+  const file = given.files.at(-1), names = Object.keys(file.previews), rows = names.length ? file.previews[names[0]].first.length : 0;
   at("preview").hidden = !names.length;
   at("preview").querySelector("h2").textContent = `The file: ${file.file}`;
   at("first-rows").replaceChildren(
@@ -95,40 +122,60 @@ function cell(text) {
   return el("td", { title: value !== +text && text }, value && Math.abs(value) < 1e-4 ? value.toExponential() : String(value));
 }
 
-const effects = () => at("effects").replaceChildren(...plant().effects.map((name) => el("label", {}, el("input", { id: `effect-${name}`, type: "checkbox", value: name }), name)));
-const boxes = () => [...at("effects").querySelectorAll("input")];
+/** What is chosen of a plant: its effects, what is known of it, and plants with the same inputs and outputs. */
+function ofPlant() {
+  effects();
+  beforehand();
+  const { constants, inputs, outputs } = plant(), signals = (p) => [...p.inputs, ...p.outputs].map(({ name }) => name).join();
+  const like = Object.entries(catalogue.plants).filter(([name, p]) => name !== at("record-plant").value && signals(p) === signals({ inputs, outputs }));
+  at("others").replaceChildren(...like.map(([name]) => el("label", {}, el("input", { id: `other-${name}`, type: "checkbox", value: name }), name)));
+  at("others").parentElement.hidden = !like.length;
+  at("uncertain").replaceChildren(...constants.map(({ name, unit }) => el("div", { class: "field" },
+    el("label", { for: `uncertain-${name}` }, symbol(name), " ", el("span", { class: "unit" }, unit)),
+    el("input", { id: `uncertain-${name}`, type: "text", placeholder: "exact", maxlength: 200, spellcheck: "false" }))));
+  at("uncertain").parentElement.hidden = !constants.length;
+}
 
-/** A row a parameter, also of the chosen effects: its known value, or its prior. What was given stays. */
+const effects = () => at("effects").replaceChildren(...plant().effects.map((name) => el("label", {}, el("input", { id: `effect-${name}`, type: "checkbox", value: name }), name)));
+const boxes = (id) => [...at(id).querySelectorAll("input")];
+const checked = (id) => boxes(id).filter((box) => box.checked).map((box) => box.value);
+
+/** A row a parameter, also of the chosen effects: its known value, the start of the search, or its prior. What was given stays. */
 function beforehand() {
-  const given = (id) => at(id)?.value ?? "";
+  const before = (id) => at(id)?.value ?? "";
   at("beforehand").replaceChildren(...estimated().map((name) => {
-    const [hold, prior] = [`hold-${name}`, `prior-${name}`], input = (id, how) => el("input", { id, value: given(id), ...how });
-    const { unit = "" } = plant().parameters.find((p) => p.name === name) ?? {};
+    const { unit = "", nominal = "" } = plant().parameters.find((p) => p.name === name) ?? {};
+    const field = (kind, how, ...title) => el("div", { class: "field" }, el("label", { for: `${kind}-${name}` }, ...title), el("input", { id: `${kind}-${name}`, value: before(`${kind}-${name}`), ...how }));
     return el("div", { class: "known" },
-      el("div", { class: "field" }, el("label", { for: hold }, "hold ", symbol(name), " ", el("span", { class: "unit" }, unit)), input(hold, { type: "number", step: "any", placeholder: "estimated" })),
-      el("div", { class: "field" }, el("label", { for: prior }, "prior of ", symbol(name)), input(prior, { type: "text", placeholder: "none", maxlength: 200, spellcheck: "false" })));
+      field("hold", { type: "number", step: "any", placeholder: "estimated" }, "hold ", symbol(name), " ", el("span", { class: "unit" }, unit)),
+      field("start", { type: "number", step: "any", placeholder: nominal && shown(nominal) }, "start of ", symbol(name)),
+      field("prior", { type: "text", placeholder: "none", maxlength: 200, spellcheck: "false" }, "prior of ", symbol(name)));
   }));
 }
 
-const estimated = () => [...plant().parameters.map((p) => p.name), ...boxes().filter((box) => box.checked).map((box) => box.value)];
-/** What is given of the parameters: numbers that are held, or priors. */
-const given = (kind, as) => Object.fromEntries(estimated().map((name) => [name, at(`${kind}-${name}`).value.trim()]).filter(([, text]) => text).map(([name, text]) => [name, as(text)]));
+const estimated = () => [...plant().parameters.map((p) => p.name), ...checked("effects")];
+/** What fields of a kind have, by the name of a parameter, a constant or a signal; those that are empty are left out. */
+const filled = (kind, names, as = String) => Object.fromEntries(names.map((name) => [name, at(`${kind}-${name}`).value.trim()]).filter(([, text]) => text).map(([name, text]) => [name, as(text)]));
 
 const plant = () => catalogue.plants[at("record-plant").value];
-const needed = () => ["time", ...plant().inputs.map((p) => p.name), ...plant().outputs.map((p) => p.name)];
+const inputs = () => plant().inputs.map((p) => p.name);
+const signals = () => [...inputs(), ...plant().outputs.map((p) => p.name)];
+const needed = () => ["time", ...signals()];
 const unitsOf = (name) => [...plant().inputs, ...plant().outputs].find((p) => p.name === name)?.units ?? plant().units_of_time;
 /** The unit that a column's name gives in brackets, such as "t [ms]" or "angle (deg)". */
 const unitIn = (column) => /[[(]([^\])]+)[\])]\s*$/.exec(column)?.[1].trim();
 
 function showMapping() {
-  if (file === null) return;
-  const there = Object.keys(file.columns), found = (name) => there.find((c) => c.toLowerCase() === name.toLowerCase()) ?? there.find((c) => c.toLowerCase().split(/[\s([]/)[0] === name.toLowerCase());
+  if (given === null) return;
+  const there = Object.keys(given.files[0].columns), found = (name) => there.find((c) => c.toLowerCase() === name.toLowerCase()) ?? there.find((c) => c.toLowerCase().split(/[\s([]/)[0] === name.toLowerCase());
   at("mapping").hidden = false;
   at("mapping").querySelector("div").replaceChildren(...needed().map((name) => {
     const select = el("select", { id: `column-${name}` });
-    const likely = found(name) ?? (name === "time" ? there.find((c) => /^(t|time|timestamps?)(?![a-z])/i.test(c)) : undefined);
+    const likely = found(name) ?? (name === "time" ? there.find((c) => /^(t|time|timestamps?|ts|dt)(?![a-z])/i.test(c)) : undefined);
     options(select, there, likely);
     if (likely === undefined) select.prepend(el("option", { value: "", selected: true }, "choose…"));
+    const isOne = name === "time" || inputs().includes(name); // one value will do
+    if (isOne) select.append(el("option", { value: NONE }, name === "time" ? "none: a sampling time" : "none: a constant"));
     const unit = el("select", { id: `unit-${name}` });
     const hint = el("p", { class: "hint", role: "status" });
     const guess = () => {
@@ -137,37 +184,64 @@ function showMapping() {
       hint.textContent = word === undefined || words.includes(word) ? "" : `unit "${word}" is not known: choose one`;
     };
     unit.addEventListener("change", () => { hint.textContent = ""; });
-    select.addEventListener("change", () => { guess(); task.refresh(); });
-    guess();
-    return el("div", { class: "map" },
-      el("div", { class: "field" }, el("label", { for: select.id }, name), select),
-      el("div", { class: "field" }, el("label", { for: unit.id }, "unit", el("span", { class: "unseen" }, ` of ${name}`)), unit),
-      el("div", { class: "field" }, el("label", { for: `scale-${name}` }, "scale", el("span", { class: "unseen" }, ` of ${name}`)),
-        el("input", { id: `scale-${name}`, type: "number", step: "any", placeholder: "none" })),
-      hint);
+    const part = (id, title, input, is = {}) => el("div", { class: "field", ...is }, el("label", { for: id }, title, el("span", { class: "unseen" }, ` of ${name}`)), input);
+    const number = (kind, how) => el("input", { id: `${kind}-${name}`, type: "number", step: "any", ...how });
+    const value = part(`value-${name}`, name === "time" ? "sampling time [s]" : `value [${unitsOf(name)[0]}]`, number("value", {}));
+    const units = [part(unit.id, "unit", unit), part(`scale-${name}`, "scale", number("scale", { placeholder: "none" }))];
+    value.addEventListener("input", () => task.refresh());
+    const change = () => {
+      guess();
+      const isNone = select.value === NONE;
+      value.hidden = !isNone;
+      units.forEach((one) => { one.hidden = isNone; });
+      task.refresh();
+    };
+    select.addEventListener("change", change);
+    change();
+    return el("div", { class: "map" }, el("div", { class: "field" }, el("label", { for: select.id }, name), select), ...units, value, hint);
   }));
+  at("held-out").replaceChildren(...signals().map((name) => {
+    const select = el("select", { id: `held-out-${name}` });
+    options(select, there);
+    select.prepend(el("option", { value: "", selected: true }, "the same"));
+    return el("div", { class: "field" }, el("label", { for: select.id }, name), select);
+  }));
+  at("held-out").parentElement.hidden = false;
   task.refresh();
 }
 
 function asked() {
-  const scales = {}, units = {};
+  const scales = {}, units = {}, columns = {}, one = {};
   for (const name of needed()) {
+    if (at(`column-${name}`).value === NONE) { one[name] = +at(`value-${name}`).value; continue; }
+    columns[name] = at(`column-${name}`).value;
     if (at(`scale-${name}`).value !== "") scales[name] = +at(`scale-${name}`).value;
     else if (at(`unit-${name}`).selectedIndex) units[name] = at(`unit-${name}`).value;
   }
+  const { time: dt = null, ...set } = one, [fitted, apart] = ["fitted", "held out"].map(filesAs), other = filled("held-out", signals());
   return {
-    upload: file.upload,
+    upload: given.upload,
+    fitted,
+    held_out: apart.length || !Object.keys(other).length ? apart : fitted.slice(0, 1),
     plant: at("record-plant").value,
-    columns: Object.fromEntries(needed().map((name) => [name, at(`column-${name}`).value])),
+    effects: checked("effects"),
+    others: checked("others"),
+    columns,
+    validate_columns: other,
     scales,
     units,
+    set_inputs: set,
+    dt,
+    rows: at("rows").value.trim(),
     estimator: at("estimator").value,
     initial_state: at("initial").value,
-    effects: boxes().filter((box) => box.checked).map((box) => box.value),
-    hold_input: at("hold-input").value,
     intervals: at("intervals").value,
-    hold: given("hold", Number),
-    priors: given("prior", String),
+    likelihood: at("likelihood").value,
+    hold_input: at("hold-input").value,
+    start: filled("start", estimated(), Number),
+    hold: filled("hold", estimated(), Number),
+    priors: filled("prior", estimated()),
+    uncertain: filled("uncertain", plant().constants.map(({ name }) => name)),
   };
 }
 
@@ -189,49 +263,81 @@ async function follow(address, request) {
   if (found) show(wanted, found);
 }
 
-const results = () => section.querySelectorAll(".view > section:not(#preview)");
+const results = () => section.querySelectorAll(".view > section:not(#preview, #side-by-side)");
 const hideResults = () => results().forEach((part) => { part.hidden = true; });
 
 /** Shows what was found for a request. */
-function show(wanted, { identification, plant: fitted, result, time, inputs, outputs, simulated, is_whole: isWhole, command: again }) {
+function show(wanted, { identification, plant: fitted, result, records, comparison, command: again }) {
   results().forEach((part) => { part.hidden = false; });
   say(form, `Done: ${identification.status}.`);
   section.querySelector(".view h2").textContent = `Identified: ${identification.files.join(", ")}, ${fitted.name}`;
   table(at("identified"), identification);
-  const fits = Object.entries(identification.fit_percent).filter(([, value]) => value !== null).map(([name, value]) => `${name}: fit ${shown(value, 4)} %${tests(identification, name)}`);
-  at("record-verdict").replaceChildren(...[...fits, ...identification.verdict].map((text) => el("li", {}, text)));
+  at("record-verdict").replaceChildren(...identification.verdict.map((text) => el("li", {}, text)));
   section.querySelector(".downloads").replaceChildren(
     download(`api/results/${result}/report.html`, "Report"),
-    download(`api/results/${result}/record.csv`, "Record"),
-    download(`api/results/${result}/record.json`, "Sidecar"),
+    ...(identification.files.length > 1 ? [] : [download(`api/results/${result}/record.csv`, "Record"), download(`api/results/${result}/record.json`, "Sidecar")]),
     download(`api/results/${result}/estimate.json`, "Estimate"));
   causes(wanted, identification.suspects ?? []);
+  at("compared-plants").replaceChildren(...(comparison ? [el("h3", {}, comparison.title), rows(comparison, comparison.title)] : []));
+  at("profiles").replaceChildren();
+  starts(identification.starts ?? []);
   profiles(identification);
   correlations(Object.keys(identification.params), identification.correlation ?? []);
   at("record-again").replaceChildren(command(again));
-  const parent = at("record-signals"), x = [time[0], time.at(-1)];
-  empty(parent, at("residual-echoes"));
-  const title = (part) => el("span", {}, part.name, " ", el("span", { class: "unit" }, part.shown_unit));
+  empty(at("record-signals"), at("residual-echoes"));
+  records.forEach((record, k) => signalsOf(record, fitted, records.length > 1 ? `${record.file}${k < identification.files.length ? "" : ", held out"}: ` : ""));
+  beside(result);
+}
+
+/** Input, output and residual of a record; `about` begins the titles. */
+function signalsOf({ time, inputs, outputs, simulated, is_whole: isWhole }, fitted, about) {
+  const parent = el("div", { class: `plots ${about && "own"}` }), x = [time[0], time.at(-1)];
+  at("record-signals").append(parent);
+  const title = (part) => el("span", {}, about, part.name, " ", el("span", { class: "unit" }, part.shown_unit));
   fitted.inputs.forEach((part, i) => {
     const y = inputs.map((row) => row[i]);
-    new Plot(parent, title(part), `${part.name} over time`).show({ x, y: range(y, 0), unit: "s", lines: [{ x: time, y, color: "input", step: true, width: 1.3 }] });
+    new Plot(parent, title(part), `${about}${part.name} over time`).show({ x, y: range(y, 0), unit: "s", lines: [{ x: time, y, color: "input", step: true, width: 1.3 }] });
   });
   fitted.outputs.forEach((part, i) => {
     const measured = outputs.map((row) => row[i] * part.factor), model = simulated.map((row) => row[i] * part.factor);
-    new Plot(parent, title(part), `${part.name}, measured and simulated, over time`).show({
+    new Plot(parent, title(part), `${about}${part.name}, measured and simulated, over time`).show({
       x, y: range([...measured, ...model], 0), unit: "s",
       lines: [{ x: time, y: measured, name: "measured", color: "output", points: true }, { x: time, y: model, name: "simulated", color: "simulated" }],
     });
     const left = measured.map((v, k) => v - model[k]);
-    new Plot(parent, el("span", {}, "residual of ", title(part)), `measured minus simulated ${part.name}`).show({
+    new Plot(parent, el("span", {}, "residual of ", title(part)), `${about}measured minus simulated ${part.name}`).show({
       x, y: range(left, 0), unit: "s", lines: [{ x: time, y: left, color: "output", width: 1 }],
     });
     if (!isWhole) return;
     const { lags, values, bound } = echoes(left), most = lags.at(-1) + 0.5;
-    new Plot(at("residual-echoes"), el("span", {}, "correlation of the residual of ", part.name), `autocorrelation of the residual of ${part.name} over the lag in samples; white noise lies within the band in 95 %`).show({
+    new Plot(at("residual-echoes"), el("span", {}, "correlation of the residual of ", about, part.name), `${about}autocorrelation of the residual of ${part.name} over the lag in samples; white noise lies within the band in 95 %`).show({
       x: [0, most], y: range(values, -0.2, 0.2), unit: "samples", bands: [{ x: [0, most], lower: [-bound, -bound], upper: [bound, bound], color: "band" }],
       lines: [{ x: lags, y: values, color: "output", points: true }],
     });
+  });
+}
+
+/** What was identified before, beside the newest; results that the server no longer has are left out. */
+async function beside(newest) {
+  const names = [...task.kept.state.results.filter((name) => name !== newest), newest].slice(-6);
+  task.kept.save({ results: names });
+  at("side-by-side").hidden = names.length < 2;
+  if (names.length < 2) return;
+  try {
+    const found = await get(`api/results/compared?${names.map((name) => `name=${encodeURIComponent(name)}`).join("&")}`);
+    at("side-by-side").hidden = found.header.length < 4;
+    at("side-by-side").querySelector("div").replaceChildren(rows(found, found.title));
+  } catch { at("side-by-side").hidden = true; }
+}
+
+/** The costs at which the starts of the search ended, the best first. */
+function starts(costs) {
+  const y = costs.filter(Number.isFinite).sort((a, b) => a - b), least = y[0], x = y.map((_, k) => k + 1);
+  if (y.length < 2) return;
+  const own = el("div", { class: "own" });
+  at("profiles").append(own);
+  new Plot(own, "starts of the search", "cost over the least at which each start of the search ended, the best first").show({
+    x: [0.5, y.length + 0.5], y: range(y.map((cost) => cost / least), 0.8, 1.2), unit: "start", lines: [{ x, y: y.map((cost) => cost / least), name: "cost / least", color: "output", dots: true }],
   });
 }
 
@@ -241,7 +347,7 @@ function causes(wanted, suspects) {
   at("causes").replaceChildren(...possible.slice(0, 3).map(({ name }, i) => el("button", {
     type: "button", click: () => {
       const more = { ...wanted, effects: [...wanted.effects, name] };
-      if (at("record-plant").value === wanted.plant) boxes().forEach((box) => { box.checked = more.effects.includes(box.value); });
+      if (at("record-plant").value === wanted.plant) boxes("effects").forEach((box) => { box.checked = more.effects.includes(box.value); });
       if (at("record-plant").value === wanted.plant) beforehand();
       identify(more);
     },
@@ -250,7 +356,6 @@ function causes(wanted, suspects) {
 
 /** The profile likelihoods: growth of the squares over its limit, with the ends of the interval. */
 function profiles({ params, profiles: every }) {
-  at("profiles").replaceChildren();
   for (const [name, points] of Object.entries(every ?? {})) {
     const drawn = points.filter(([value, growth]) => Number.isFinite(value) && Number.isFinite(growth) && growth < 5).sort(([a], [b]) => a - b);
     if (drawn.length < 2) continue;
@@ -284,12 +389,6 @@ function echoes(left, most = 30) {
   const own = left.map((v) => (Number.isFinite(v) ? v - mean : 0)), power = own.reduce((a, v) => a + v * v, 0) || 1;
   const lags = Array.from({ length: Math.min(most, left.length - 1) }, (_, k) => k + 1);
   return { lags, values: lags.map((k) => own.slice(k).reduce((a, v, i) => a + v * own[i], 0) / power), bound: 1.96 / Math.sqrt(seen.length) };
-}
-
-/** What the tests of a residual say; the verdict says what follows from a small p. */
-function tests({ whiteness_p_value: white, structure_p_value: follows }, name) {
-  if (!Number.isFinite(white?.[name]) || !Number.isFinite(follows?.[name])) return "";
-  return `; residual white with p = ${shown(white[name])}, independent of the input with p = ${shown(follows[name])}`;
 }
 
 const interval = ({ estimate, std_error: sd, ci95 }) => (Number.isFinite(ci95?.[0])

@@ -14,7 +14,7 @@ export function begin(catalogue) {
   form.querySelector(".primary").disabled = false;
   form.addEventListener("input", tellResources);
   form.addEventListener("submit", (event) => { event.preventDefault(); start(); });
-  const gone = new Kept(form).fill();
+  const gone = new Kept(form, false).fill();
   if (gone) say(form, gone, true);
 }
 

@@ -1,9 +1,11 @@
-"""The description of a plant as the page shows it."""
+"""A plant's description and a table as the page shows them."""
 
 from __future__ import annotations
 
 from ..description import PlantDescription, display_unit
 from ..record.units import known_units
+from ..report.tables import Table
+from .events import ShownTable
 
 
 def shown_plant(description: PlantDescription) -> dict[str, object]:
@@ -13,3 +15,8 @@ def shown_plant(description: PlantDescription) -> dict[str, object]:
         part["shown_unit"], part["factor"] = display_unit(part["unit"])
         part["units"] = known_units(part["unit"])
     return {**data, "units_of_time": known_units("s")}
+
+
+def shown_table(title: str, table: Table) -> ShownTable:
+    """A table of texts."""
+    return {"title": title, "header": table[0], "rows": table[1]}
