@@ -203,6 +203,17 @@ def test_openblas_of_a_worker_has_one_thread():
     assert there == {"t": 1}
 
 
+def test_openblas_of_a_command_has_one_thread():
+    """Threads that wait for one another make a fit five times as long on a busy computer."""
+    told = "import excite.cli.options as o; o.prepare_jax(); import tasks; "
+    told += "print(tasks.num_blas_threads())"
+    own = {n: value for n, value in os.environ.items() if not n.endswith("_NUM_THREADS")}
+    own["PYTHONPATH"] = str(Path(__file__).parent)
+    words = [sys.executable, "-c", told]
+    done = subprocess.run(words, env=own, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "1"
+
+
 def test_ctrl_c_ends_the_workers_at_once(tmp_path):
     markers = [tmp_path / str(i) for i in range(2)]
 

@@ -237,6 +237,10 @@ def prepare_jax() -> None:
     """Double precision, and a cache of compiled programs."""
     # Tracing makes many objects; searching all of them for cycles is a sixth of a first command.
     gc.set_threshold(100_000, 20, 20)
+    # On a busy computer the threads of OpenBLAS wait for one another: a fit then takes five times
+    # as long. NumPy reads this when it is imported.
+    for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
     # The user cannot act on the compiler's messages about its cache.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     import jax
