@@ -1,7 +1,8 @@
 # Everything a newcomer needs: `make demo`, `make test`. Only Python 3.11 or newer and make are expected.
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
-INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
+# Modules are compiled when they are first imported: of most packages few are.
+INSTALL := $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check --constraint constraints.txt
 
 PYTEST := $(BIN)/python -m pytest -n 2
 # Thousands of small programs are compiled in the tests and run once: compiling is most of their time.

@@ -73,8 +73,14 @@ def require_enough(
     num_params: int,
     knows_state: bool,
     num_priors: int = 0,
+    has_prior: bool = False,
 ) -> None:
-    """Raises ValueError where there are not more measured values, and priors, than unknowns."""
+    """Raises ValueError where there are not more measured values, and priors, than unknowns.
+
+    Args:
+        num_priors: how many priors count as values.
+        has_prior: whether there are priors, which may not count.
+    """
     where = " and ".join(record.source or "the record" for record in records)
     if any(len(record.time) < 2 for record in records):
         raise ValueError(f"{where}: a record needs at least two samples")
@@ -83,10 +89,10 @@ def require_enough(
     states = 0 if knows_state and parts == len(records) else parts * len(plant.definition.states)
     if values + num_priors <= num_params + states:
         known = f"{values} measured values" + f" and {num_priors} priors" * bool(num_priors)
+        counted = " (with NLS(noise='known') a normal prior of a parameter counts as a value)"
         raise ValueError(
             f"{where}: {known} for {num_params + states} unknowns ({num_params} parameters, "
-            f"{states} initial states); more values than unknowns are needed (with "
-            "NLS(noise='known') a normal prior of a parameter counts as a value)"
+            f"{states} initial states); more values than unknowns are needed{counted * has_prior}"
         )
 
 

@@ -227,7 +227,8 @@ def identify(
         initial_state == "auto" and all(starts_at(record, plant) for record in records)
     )
     num_free, num_priors = int(np.sum(~known_parameters(plant, estimator))), _priors(estimator)
-    require_enough(plant, records, num_free, known or by_steps, num_priors)
+    has_prior = prior is not None or (isinstance(estimator, NLS) and estimator.prior is not None)
+    require_enough(plant, records, num_free, known or by_steps, num_priors, has_prior)
     way = way_to_state(validate_state)
     shares = [state_from(record, plant, way) for record in validation]
     for record in validation:

@@ -204,12 +204,13 @@ _ROWS = re.compile(r"(-?\d{1,18})?:(-?\d{1,18})?(?::(\d{1,18})?)?")
 def _slice_of(rows: slice | str | None) -> slice:
     """The rows to use, from a Python slice or its text."""
     found = _ROWS.fullmatch(rows.replace(" ", "")) if isinstance(rows, str) else None
+    told = reprlib.repr(rows)
     if found:
         rows = slice(*(None if number is None else int(number) for number in found.groups()))
     rows = slice(None) if rows is None else rows
     if not isinstance(rows, slice) or (rows.step is not None and rows.step < 1):
         raise ValueError(
-            f"rows {reprlib.repr(rows)} are not allowed: START:STOP or START:STOP:STEP, counted "
+            f"rows {told} are not allowed: START:STOP or START:STOP:STEP, counted "
             "from 0 below the names, such as 100:1000:5"
         )
     return rows

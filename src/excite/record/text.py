@@ -106,7 +106,7 @@ def _look(path: Path) -> _Look:
         try:
             return _look_in(path, encoding)
         except UnicodeDecodeError as error:
-            reason = str(error)
+            reason = f"byte {error.object[error.start]:#04x} is no character"
     raise _no_text(path, reason)
 
 

@@ -66,13 +66,19 @@ class Answer:
              f"{row.log_det_information:.2f}",
              *(number(row.relative_error_percent[name].mean, 3) for name in names),
              violations_cell(row)]
-            for row in self.rows[:_MOST_ROWS]
+            for row in self._shown
         ]  # fmt: skip
+
+    @property
+    def _shown(self) -> list[Row]:
+        """Rows that fit one screen: those with violations are not left out for want of room."""
+        bad = [row for row in self.rows if row.violations][: _MOST_ROWS // 2]
+        return [row for row in self.rows if not row.violations][: _MOST_ROWS - len(bad)] + bad
 
     @property
     def caption(self) -> str:
         """Of the table and the figure, to be copied."""
-        row, left = self.rows[0], len(self.rows) - _MOST_ROWS
+        row, left = self.rows[0], len(self.rows) - len(self._shown)
         more = f" {left} more are in the table of all results." * (left > 0)
         gain = (
             "Expected information gain (nats), information"
@@ -181,10 +187,9 @@ def _told(
     """The answer in sentences."""
     if best is None:
         least = min(ranked, key=lambda row: row.violation_rate.estimate)
-        return (
-            f"No excitation was without a violation: {least.method} had the fewest, "
-            f"{least.violations} of {least.evaluations}.",
-        )
+        few = f"{least.violations} of {least.evaluations}"
+        few = few if least.by_seed is None else violations_cell(least)
+        return (f"No excitation was without a violation: {least.method} had the fewest, {few}.",)
     many = f"Of {len(safe)} excitations" if len(safe) > 1 else "The only excitation"
     told = f"{many} that reached no critical level in these experiments"
     told += f", {best.method} tells most about the plant" * (len(safe) > 1)
@@ -240,6 +245,18 @@ def told_of_record(d: PlantDescription, record: Record) -> tuple[str, ...]:
     if ended is None:
         return told, "The experiment is still running, or its process was killed."
     return told, f"The experiment ended after {lasted:.4g} s: {str(ended['reason']).rstrip('.')}."
+
+
+def told_of_levels(d: PlantDescription, records: Sequence[Record]) -> tuple[str, ...]:
+    """Of each record in which an output reached a safety level, which and when."""
+    told = []
+    for record in records:
+        most = np.nanmax(np.abs(record.outputs), axis=0, initial=0.0)
+        levels = [(part.warning_level, part.critical_level) for part in d.outputs]
+        if any(w <= m for m, own in zip(most, levels, strict=True) for w in own if w is not None):
+            where = f"{record.source}: " * (len(records) > 1)
+            told.append(where + told_of_record(d, record)[0])
+    return tuple(told)
 
 
 def _reached(part: Output, time: np.ndarray, size: np.ndarray) -> str:

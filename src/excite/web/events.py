@@ -133,13 +133,12 @@ class Row(TypedDict):
 
 
 class Traces(TypedDict):
-    """Signals of an experiment, and what it tells over time.
+    """Signals of an experiment at the times of its samples, and what it tells over time.
 
     `bound_percent` is the Cramér-Rao bound of each parameter, one standard deviation, in percent
     of the true value; it and `log_det` have one number after each input.
     """
 
-    time: list[float]
     inputs: Rows
     outputs: Rows
     log_det: list[float]

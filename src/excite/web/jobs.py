@@ -56,6 +56,7 @@ from ..record import column_lengths
 from ..record.bags import is_bag
 from ..record.figure import kept_samples
 from ..record.formats import columns_in
+from ..report.answer import told_of_identification, told_of_levels
 from ..report.html import report_html
 from ..report.results import compared_plants, judgement
 from ..report.rows import EstimateSummary
@@ -366,7 +367,6 @@ def _traces(own: Experiment, run: Trajectory, information: Array) -> Traces:
     percent = 100 * bounds * np.asarray(relative_size(own.plant, own.params)) / per
     names = names_of(own.plant.definition.parameters)
     return {
-        "time": run.time.tolist(),
         "inputs": run.inputs.tolist(),
         "outputs": run.outputs.tolist(),
         "log_det": jax.vmap(d_optimality)(information).tolist(),
@@ -387,14 +387,17 @@ def columns(folder: str, name: str) -> Iterator[Event]:
         path = Path(name)
         cells = {} if is_bag(path) else columns_in(path)
         counts = {n: len(own) for n, own in cells.items()} if cells else column_lengths(path)
-    if not counts:
-        raise ValueError(f"{name} has no column of numbers")
+    previews = _previews(cells)
+    if not counts or (cells and not any(own["index"] for own in previews.values())):
+        raise ValueError(f"{name} has no column of numbers below names; is it a log file?")
+    if not max(counts.values()):
+        raise ValueError(f"{name} has names of columns, but no samples below them")
     if len(counts) > _MAX_COLUMNS or max(map(len, counts)) > _MAX_NAME:
         raise ValueError(
             f"{name} has {len(counts)} columns, the longest name has {max(map(len, counts))} "
             f"characters; at most {_MAX_COLUMNS} columns of {_MAX_NAME} characters are taken"
         )
-    yield {"kind": "columns", "columns": counts, "previews": _previews(cells)}
+    yield {"kind": "columns", "columns": counts, "previews": previews}
 
 
 def _previews(columns: Mapping[str, np.ndarray]) -> dict[str, Preview]:
@@ -417,7 +420,10 @@ def _previews(columns: Mapping[str, np.ndarray]) -> dict[str, Preview]:
 
 
 def _noted(values: np.ndarray) -> str:
-    """What a column shows: its sampling and gaps, missing values, a suspected saturation."""
+    """What a column shows: its sampling and gaps, missing values, a suspected saturation.
+
+    A signal that rests at zero is off, and not saturated.
+    """
     known = values[np.isfinite(values)]
     if len(known) < 3:
         return ""
@@ -434,7 +440,7 @@ def _noted(values: np.ndarray) -> str:
     elif len(np.unique(known)) > _FEW_VALUES:
         for end, word in ((known.max(), "largest"), (known.min(), "smallest")):
             is_at = known == end
-            if is_at.mean() >= _OFTEN and np.any(is_at[:-2] & is_at[1:-1] & is_at[2:]):
+            if end and is_at.mean() >= _OFTEN and np.any(is_at[:-2] & is_at[1:-1] & is_at[2:]):
                 notes.append(f"{100 * is_at.mean():.0f} % at its {word} value: saturated?")
     return ", ".join(notes)
 
@@ -443,7 +449,7 @@ def identified(asked: IdentificationRequest, source: str, folder: str) -> Iterat
     """Parameters from uploaded files; writes a run folder like `excite identify`."""
     plant = _plant(asked["plant"])
     plant = extended(plant, asked["effects"]) if asked["effects"] else plant
-    records = [Path(name) for name in asked["fitted"]]
+    files = [Path(name) for name in asked["fitted"]]
     options = {
         "initial_state": asked["initial_state"],
         "hold_input": asked["hold_input"],
@@ -458,7 +464,7 @@ def identified(asked: IdentificationRequest, source: str, folder: str) -> Iterat
     }
     with contextlib.chdir(source):  # so that messages have the files' names without their folder
         result = identify(
-            records,
+            files,
             plant,
             asked["estimator"],
             start=asked["start"] or None,
@@ -470,12 +476,15 @@ def identified(asked: IdentificationRequest, source: str, folder: str) -> Iterat
             **options,
         )
         plants = [plant, *map(_plant, _others(asked))]
-        compared = compare_plants(records, plants, **options).to_dict() if plants[1:] else None
+        compared = compare_plants(files, plants, **options).to_dict() if plants[1:] else None
     comparison = None if compared is None else shown_table(*compared_plants(compared))
     command = _identification_again(asked)
     result.save(folder, command=command.partition("\n")[0])
     data = result.to_dict()
-    data["verdict"] = judgement(EstimateSummary.of(data))
+    summary = EstimateSummary.of(data)
+    records = [fitted.record for fitted in (*result.fitted, *result.validation)]
+    told = *told_of_levels(result.plant, records), *told_of_identification(summary)
+    data |= {"verdict": judgement(summary), "answer": told}
     yield {
         "kind": "identified",
         "command": command,

@@ -139,7 +139,7 @@ def _file_name(name: str) -> str:
     """The name of an uploaded file, without folders and control characters."""
     ending = Path(name).suffix
     if ending.lower() not in READ_ENDINGS:
-        raise RefusedError(415, WRONG_ENDING)
+        raise RefusedError(415, f"{name!r} is none of them: {WRONG_ENDING}")
     plain = "".join(c if c.isprintable() and c not in "/\\" else "_" for c in name)
     return plain if len(plain.encode()) <= _MAX_NAME else f"file{ending}"
 
@@ -169,7 +169,7 @@ async def _receive(request: Request, path: Path, scratch: Path) -> None:
     except OSError as error:
         raise RefusedError(507, f"the file cannot be stored ({error.strerror})") from None
     if not path.stat().st_size:
-        raise RefusedError(400, "the file is empty")
+        raise RefusedError(400, f"{path.name} is empty; a table with names and samples is needed")
 
 
 async def _last(

@@ -110,10 +110,13 @@ def routes(workers: Workers, plants: Mapping[str, str], body: Body) -> list[Rout
 
 def _experiment(asked: Asked, plants: Mapping[str, str]) -> ExperimentRequest:
     """An experiment for `excite.web.jobs`: only checked names and numbers."""
+    amplitude = asked.get("amplitude")
+    if amplitude == 0:
+        raise RefusedError(400, "amplitude must be above 0: an input of 0 moves nothing")
     return {
         "plant": plant_of(asked, plants),
         "excitation": word(asked, "excitation"),
-        "amplitude": None if asked.get("amplitude") is None else number(asked, "amplitude", 0, 1e9),
+        "amplitude": None if amplitude is None else number(asked, "amplitude", 0, 1e9),
         "noise": numbers(asked, "noise"),
         "params": numbers(asked, "params"),
         "steps": whole(asked, "steps", 50, MAX_STEPS),
@@ -142,7 +145,7 @@ def _identification(
         "scales": numbers(asked, "scales"),
         "units": texts(asked, "units"),
         "set_inputs": numbers(asked, "set_inputs"),
-        "dt": None if asked.get("dt") is None else number(asked, "dt", 0, 1e9),
+        "dt": None if asked.get("dt") is None else number(asked, "dt", 1e-9, 1e9),
         "rows": text({"rows": "", **asked}, "rows") or None,
         "start": numbers(asked, "start"),
         "hold": numbers(asked, "hold"),

@@ -14,7 +14,7 @@ from ...description import RARE, PlantDescription, display_unit, names_of
 from ...files import read_columns
 from ...record import Record
 from ...record.figure import episode_figure
-from ..answer import told_of_identification
+from ..answer import told_of_identification, told_of_levels
 from ..content import Answer, Bullets, Element, Figure, Folded, Heading, Paragraph, Section, Table
 from ..estimates import (
     beside,
@@ -96,7 +96,7 @@ class Experiment(Run):
         with understood(self.marker.folder / "estimate.json", _ADVICE):
             cells = [parameter_cells(n, p) for n, p in result.params.items()]
             parts = [
-                Answer(told_of_identification(result)),
+                Answer((*told_of_levels(d, self.records), *told_of_identification(result))),
                 Heading("Parameters"),
                 Table(parameter_header(), cells, name="Estimates and their 95 % intervals"),
                 *_truth(self),

@@ -34,6 +34,17 @@ export function say(form, sentence, isBad = false) {
 /** How far it is: shown, and not read out. */
 export const tell = (form, sentence) => { form.querySelector(".progress").textContent = sentence; };
 
+/** Says what is wrong with the first field of a form that has a value that is not allowed, also where it is folded away. */
+export function tellInvalid(form) {
+  form.addEventListener("invalid", ({ target }) => {
+    if (target !== form.querySelector("input:invalid, select:invalid")) return;
+    const { type, min, max, step, value, labels: [{ textContent: name }] } = target, kind = step === "1" ? "a whole number" : "a number";
+    if (target.closest("details")) target.closest("details").open = true;
+    const range = max ? `${kind} from ${min || 0} to ${max}` : `${kind}${min && ` of at least ${min}`}`;
+    say(form, `${name.trim()}: ${type === "number" ? `${value ? `got ${value}` : "got no number"}, needed is ${range}.` : target.validationMessage}`, true);
+  }, true);
+}
+
 async function sentenceOf(response) {
   try { return (await response.json()).sentence ?? "the server rejected the request"; }
   catch { return `the server answered with ${response.status}`; }
@@ -75,6 +86,7 @@ export class Task {
     Object.assign(this, { form, isReady, isBusy: false, job: null, kept: new Kept(form) });
     this.halt = form.querySelector(".stop");
     this.halt.addEventListener("click", () => this.stop());
+    tellInvalid(form);
     this.refresh();
   }
 

@@ -135,7 +135,7 @@ async function follow(address, wanted) {
 /** Takes away what is shown of the run before. */
 function clear() {
   shownRun?.halt();
-  at("outcome").hidden = at("player").hidden = true;
+  at("outcome").hidden = at("player").hidden = at("answer").hidden = true;
   empty(at("signals"), at("estimates"), at("overlays"));
 }
 
@@ -159,7 +159,7 @@ function follower(wanted) {
       if (live.isFull) say(form, waiting(live));
     } else if (["result", "other", "left_out"].includes(event.kind)) {
       rows.push(event.row ?? event);
-      if (event.traces) live.compared.push({ name: event.row.excitation, estimates: event.estimates, ...event.traces });
+      if (event.traces) live.compared.push({ name: event.row.excitation, estimates: event.estimates, time: live.time, ...event.traces });
       compare(live, rows, total);
       overlay(live.plan, live.compared);
       live.track();
@@ -177,6 +177,7 @@ class Live {
     this.end = (plan.num_samples - 1) * plan.plant.dt;
     if (plan.warning) say(form, plan.warning, true);
     const title = (part) => el("span", {}, part.name, " ", el("span", { class: "unit" }, part.shown_unit));
+    at("signals").parentElement.querySelector("h2").textContent = `Input and output: ${plan.plant.name}, ${plan.excitation}`;
     this.play();
     const from = (name) => el("span", {}, symbol(name), " ", el("span", { class: "unit" }, "% from the true value"));
     this.plots = [...plan.plant.inputs, ...plan.plant.outputs].map((part) =>
@@ -307,31 +308,47 @@ function overlay({ plant, num_samples: count }, compared) {
 /** Whether an output passed its critical level, or its warning level. */
 function state(row, outputs) {
   if (row.is_violation) return "violation";
+  if (outputs.every((o) => o.warning_level === null && o.critical_level === null)) return "no level";
   return outputs.some((o) => o.warning_level !== null && row.max_abs_output[o.name] >= o.warning_level) ? "warning" : "safe";
 }
 
+/** Which excitation tells most of those without a violation, by how much, and how near it came to a level. */
+function answer(rows, { parameters, outputs }) {
+  const worth = (row) => row.log_det_information ?? -Infinity, bound = (row) => parameters.reduce((sum, { name }) => sum + Math.log(row.params[name].cramer_rao_percent), 0) / parameters.length;
+  const calm = rows.filter((row) => !row.is_violation).sort((a, b) => worth(b) - worth(a)), [best, next] = calm;
+  if (!best || !Number.isFinite(worth(best))) return best ? "No excitation tells all parameters." : "Every excitation reached a critical level (violation): take a smaller amplitude, or a policy.";
+  const many = rows.length > 1 ? `Of ${calm.length < rows.length ? `the ${calm.length} without a violation` : `these ${rows.length}`}, ` : "";
+  const less = next && Math.exp(bound(next) - bound(best)), lead = Number.isFinite(less) ? `: the standard errors that it allows are ${shown(less, 2)} times smaller than those of ${next.excitation}` : "";
+  const told = { warning: "reached a warning level, but no critical one", safe: "reached no level", "no level": "has no level to reach: the plant declares none" }[state(best, outputs)];
+  return `${many}${best.excitation} tells most about ${parameters.length > 1 ? "the parameters" : "the parameter"}${lead}. In this experiment it ${told}.`;
+}
+
 function compare(live, rows, total) {
-  const { parameters, outputs } = live.plan.plant;
-  const found = rows.filter((row) => row.params);
-  const best = (name) => Math.min(...found.map((r) => r.params[name].error_percent ?? Infinity));
-  const head = ["excitation", "safety", ...outputs.map((o) => `largest true ${o.name} [${o.shown_unit}]`)];
+  const { parameters, inputs, outputs } = live.plan.plant;
+  const found = rows.filter((row) => row.params), calm = found.filter((row) => !row.is_violation);
+  const least = (name) => Math.min(...calm.map((r) => r.params[name].cramer_rao_percent ?? Infinity)), most = Math.max(...calm.map((r) => r.log_det_information ?? -Infinity));
+  const marked = (row, isBest) => ({ class: found.length > 1 && calm.includes(row) && isBest ? "best" : "" });
+  const largest = (row, i) => Math.max(...(live.compared.find(({ name }) => name === row.excitation)?.inputs ?? []).map((u) => Math.abs(u[i])));
+  const head = ["excitation", "safety", ...inputs.map((u) => `largest ${u.name} [${u.unit}]`), ...outputs.map((o) => `largest true ${o.name} [${o.shown_unit}]`)];
   at("outcome").querySelector("h2").textContent = `Comparison: ${live.plan.plant.name}, ${live.plan.num_samples - 1} samples`;
   at("comparison").replaceChildren(
     el("thead", {}, el("tr", {}, ...head.map((text) => el("th", { scope: "col" }, text)),
       ...parameters.map((p) => el("th", { scope: "col" }, symbol(p.name), " error (bound) %")), el("th", { scope: "col" }, "log det M"))),
     el("tbody", {}, ...rows.map((row) => (row.sentence ? el("tr", {}, el("th", { scope: "row" }, row.excitation),
-      el("td", { class: "said", colspan: 2 + outputs.length + parameters.length }, row.sentence)) : el("tr", {},
+      el("td", { class: "said", colspan: 2 + inputs.length + outputs.length + parameters.length }, row.sentence)) : el("tr", {},
       el("th", { scope: "row" }, row.excitation),
       el("td", { class: { violation: "bad", warning: "warned", safe: "good" }[state(row, outputs)] }, state(row, outputs)),
+      ...inputs.map((_, i) => el("td", {}, shown(largest(row, i)))),
       ...outputs.map((o) => el("td", {}, shown(row.max_abs_output[o.name] * o.factor))),
       ...parameters.map(({ name }) => {
         const p = row.params[name];
-        return el("td", { class: found.length > 1 && p.error_percent === best(name) ? "best" : "" },
+        return el("td", marked(row, p.cramer_rao_percent === least(name)),
           shown(p.error_percent), " ", el("small", {}, `(${shown(p.cramer_rao_percent, 2)})`));
       }),
-      el("td", {}, shown(row.log_det_information, 4)))))));
+      el("td", marked(row, row.log_det_information === most), shown(row.log_det_information, 4)))))));
   at("outcome").hidden = false;
   if (rows.length < total) say(form, "Comparing…");
+  else if (found.length) Object.assign(at("answer"), { hidden: false, textContent: answer(found, live.plan.plant) });
 }
 
 function conclude(event) {

@@ -5,10 +5,10 @@ import { COLOURS } from "./curves.js";
 import { Plot, range, shown } from "./plot.js";
 
 /** Both safety levels of an output, as bands with a name, in its shown unit. */
-export function levelsOf({ warning_level: warning, critical_level: critical, factor }) {
+export function levelsOf({ warning_level: warning, critical_level: critical, factor, shown_unit: unit }) {
   const found = [["warning", warning, critical], ["critical", critical, null]].filter(([, level]) => level !== null);
   return found.flatMap(([word, level, next]) => [1, -1].map((sign) => ({
-    y: sign * level * factor, until: next === null ? undefined : sign * next * factor, color: word, word: sign > 0 ? `${word} level` : "",
+    y: sign * level * factor, until: next === null ? undefined : sign * next * factor, color: word, word: sign > 0 ? `${word} level ${shown(level * factor)} ${unit}` : "",
   })));
 }
 
@@ -48,7 +48,7 @@ export function drawSignals(plots, plant, compared) {
   plant.outputs.forEach((part, i) => {
     const found = linesOf(compared, {}, (own) => own.outputs.map((row) => (row[i] === null ? null : row[i] * part.factor))), plot = plots[plant.inputs.length + i];
     const marks = found.flatMap(({ name, y }, k) => passed(part, compared[k].time, y, `${name}: `).filter(({ color }) => color === "critical"));
-    plot.show({ x, unit, y: reach(part, found.flatMap(({ y }) => y)), levels: levelsOf(part), marks, lines: found });
+    plot.show({ x, unit, y: reach(part, found.flatMap(({ y }) => y)), levels: levelsOf(part), marks: marks.map((mark) => ({ ...mark, word: "" })), lines: found });
     plot.note.textContent = marks.map(({ word }) => word).join("; ");
   });
 }

@@ -11,7 +11,7 @@ let catalogue, task, given = null, reading = 0;
 
 export function begin(known) {
   catalogue = known;
-  task = new Task(form, () => given !== null && needed().every((name) => at(`column-${name}`)?.value && (at(`column-${name}`).value !== NONE || at(`value-${name}`).value !== "")));
+  task = new Task(form, () => given !== null && needed().every((name) => at(`column-${name}`)?.value));
   options(at("record-plant"), Object.keys(catalogue.plants), "aero2");
   options(at("estimator"), catalogue.estimators, "nls");
   at("record-plant").addEventListener("change", () => { ofPlant(); showMapping(); });
@@ -56,8 +56,9 @@ function put(taken) {
   task.kept.save({ upload: given.upload, mapped });
   preview();
   task.refresh();
+  const open = needed().filter((name) => !at(`column-${name}`).value);
   const { file, columns } = given.files.at(-1), counts = Object.values(columns);
-  say(form, `${file}: ${counts.length} ${counts.length > 1 ? "columns" : "column"}, ${Math.max(...counts)} samples. ${task.isBusy ? "Another file is still being identified; wait, or stop it." : "Map them, then identify."}`);
+  say(form, `${file}: ${counts.length} ${counts.length > 1 ? "columns" : "column"}, ${Math.max(...counts)} samples. ${task.isBusy ? "Another file is still being identified; wait, or stop it." : open.length ? `Choose the column of ${open.join(", ")}.` : "Map them, then identify."}`);
 }
 
 /** Reads files, one after the other; they replace those before, or are added to them. */
@@ -167,7 +168,8 @@ const unitIn = (column) => /[[(]([^\])]+)[\])]\s*$/.exec(column)?.[1].trim();
 
 function showMapping() {
   if (given === null) return;
-  const there = Object.keys(given.files[0].columns), found = (name) => there.find((c) => c.toLowerCase() === name.toLowerCase()) ?? there.find((c) => c.toLowerCase().split(/[\s([]/)[0] === name.toLowerCase());
+  const there = Object.keys(given.files[0].columns), part = (name, kind) => there.find((c) => c.toLowerCase().replace("_", "") === name.toLowerCase() + kind); // uEst and uVal
+  const found = (name) => there.find((c) => c.toLowerCase() === name.toLowerCase()) ?? there.find((c) => c.toLowerCase().split(/[\s([]/)[0] === name.toLowerCase()) ?? part(name, "est");
   at("mapping").hidden = false;
   at("mapping").querySelector("div").replaceChildren(...needed().map((name) => {
     const select = el("select", { id: `column-${name}` });
@@ -184,15 +186,16 @@ function showMapping() {
       hint.textContent = word === undefined || words.includes(word) ? "" : `unit "${word}" is not known: choose one`;
     };
     unit.addEventListener("change", () => { hint.textContent = ""; });
-    const part = (id, title, input, is = {}) => el("div", { class: "field", ...is }, el("label", { for: id }, title, el("span", { class: "unseen" }, ` of ${name}`)), input);
+    const field = (id, title, input) => el("div", { class: "field" }, el("label", { for: id }, title, el("span", { class: "unseen" }, ` of ${name}`)), input);
     const number = (kind, how) => el("input", { id: `${kind}-${name}`, type: "number", step: "any", ...how });
-    const value = part(`value-${name}`, name === "time" ? "sampling time [s]" : `value [${unitsOf(name)[0]}]`, number("value", {}));
-    const units = [part(unit.id, "unit", unit), part(`scale-${name}`, "scale", number("scale", { placeholder: "none" }))];
+    const value = field(`value-${name}`, name === "time" ? "sampling time dt [s]" : `value [${unitsOf(name)[0]}]`, number("value", {}));
+    const units = [field(unit.id, "unit", unit), field(`scale-${name}`, "scale", number("scale", { placeholder: "none" }))];
     value.addEventListener("input", () => task.refresh());
     const change = () => {
       guess();
       const isNone = select.value === NONE;
       value.hidden = !isNone;
+      value.lastChild.required = isNone;
       units.forEach((one) => { one.hidden = isNone; });
       task.refresh();
     };
@@ -203,7 +206,8 @@ function showMapping() {
   at("held-out").replaceChildren(...signals().map((name) => {
     const select = el("select", { id: `held-out-${name}` });
     options(select, there);
-    select.prepend(el("option", { value: "", selected: true }, "the same"));
+    select.prepend(el("option", { value: "" }, "the same"));
+    select.value = part(name, "val") ?? "";
     return el("div", { class: "field" }, el("label", { for: select.id }, name), select);
   }));
   at("held-out").parentElement.hidden = false;
@@ -260,7 +264,9 @@ async function follow(address, request) {
     else if (event.kind === "pulse") tell(form, `${(seconds += 1)} s`);
     else if (event.kind === "identified") found = event;
   });
-  if (found) show(wanted, found);
+  if (!found) return;
+  show(wanted, found);
+  if (request) section.querySelector(".view h2").scrollIntoView({ block: "nearest" });
 }
 
 const results = () => section.querySelectorAll(".view > section:not(#preview, #side-by-side)");
@@ -271,6 +277,7 @@ function show(wanted, { identification, plant: fitted, result, records, comparis
   results().forEach((part) => { part.hidden = false; });
   say(form, `Done: ${identification.status}.`);
   section.querySelector(".view h2").textContent = `Identified: ${identification.files.join(", ")}, ${fitted.name}`;
+  at("record-answer").replaceChildren(...identification.answer.map((text) => el("p", {}, text)));
   table(at("identified"), identification);
   at("record-verdict").replaceChildren(...identification.verdict.map((text) => el("li", {}, text)));
   section.querySelector(".downloads").replaceChildren(
@@ -278,7 +285,8 @@ function show(wanted, { identification, plant: fitted, result, records, comparis
     ...(identification.files.length > 1 ? [] : [download(`api/results/${result}/record.csv`, "Record"), download(`api/results/${result}/record.json`, "Sidecar")]),
     download(`api/results/${result}/estimate.json`, "Estimate"));
   causes(wanted, identification.suspects ?? []);
-  at("compared-plants").replaceChildren(...(comparison ? [el("h3", {}, comparison.title), rows(comparison, comparison.title)] : []));
+  at("compared-plants").replaceChildren(...(comparison ? [el("h3", {}, comparison.title), rows(comparison, comparison.title),
+    el("p", { class: "hint below" }, "All fitted alike: normal likelihood, all parameters free, no priors. BIC: the Bayesian information criterion, smaller is better. p: that of the first plant, against this one.")] : []));
   at("profiles").replaceChildren();
   starts(identification.starts ?? []);
   profiles(identification);
@@ -290,23 +298,24 @@ function show(wanted, { identification, plant: fitted, result, records, comparis
 }
 
 /** Input, output and residual of a record; `about` begins the titles. */
-function signalsOf({ time, inputs, outputs, simulated, is_whole: isWhole }, fitted, about) {
-  const parent = el("div", { class: `plots ${about && "own"}` }), x = [time[0], time.at(-1)];
+function signalsOf({ time: seconds, inputs, outputs, simulated, is_whole: isWhole }, fitted, about) {
+  const parent = el("div", { class: `plots ${about && "own"}` }), [unit, size] = clock(seconds.at(-1) - seconds[0]);
+  const time = seconds.map((t) => t / size), x = [time[0], time.at(-1)];
   at("record-signals").append(parent);
   const title = (part) => el("span", {}, about, part.name, " ", el("span", { class: "unit" }, part.shown_unit));
   fitted.inputs.forEach((part, i) => {
     const y = inputs.map((row) => row[i]);
-    new Plot(parent, title(part), `${about}${part.name} over time`).show({ x, y: range(y, 0), unit: "s", lines: [{ x: time, y, color: "input", step: true, width: 1.3 }] });
+    new Plot(parent, title(part), `${about}${part.name} over time`).show({ x, y: range(y, 0), unit, lines: [{ x: time, y, color: "input", step: true, width: 1.3 }] });
   });
   fitted.outputs.forEach((part, i) => {
     const measured = outputs.map((row) => row[i] * part.factor), model = simulated.map((row) => row[i] * part.factor);
     new Plot(parent, title(part), `${about}${part.name}, measured and simulated, over time`).show({
-      x, y: range([...measured, ...model], 0), unit: "s",
+      x, y: range([...measured, ...model], 0), unit,
       lines: [{ x: time, y: measured, name: "measured", color: "output", points: true }, { x: time, y: model, name: "simulated", color: "simulated" }],
     });
     const left = measured.map((v, k) => v - model[k]);
     new Plot(parent, el("span", {}, "residual of ", title(part)), `${about}measured minus simulated ${part.name}`).show({
-      x, y: range(left, 0), unit: "s", lines: [{ x: time, y: left, color: "output", width: 1 }],
+      x, y: range(left, 0), unit, lines: [{ x: time, y: left, color: "output", width: 1 }],
     });
     if (!isWhole) return;
     const { lags, values, bound } = echoes(left), most = lags.at(-1) + 0.5;
@@ -316,6 +325,9 @@ function signalsOf({ time, inputs, outputs, simulated, is_whole: isWhole }, fitt
     });
   });
 }
+
+/** The unit in which a time is easily read, and how many seconds it has. */
+const clock = (length) => [["d", 86400], ["h", 3600]].find(([, size]) => length >= 5 * size) ?? ["s", 1];
 
 /** What was identified before, beside the newest; results that the server no longer has are left out. */
 async function beside(newest) {

@@ -1,6 +1,6 @@
 // Trainings of this server: start, watch, stop, resume.
 
-import { el, get, options, post, remove, say } from "./api.js";
+import { el, get, options, post, remove, say, tellInvalid } from "./api.js";
 import { curves } from "./curves.js";
 import { Kept } from "./kept.js";
 import { shown } from "./plot.js";
@@ -13,6 +13,7 @@ export function begin(catalogue) {
   options(at("training-plant"), Object.keys(catalogue.plants), "aero2");
   form.querySelector(".primary").disabled = false;
   form.addEventListener("input", tellResources);
+  tellInvalid(form);
   form.addEventListener("submit", (event) => { event.preventDefault(); start(); });
   const gone = new Kept(form, false).fill();
   if (gone) say(form, gone, true);
