@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.optimize
@@ -13,6 +14,7 @@ from kinetics import TIME, TRUTH, Conversion, Product, concentrations
 import excite as ex
 from excite.description import Output, Parameter, PlantDescription, State
 from excite.estimation.diagnosis import student_95
+from excite.plant import AbstractPlant
 from excite.record import Record, read_record
 
 FILE = f"{Path(__file__).parent / 'kinetics.py'}:Conversion"
@@ -36,6 +38,36 @@ def scipys(record: Record) -> tuple[np.ndarray, np.ndarray]:
     degrees = record.outputs.size - 2
     variance = 2 * found.cost / degrees * np.linalg.inv(found.jac.T @ found.jac)
     return found.x, student_95(degrees) * np.sqrt(np.diag(variance))
+
+
+class Leak(AbstractPlant):
+    """A tank that runs empty through a hole; the slope of the root at zero is infinite."""
+
+    definition = PlantDescription(
+        name="leak",
+        states=(State("level", "m"),),
+        inputs=(),
+        outputs=(Output("level", "m", scale=1.0, noise_sd=0.01),),
+        parameters=(Parameter("k", "m^0.5/s", 0.1),),
+        dt=0.5,
+    )
+
+    def derivative(self, state, input, params):
+        return -params.k * jnp.sqrt(state)
+
+    def output(self, state, params):
+        return state
+
+
+def test_an_infinite_slope_where_the_simulation_begins_is_told():
+    time = 0.5 * np.arange(20)
+    level = (1 - 0.06 * time)[:, None] ** 2  # of k = 0.12 from a level of 1
+    record = Record(time, np.zeros((20, 0)), level, source="leak.csv")
+    failed = ex.identify(record, Leak, initial_state="known")
+    assert failed.status == "not finite"
+    assert "derivative of level over level is not finite at level = 0" in failed.verdict[-1]
+    full = Leak(initial_state=jnp.array([1.0]))
+    assert ex.identify(record, full, initial_state="known").params["k"] == pytest.approx(0.12)
 
 
 @pytest.mark.science

@@ -88,7 +88,7 @@ from .from_records import (
     starts_at,
 )
 from .held import told_of_held
-from .integration import too_coarse
+from .integration import infinite_slope, too_coarse
 from .nls import NLS, Likelihood
 from .pem import PEM
 from .prior import unbounded, within_support
@@ -286,6 +286,8 @@ def identify(
     astray = _simulates_poorly(fitted) if is_predicted else ()
     remedies = *_remedies(found), *where
     verdict = (*others, *wrong, *large, *astray, *remedies, *_agreement(fit), *verdict)
+    if fit.has_ended_in(Status.NOT_FINITE) and not by_steps:
+        verdict = (*verdict, *infinite_slope(plant, begin, whole))
     names = names_of(plant.definition.parameters)
     values = np.array([float(value) for value in fit.estimate.params])
     sd = np.where(fit.free, np.sqrt(np.maximum(np.diag(covariance), 0.0)), np.nan)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..description import names_of
-from ..plant import AbstractPlant
+from ..plant import AbstractPlant, Params
 from .contract import Estimate, Experiments, residual_of, simulate_experiments
 from .diagnosis import inverse_information
 from .nls import NLS
@@ -20,6 +20,27 @@ from .nls import NLS
 _ENOUGH = 0.5  # standard errors by which an estimate may change with a finer integration
 _LONGEST = 5_000  # samples, of all experiments together, that are integrated again
 _LEAST = 1e-4  # relative change that is told
+
+
+def infinite_slope(
+    plant: AbstractPlant, params: Params, experiments: Experiments
+) -> tuple[str, ...]:
+    """A sentence where the plant's equations have an infinite slope at an initial state.
+
+    The search needs all slopes; that of a root at zero is infinite.
+    """
+    states = names_of(plant.definition.states)
+    for state, inputs in zip(experiments.initial_state, experiments.inputs, strict=True):
+        slopes = np.asarray(jax.jacfwd(plant.derivative)(state, inputs[0], params))
+        if not np.isfinite(slopes).all():
+            i, j = np.argwhere(~np.isfinite(slopes))[0]
+            return (
+                f"the slope of the derivative of {states[i]} over {states[j]} is not finite at "
+                f"{states[j]} = {float(state[j]):g}, where the simulation begins (a root, a "
+                "logarithm or a division of zero?): give the state another initial value in the "
+                "plant, or keep what stands there above zero: jnp.sqrt(jnp.maximum(x, 1e-6))",
+            )
+    return ()
 
 
 def too_coarse(

@@ -118,7 +118,9 @@ def require_even(record: Record, what: str) -> None:
 
 def check_size(values: np.ndarray, part: Input | Output, path: Path) -> None:
     """Raises ValueError for values so large that their unit must be wrong."""
+    own = ""
     if isinstance(part, Input):
+        own = ". Or the limits in the plant are too narrow"
         middle, half = (part.upper + part.lower) / 2, (part.upper - part.lower) / 2
         excess, allowed = np.abs(values - middle) / half, _TIMES_LIMIT
         expected = f"the plant's limits are {part.lower:g} to {part.upper:g} {part.unit}"
@@ -129,7 +131,7 @@ def check_size(values: np.ndarray, part: Input | Output, path: Path) -> None:
     if beyond.size:
         raise ValueError(
             f"{path}: {part.name!r} reaches {worst:g} {part.unit}, {expected}; "
-            f"is it in another unit? {unit_hint(part.name)}. {beyond.size} of {values.size} "
+            f"is it in another unit? {unit_hint(part.name)}{own}. {beyond.size} of {values.size} "
             f"samples are that large, the first is {beyond[0] + 1} ({LEAVE_OUT})"
         )
 

@@ -347,7 +347,7 @@ def _check_unit_of_time(time: np.ndarray, options: _Options, where: Path) -> Non
     if step > TIMES_DT * plant.dt and not options.confirms("time"):
         raise ValueError(
             f"{where}: sampled every {step:g} s, where {plant.name!r} is every {plant.dt:g} s; is "
-            f"'time' in another unit? {unit_hint('time')}"
+            f"'time' in another unit? {unit_hint('time')}. If it is right, dt in the plant is wrong"
         )
 
 
