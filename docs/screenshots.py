@@ -57,7 +57,7 @@ def words(own: str) -> list[str]:
 def training(page: Page) -> None:
     page.set_viewport_size({"width": 1440, "height": 900})
     page.evaluate("location.hash = 'training'")
-    for label, value in (("Updates", "400"), ("Length", "60"), ("Seeds", "2")):
+    for label, value in (("Updates", "2000"), ("Length", "60"), ("Seeds", "2")):
         page.locator("#training").get_by_label(label).fill(value)
     page.get_by_role("button", name="Start").click()
     card = page.locator("#trainings section")
