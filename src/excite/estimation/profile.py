@@ -64,18 +64,24 @@ def profile_intervals(
     ends = np.full((len(free), 2), np.nan)
     profiles: dict[str, Float[np.ndarray, "point 2"]] = {}
 
-    def excess_of(index: int, tried: list[tuple[float, float]]) -> Callable[[float], float]:
-        """Growth of the sum of squares, with the parameter at a value and the others best."""
+    def excess_of(
+        index: int, limit: float, tried: list[tuple[float, float]]
+    ) -> Callable[[float], float]:
+        """Growth of the sum of squares, with the parameter at a value and the others best.
+
+        The others are searched from the last value inside the interval: from one far outside a
+        search may not find back.
+        """
         name = names_of(plant.definition.parameters)[index]
         others = jax.device_put(free & (np.arange(len(free)) != index))
-        nearest = {"params": estimate.params}
+        inside = {"params": estimate.params}
 
         def excess(value: float) -> float:
-            begin = nearest["params"]._replace(**{name: floats(value)})
+            begin = inside["params"]._replace(**{name: floats(value)})
             found = jax.device_get(estimator(plant, experiments, jax.device_put(begin), others))
             is_found = int(found.status) == Status.SUCCESSFUL
             growth = float(found.cost) - least if is_found else math.inf
-            nearest["params"] = found.params if is_found else nearest["params"]
+            inside["params"] = found.params if growth <= limit else inside["params"]
             tried.append((value, growth))
             return growth
 
@@ -87,7 +93,7 @@ def profile_intervals(
         limit = (half[index] / (unit[index] * size[index])) ** 2
         tried = [(value, 0.0)]
         for side, sign in enumerate((-1, 1)):
-            excess = excess_of(int(index), tried)
+            excess = excess_of(int(index), limit, tried)
             ends[index, side] = _end(part, value, sign, half[index], limit, excess)
         profiles[part.name] = np.array(sorted(tried)) / np.array([1.0, limit])
     return ends, profiles
