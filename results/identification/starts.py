@@ -28,6 +28,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 import excite as ex
 from excite.description import names_of
@@ -113,8 +114,9 @@ def batch(case: Case, first: int, count: int = BATCH) -> Batch:
     return Batch(*jax.device_get((*runs, *fit(*runs[1:]))))
 
 
-def is_away(true: np.ndarray, values: np.ndarray, errors: np.ndarray) -> np.ndarray:
+def is_away(true: ArrayLike, values: ArrayLike, errors: ArrayLike) -> np.ndarray:
     """Which estimates are further from the true values than noise explains."""
+    true, values, errors = map(np.asarray, (true, values, errors))
     off = np.abs(values - true)
     return ~((off <= FAR * errors) | (off <= MUCH * np.abs(true)))
 
