@@ -14,9 +14,9 @@ standard errors and more than 1 % away from the true value. A parameter that a r
 which then calls the result partly identifiable. These plants are counted beside, with the least
 Cramér-Rao bound of what was held, relative to its true value.
 
-The judged lines, 3 of 3,000 plants within a factor of three and 1 % of the others, are kept. The one
-failure of 5,700 plants is no matter of the start: with the friction of a DC motor held at a wrong
-value, the interval of K is too narrow.
+The judged lines, 3 of 3,000 plants within a factor of three and 1 % of the others, are kept. The
+one failure of 5,700 plants is no matter of the start: with the friction of a DC motor held at a
+wrong value, the interval of K is too narrow.
 
 Counts are written to starts.json after every batch, and the script goes on where it was
 interrupted.
