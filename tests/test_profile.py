@@ -3,6 +3,7 @@
 import json
 import math
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.optimize
@@ -12,9 +13,12 @@ from test_identification import Tank, tank_record
 from test_plants_without_inputs import FILE
 
 import excite as ex
-from excite.estimation import NLS
-from excite.estimation.diagnosis import student_95
+from excite.description import Input, Output, Parameter, PlantDescription, State
+from excite.estimation import NLS, stack_experiments
+from excite.estimation.diagnosis import half_95, student_95
+from excite.estimation.profile import profile_intervals
 from excite.record import Record
+from excite.simulation import response
 
 
 def product(noise: float, time: np.ndarray = TIME, seed: int = 3) -> Record:
@@ -114,6 +118,86 @@ def test_a_side_that_does_not_close_is_told():
     sentence = "k2 is practically not identifiable: its 95 % interval is open below"
     assert sentence in result.verdict
     result.plot()
+
+
+class Enzyme(Product):
+    """A substrate that an enzyme uses up, by L. Michaelis and M. Menten."""
+
+    definition = PlantDescription(
+        name="enzyme",
+        states=(State("s", "mmol/l", initial=1.0),),
+        inputs=(),
+        outputs=(Output("substrate", "mmol/l", scale=1.0, noise_sd=0.05),),
+        parameters=(Parameter("V", "mmol/l/s", 0.1), Parameter("K", "mmol/l", 0.6)),
+        dt=1.0,
+        substeps=10,
+    )
+
+    def derivative(self, state, input, params):
+        return -params.V * state / (params.K + state)
+
+    def output(self, state, params):
+        return state
+
+
+@pytest.mark.science
+def test_an_end_is_found_after_a_value_far_outside():
+    """Far below the estimate of V the best K is zero; from there no search finds back."""
+    plant, none, rng = Enzyme(), jnp.zeros((14, 0)), np.random.default_rng(4)
+    measured = np.asarray(response(plant, plant.nominal, none))
+    measured = measured + 0.05 * rng.normal(size=measured.shape)
+    data = stack_experiments(plant, [none], [measured], True)
+    estimate, free = NLS()(plant, data), np.ones(2, bool)
+    half = half_95(np.asarray(estimate.covariance), np.asarray(estimate.degrees))
+    ends, profiles = profile_intervals(plant, data, NLS(), estimate, free, half)
+    low, (value, growth) = ends[0, 0], profiles["V"].T
+    assert low < 0.8 * float(estimate.params.V)
+    np.testing.assert_allclose(growth[np.isclose(value, low)], 1, atol=5e-3)
+
+
+class Turn(Product):
+    """A car that turns; the heading is linear in the reciprocal of the radius."""
+
+    definition = PlantDescription(
+        name="turn",
+        states=(State("distance", "m", scale=10.0), State("heading", "rad", scale=0.1)),
+        inputs=(Input("wheel", "1/s", 0.0, 20.0),),
+        outputs=(
+            Output("distance", "m", 10.0, noise_sd=0.05),
+            Output("heading", "rad", 0.1, noise_sd=0.07),
+        ),
+        parameters=(
+            Parameter("circumference", "m", 1.0),
+            Parameter("radius", "m", 100.0, positive=False, scale=100.0),
+        ),
+        dt=0.1,
+        band=(0.1, 2.0),
+    )
+
+    def derivative(self, state, input, params):
+        speed = params.circumference * input[0]
+        return jnp.stack([speed, speed / params.radius])
+
+    def output(self, state, params):
+        return state
+
+
+@pytest.mark.science
+def test_segments_that_lead_astray_close_no_interval():
+    """They turn the car to the other side, where a search does not find back."""
+    plant, wheel = Turn(), np.full((20, 1), 3.0)
+    clean = np.asarray(response(plant, plant.nominal, jnp.asarray(wheel)))
+    for seed in range(12):
+        noise = np.random.default_rng(seed).normal(size=clean.shape) * np.array([[0.05, 0.07]])
+        record = Record.of_episode(0.1 * np.arange(21), wheel, clean + noise, {}, "r.csv")
+        given = {"plant": plant, "initial_state": "known"}
+        linear = ex.identify(record, **given)
+        curved = ex.identify(record, intervals="profile", **given)
+        # The distance tells the circumference, in which it is linear.
+        half = np.diff(linear.ci95("circumference"))[0] / 2
+        np.testing.assert_allclose(
+            curved.ci95("circumference"), linear.ci95("circumference"), atol=0.02 * half
+        )
 
 
 def test_intervals_of_another_kind_are_refused():

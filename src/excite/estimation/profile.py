@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float
 
 from ..description import Parameter, names_of
 from ..information import relative_size
-from ..plant import AbstractPlant, Sensor, floats
+from ..plant import AbstractPlant, Params, Sensor, floats
 from .contract import Estimate, Experiments, Status
 from .diagnosis import inverse_information
 from .nls import NLS
@@ -60,22 +60,36 @@ def profile_intervals(
     prior = np.asarray(estimator.prior_information(*given))
     unit = np.sqrt(np.diag(inverse_information(S, prior)))[: len(free)]
     size = np.abs(np.asarray(relative_size(plant, estimate.params)))
+    whole = dataclasses.replace(estimator, segment_length=experiments.valid.shape[1])
     least = float(estimator.sum_of_squares(plant, experiments, estimate))
     ends = np.full((len(free), 2), np.nan)
     profiles: dict[str, Float[np.ndarray, "point 2"]] = {}
 
-    def excess_of(index: int, tried: list[tuple[float, float]]) -> Callable[[float], float]:
-        """Growth of the sum of squares, with the parameter at a value and the others best."""
+    def excess_of(
+        index: int, limit: float, tried: list[tuple[float, float]]
+    ) -> Callable[[float], float]:
+        """Growth of the sum of squares, with the parameter at a value and the others best.
+
+        The others are searched from the last value inside the interval: from one far outside a
+        search may not find back. Where the sum is above the limit they are searched by one
+        simulation, too: the segments of a noisy record may have led astray.
+        """
         name = names_of(plant.definition.parameters)[index]
         others = jax.device_put(free & (np.arange(len(free)) != index))
-        nearest = {"params": estimate.params}
+        inside = {"params": estimate.params}
+
+        def search(by: NLS, begin: Params) -> tuple[float, Params]:
+            found = jax.device_get(by(plant, experiments, jax.device_put(begin), others))
+            is_found = int(found.status) == Status.SUCCESSFUL
+            return float(found.cost) - least if is_found else math.inf, found.params
 
         def excess(value: float) -> float:
-            begin = nearest["params"]._replace(**{name: floats(value)})
-            found = jax.device_get(estimator(plant, experiments, jax.device_put(begin), others))
-            is_found = int(found.status) == Status.SUCCESSFUL
-            growth = float(found.cost) - least if is_found else math.inf
-            nearest["params"] = found.params if is_found else nearest["params"]
+            begin = inside["params"]._replace(**{name: floats(value)})
+            growth, params = search(estimator, begin)
+            if not growth <= limit:
+                ends = (growth, params), search(whole, begin)
+                growth, params = min(ends, key=lambda end: end[0])
+            inside["params"] = params if growth <= limit else inside["params"]
             tried.append((value, growth))
             return growth
 
@@ -87,7 +101,7 @@ def profile_intervals(
         limit = (half[index] / (unit[index] * size[index])) ** 2
         tried = [(value, 0.0)]
         for side, sign in enumerate((-1, 1)):
-            excess = excess_of(int(index), tried)
+            excess = excess_of(int(index), limit, tried)
             ends[index, side] = _end(part, value, sign, half[index], limit, excess)
         profiles[part.name] = np.array(sorted(tried)) / np.array([1.0, limit])
     return ends, profiles
