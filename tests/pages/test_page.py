@@ -1320,3 +1320,51 @@ def test_a_token_lets_the_browser_in_and_leaves_the_address(chromium: Browser, t
         expect(known).to_have_url(f"{root}/")
         expect(known.locator("#experiment .primary")).to_be_enabled(timeout=WAIT)
         known.close()
+
+
+def test_the_answer_stands_above_the_plots(address: str, page: Page):
+    prepared(page, address)
+    answer = page.locator("#answer")
+    expect(answer).to_have_text(
+        re.compile(
+            r"^Of these 3, aero2 tells most: the standard errors that it allows are 2\.4 times "
+            r"smaller \(geometric mean\) than those of chirp\. In this experiment it reached a "
+            r"warning level, but no critical one\.$"
+        )
+    )
+    page.locator("#experiment form summary").click()
+    page.get_by_label("Played in").select_option("0")
+    page.locator("#amplitude").fill("20")
+    for label in ("First", "Second"):
+        page.get_by_label(label, exact=True).select_option("aero2")
+    page.get_by_role("button", name="Run", exact=True).click()
+    expect(status(page)).to_have_text("Done.", timeout=WAIT)
+    expect(answer).to_have_text(
+        "chirp reached a critical level (violation). aero2 reached a warning level, but no "
+        "critical one in this experiment."
+    )
+    expect(page.locator("#comparison tbody tr").first.locator(".best")).to_have_count(0)
+
+
+def test_columns_that_a_second_file_lacks_are_told(address: str, page: Page):
+    page.goto(f"{address}/#record")
+    expect(page.locator("#record-plant option").first).to_be_attached(timeout=WAIT)
+    first: Any = {
+        "name": "a.csv",
+        "mimeType": "",
+        "buffer": b"time,uEst,pitch,uVal\n0,1,1,1\n1,2,1,1\n",
+    }
+    page.locator("#file").set_input_files(first)
+    expect(status(page, "record")).to_contain_text("Choose the column of voltage.", timeout=WAIT)
+    page.locator("#column-voltage").select_option("uEst")
+    expect(status(page, "record")).to_contain_text("Map them, then identify.")
+    other: Any = {"name": "b.csv", "mimeType": "", "buffer": b"t,uEst,winkel\n0,1,1\n1,2,1\n"}
+    page.get_by_label("Add a file").set_input_files(other)
+    lacking = "b.csv has no column time, pitch: all files need the same names, or are not used."
+    expect(status(page, "record")).to_have_text(lacking, timeout=WAIT)
+    page.get_by_label("b.csv", exact=True).select_option("not used")
+    expect(status(page, "record")).to_contain_text("b.csv: 3 columns")
+    empty: Any = {"name": "c.csv", "mimeType": "", "buffer": b"time,pitch\n"}
+    page.locator("#file").set_input_files(empty)
+    expect(status(page, "record")).to_contain_text("c.csv", timeout=WAIT)
+    expect(page.locator("#preview")).to_be_hidden()

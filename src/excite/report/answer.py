@@ -368,7 +368,10 @@ def _believed(result: EstimateSummary) -> str:
             f"are to be doubted{wider}"
         )
     if coloured:
-        return f"the residual of {listed(coloured)} is not white, as noise would be"
+        return (
+            f"but the residual of {listed(coloured)} is more than white noise: something is left "
+            "that the plant does not explain, or that disturbs it"
+        )
     if not any(map(math.isfinite, tested)):
         return "the residual is too small or too short to be tested"
     more = ", but read what can be identified" * (len(result.verdict) > 1)

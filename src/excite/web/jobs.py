@@ -388,10 +388,10 @@ def columns(folder: str, name: str) -> Iterator[Event]:
         cells = {} if is_bag(path) else columns_in(path)
         counts = {n: len(own) for n, own in cells.items()} if cells else column_lengths(path)
     previews = _previews(cells)
-    if not counts or (cells and not any(own["index"] for own in previews.values())):
-        raise ValueError(f"{name} has no column of numbers below names; is it a log file?")
-    if not max(counts.values()):
+    if counts and not max(counts.values()):
         raise ValueError(f"{name} has names of columns, but no samples below them")
+    if not counts or (cells and not any(own["index"] for own in previews.values())):
+        raise ValueError(f"{name} has no column of numbers")
     if len(counts) > _MAX_COLUMNS or max(map(len, counts)) > _MAX_NAME:
         raise ValueError(
             f"{name} has {len(counts)} columns, the longest name has {max(map(len, counts))} "

@@ -317,10 +317,11 @@ function answer(rows, { parameters, outputs }) {
   const worth = (row) => row.log_det_information ?? -Infinity, bound = (row) => parameters.reduce((sum, { name }) => sum + Math.log(row.params[name].cramer_rao_percent), 0) / parameters.length;
   const calm = rows.filter((row) => !row.is_violation).sort((a, b) => worth(b) - worth(a)), [best, next] = calm;
   if (!best || !Number.isFinite(worth(best))) return best ? "No excitation tells all parameters." : "Every excitation reached a critical level (violation): take a smaller amplitude, or a policy.";
-  const many = rows.length > 1 ? `Of ${calm.length < rows.length ? `the ${calm.length} without a violation` : `these ${rows.length}`}, ` : "";
-  const less = next && Math.exp(bound(next) - bound(best)), lead = Number.isFinite(less) ? `: the standard errors that it allows are ${shown(less, 2)} times smaller than those of ${next.excitation}` : "";
+  const loud = rows.filter((row) => row.is_violation).map(({ excitation }) => excitation).join(" and ");
   const told = { warning: "reached a warning level, but no critical one", safe: "reached no level", "no level": "has no level to reach: the plant declares none" }[state(best, outputs)];
-  return `${many}${best.excitation} tells most about ${parameters.length > 1 ? "the parameters" : "the parameter"}${lead}. In this experiment it ${told}.`;
+  if (!next) return `${loud && `${loud} reached a critical level (violation). `}${best.excitation} ${told} in this experiment.`;
+  const less = Math.exp(bound(next) - bound(best)), lead = Number.isFinite(less) ? `: the standard errors that it allows are ${shown(less, 2)} times smaller (geometric mean) than those of ${next.excitation}` : "";
+  return `${loud && `${loud} reached a critical level (violation). `}Of ${loud ? "the others" : `these ${rows.length}`}, ${best.excitation} tells most${lead}. In this experiment it ${told}.`;
 }
 
 function compare(live, rows, total) {

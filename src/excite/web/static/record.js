@@ -14,7 +14,10 @@ export function begin(known) {
   task = new Task(form, () => given !== null && needed().every((name) => at(`column-${name}`)?.value));
   options(at("record-plant"), Object.keys(catalogue.plants), "aero2");
   options(at("estimator"), catalogue.estimators, "nls");
-  at("record-plant").addEventListener("change", () => { ofPlant(); showMapping(); });
+  at("record-plant").addEventListener("change", () => {
+    ofPlant();
+    if (given) { showMapping(); tellFiles(); }
+  });
   at("effects").addEventListener("change", beforehand);
   ofPlant();
   at("file").addEventListener("change", () => take([...at("file").files]));
@@ -56,8 +59,17 @@ function put(taken) {
   task.kept.save({ upload: given.upload, mapped });
   preview();
   task.refresh();
-  const open = needed().filter((name) => !at(`column-${name}`).value);
-  const { file, columns } = given.files.at(-1), counts = Object.values(columns);
+  tellFiles();
+}
+
+/** What the newest file has, and what is to be done next. */
+function tellFiles() {
+  const chosen = needed().map((name) => at(`column-${name}`).value), open = needed().filter((_, i) => !chosen[i]);
+  const { file, columns } = given.files.at(-1), counts = Object.values(columns), lacking = chosen.filter((name) => name && name !== NONE && !(name in columns));
+  if (lacking.length && at(`role-${given.files.length - 1}`).value !== "not used") {
+    say(form, `${file} has no column ${lacking.join(", ")}: all files need the same names, or are not used.`, true);
+    return;
+  }
   say(form, `${file}: ${counts.length} ${counts.length > 1 ? "columns" : "column"}, ${Math.max(...counts)} samples. ${task.isBusy ? "Another file is still being identified; wait, or stop it." : open.length ? `Choose the column of ${open.join(", ")}.` : "Map them, then identify."}`);
 }
 
@@ -71,7 +83,7 @@ async function take(chosen, before = null) {
     task.refresh();
     if (!task.isBusy) hideResults();
     task.kept.save({ upload: null, shown: task.job });
-    ["mapping", "files"].forEach((id) => { at(id).hidden = true; });
+    ["mapping", "files", "preview"].forEach((id) => { at(id).hidden = true; });
   }
   for (const one of chosen) {
     say(form, `Reading ${one.name}…`);
@@ -93,6 +105,7 @@ function roles() {
   at("files").querySelector("div").replaceChildren(...given.files.map(({ file }, i) => {
     const select = el("select", { id: `role-${i}` });
     options(select, ["fitted", "held out", "not used"]);
+    select.addEventListener("change", tellFiles);
     return el("div", { class: "field" }, el("label", { for: select.id }, file), select);
   }));
 }
@@ -167,7 +180,6 @@ const unitsOf = (name) => [...plant().inputs, ...plant().outputs].find((p) => p.
 const unitIn = (column) => /[[(]([^\])]+)[\])]\s*$/.exec(column)?.[1].trim();
 
 function showMapping() {
-  if (given === null) return;
   const there = Object.keys(given.files[0].columns), part = (name, kind) => there.find((c) => c.toLowerCase().replace("_", "") === name.toLowerCase() + kind); // uEst and uVal
   const found = (name) => there.find((c) => c.toLowerCase() === name.toLowerCase()) ?? there.find((c) => c.toLowerCase().split(/[\s([]/)[0] === name.toLowerCase()) ?? part(name, "est");
   at("mapping").hidden = false;
@@ -199,7 +211,7 @@ function showMapping() {
       units.forEach((one) => { one.hidden = isNone; });
       task.refresh();
     };
-    select.addEventListener("change", change);
+    select.addEventListener("change", () => { change(); tellFiles(); });
     change();
     return el("div", { class: "map" }, el("div", { class: "field" }, el("label", { for: select.id }, name), select), ...units, value, hint);
   }));
