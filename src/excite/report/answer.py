@@ -369,7 +369,7 @@ def _believed(result: EstimateSummary) -> str:
         )
     if coloured:
         return (
-            f"but the residual of {listed(coloured)} is more than white noise: something is left "
+            f"the residual of {listed(coloured)} is not white noise: something is left "
             "that the plant does not explain, or that disturbs it"
         )
     if not any(map(math.isfinite, tested)):
