@@ -1358,6 +1358,10 @@ def test_columns_that_a_second_file_lacks_are_told(address: str, page: Page):
     expect(status(page, "record")).to_contain_text("Choose the column of voltage.", timeout=WAIT)
     page.locator("#column-voltage").select_option("uEst")
     expect(status(page, "record")).to_contain_text("Map them, then identify.")
+    page.locator("#record form summary").click()
+    page.locator("#held-out-voltage").select_option("uVal")
+    told = "Map them, then identify. Held out, as chosen under Advanced: uVal."
+    expect(status(page, "record")).to_contain_text(told)
     other: Any = {"name": "b.csv", "mimeType": "", "buffer": b"t,uEst,winkel\n0,1,1\n1,2,1\n"}
     page.get_by_label("Add a file").set_input_files(other)
     lacking = "b.csv has no column time, pitch: all files need the same names, or are not used."

@@ -66,11 +66,12 @@ function put(taken) {
 function tellFiles() {
   const chosen = needed().map((name) => at(`column-${name}`).value), open = needed().filter((_, i) => !chosen[i]);
   const { file, columns } = given.files.at(-1), counts = Object.values(columns), lacking = chosen.filter((name) => name && name !== NONE && !(name in columns));
+  const apart = Object.values(filled("held-out", signals()));
   if (lacking.length && at(`role-${given.files.length - 1}`).value !== "not used") {
     say(form, `${file} has no column ${lacking.join(", ")}: all files need the same names, or are not used.`, true);
     return;
   }
-  say(form, `${file}: ${counts.length} ${counts.length > 1 ? "columns" : "column"}, ${Math.max(...counts)} samples. ${task.isBusy ? "Another file is still being identified; wait, or stop it." : open.length ? `Choose the column of ${open.join(", ")}.` : "Map them, then identify."}`);
+  say(form, `${file}: ${counts.length} ${counts.length > 1 ? "columns" : "column"}, ${Math.max(...counts)} samples. ${task.isBusy ? "Another file is still being identified; wait, or stop it." : open.length ? `Choose the column of ${open.join(", ")}.` : "Map them, then identify."}${apart.length ? ` Held out, as chosen under Advanced: ${apart.join(", ")}.` : ""}`);
 }
 
 /** Reads files, one after the other; they replace those before, or are added to them. */
@@ -220,6 +221,7 @@ function showMapping() {
     options(select, there);
     select.prepend(el("option", { value: "" }, "the same"));
     select.value = part(name, "val") ?? "";
+    select.addEventListener("change", tellFiles);
     return el("div", { class: "field" }, el("label", { for: select.id }, name), select);
   }));
   at("held-out").parentElement.hidden = false;
