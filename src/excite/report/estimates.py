@@ -86,14 +86,14 @@ def beside(results: Mapping[str, EstimateSummary]) -> Table:
         fits = [number(result.fit_percent.get(output), 4) for result in every]
         rows.append([f"fit of {output}", "%", *fits])
     for output in outputs:
-        held_out = [_held_out_fit(result, output) for result in every]
+        held_out = [held_out_fit(result, output) for result in every]
         if any(fit is not None for fit in held_out):
             rows.append([f"held-out fit of {output}", "%", *(number(fit, 4) for fit in held_out)])
     return header, rows
 
 
-def _held_out_fit(result: EstimateSummary, output: str) -> float | None:
-    """The mean over held-out records; None without any."""
+def held_out_fit(result: EstimateSummary, output: str) -> float | None:
+    """Fit of the simulation, mean over the held-out records [%]; None without any."""
     fits = [own.fit_percent[output] for own in result.validation if output in own.fit_percent]
     return sum(fits) / len(fits) if fits else None
 

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from .estimates import (
+    held_out_fit,
     largest_correlation,
     parameter_cells,
     parameter_header,
@@ -137,8 +138,7 @@ def compared_plants(result: Data) -> tuple[str, Table]:
         row += [number(p["bic"] - best, 4), "–" if p["p_value"] is None else number(p["p_value"])]
         row += [number(own.fit_percent[name], 4) for name in outputs]
         if held_out:
-            fits = [[v.fit_percent[name] for v in own.validation] for name in outputs]
-            row += [number(sum(values) / len(values), 4) for values in fits]
+            row += [number(held_out_fit(own, name), 4) for name in outputs]
         rows.append(row)
     return "plants, likeliest first", (header, rows)
 

@@ -21,6 +21,7 @@ export function begin(known) {
   at("effects").addEventListener("change", beforehand);
   ofPlant();
   at("file").addEventListener("change", () => take([...at("file").files]));
+  at("more").accept = at("file").accept;
   at("more").addEventListener("change", () => take([...at("more").files], given));
   const drop = section.querySelector(".drop");
   const over = (is) => (event) => { event.preventDefault(); drop.classList.toggle("over", is); };
