@@ -16,7 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from . import __version__
 from .description import by_name, names_of, require_whole, wrong_type
@@ -180,21 +180,24 @@ def response(
 
     Args:
         dt: time from each sample to the next [s]; default the plant's sampling time.
-        next_inputs: see `step`.
+        next_inputs: see `step`; of the last step, what acts on the last sample directly.
     """
     start = plant.initial_state if initial_state is None else initial_state
     steps = acting(plant, params, inputs, dt, next_inputs)
 
     def advance(state: Array, now: tuple) -> tuple[Array, Array]:
-        input, dt, next_input = now
+        (input, dt, next_input), at_once = now
         state = step(plant, state, input, params, dt, next_input)
-        return state, plant.output(state, params)
+        return state, plant.output(state, *at_once, params)
 
     if isinstance(plant, AbstractStaticTask):  # all designs at once: none waits for another
         outputs = jax.vmap(lambda design: plant.output(plant.after(design), params))(inputs)
-    else:
-        _, outputs = jax.lax.scan(advance, start, steps)
-    return jnp.concatenate([plant.output(start, params)[None], outputs])
+        return jnp.concatenate([plant.output(start, params)[None], outputs])
+    first, _, ends = steps
+    last = first[-1:] if ends is None else ends[-1:]
+    at_once = plant.at_once(jnp.concatenate([first[1:], last]))
+    _, outputs = jax.lax.scan(advance, start, (steps, at_once))
+    return jnp.concatenate([plant.output(start, *plant.at_once(first[0]), params)[None], outputs])
 
 
 @eqx.filter_jit
@@ -327,40 +330,63 @@ def run_episode(
 
     Args:
         noise: in place of that of the key, in standard deviations of the sensor.
+
+    Raises:
+        ValueError: for an excitation that measures, on a plant with feedthrough.
     """
     noise = sensor_noise(plant, num_steps, key) if noise is None else noise
     lower, upper = plant.input_limits
+    if plant.has_feedthrough and excitation.measures:
+        raise ValueError(
+            f"an input of plant {plant.definition.name!r} acts on an output directly (an algebraic "
+            "loop): the excitation must be a signal, which needs no measurement"
+        )
 
     delay = plant.delay(params)
 
-    def moved(state: Array, past: Array, input: Array, k: Array) -> tuple[Array, Array]:
+    def delayed_input(past: Array, input: Array, k: Array) -> tuple[Array, Array, Array | None]:
+        """The input at the beginning and the end of step k, None where it is held."""
         if delay is None:
-            return step(plant, state, input, params), past
+            return past, input, None
         past = past.at[k].set(input)
-        first, last = _delayed_step(past, delay / plant.dt, k)
-        return step(plant, state, first, params, next_input=last), past
+        return past, *_delayed_step(past, delay / plant.dt, k)
 
     disturbance_key = jax.random.fold_in(key, 0)
 
-    def advance(carry: tuple, now: tuple) -> tuple[tuple, tuple]:
-        (state, past, memory), (noise, k) = carry, now
-        output, shown = plant.true_and_shown(state, params)
-        measured = measure(plant, state, params, shown, noise)
+    def sampled(state: Array, at_once: tuple[Array, ...], noise: Array) -> tuple[Array, Array]:
+        """The measurement and the true outputs."""
+        output, shown = plant.true_and_shown(state, *at_once, params)
+        return measure(plant, state, params, shown, noise), output
+
+    def excited(memory: PyTree, measured: Array) -> tuple[PyTree, Array]:
         memory, input = excitation(memory, measured)
-        input = jnp.clip(input, lower, upper)
-        state, past = moved(state, past, input, k)
+        return memory, jnp.clip(input, lower, upper)
+
+    def advance(carry: tuple, now: tuple) -> tuple[tuple, tuple]:
+        (state, past, memory, _), (noise, k) = carry, now
+        if plant.has_feedthrough:  # the input is there before the measurement
+            memory, input = excited(memory, jnp.zeros_like(noise))
+            past, first, last = delayed_input(past, input, k)
+            measured, output = sampled(state, plant.at_once(first), noise)
+        else:
+            measured, output = sampled(state, (), noise)
+            memory, input = excited(memory, measured)
+            past, first, last = delayed_input(past, input, k)
+        state = step(plant, state, first, params, next_input=last)
         state = disturbed(plant, state, jax.random.fold_in(disturbance_key, k))
-        return (state, past, memory), (input, measured, output)
+        end = plant.at_once(first if last is None else last)
+        return (state, past, memory, end), (input, measured, output)
 
     past = jnp.zeros((0 if delay is None else num_steps, len(lower)))
-    start = plant.initial_state, past, excitation.init(plant, num_steps, jax.random.split(key)[0])
+    memory = excitation.init(plant, num_steps, jax.random.split(key)[0])
+    start = plant.initial_state, past, memory, plant.at_once(jnp.zeros(len(lower)))
     steps = noise[:-1], jnp.arange(num_steps)
-    (state, *_), (inputs, measured, outputs) = jax.lax.scan(advance, start, steps)
-    last, shown = plant.true_and_shown(state, params)
+    (state, *_, end), (inputs, measured, outputs) = jax.lax.scan(advance, start, steps)
+    final, last = sampled(state, end, noise[-1])
     return Trajectory(
         time=jnp.arange(num_steps + 1) * plant.dt,
         inputs=inputs,
-        measured=jnp.concatenate([measured, measure(plant, state, params, shown, noise[-1])[None]]),
+        measured=jnp.concatenate([measured, final[None]]),
         outputs=jnp.concatenate([outputs, last[None]]),
     )
 

@@ -84,12 +84,21 @@ def stack_experiments(
 ) -> Experiments:
     """Experiments of any lengths side by side; each has one more output than inputs.
 
+    A plant with feedthrough needs the input of the last sample, too: it is repeated where it is
+    not given. So these experiments end with a step after which nothing is measured.
+
     Args:
         dt: see `Experiments`.
         next_inputs: see `Experiments`.
         seen: False where an output was not measured; its value is ignored.
     """
     xp = jnp if any(isinstance(rows, jax.core.Tracer) for rows in (*inputs, *measured)) else np
+    if plant.has_feedthrough:
+
+        def with_last(u: AnyArray, y: AnyArray) -> AnyArray:
+            return u if len(u) == len(y) else xp.concatenate([u, u[-1:]])
+
+        inputs = [*map(with_last, inputs, measured)]
     longest, counts = max(map(len, inputs)), xp.asarray([len(y) for y in measured])
 
     def stacked(records: Sequence[AnyArray], length: int) -> AnyArray:

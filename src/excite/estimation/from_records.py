@@ -181,13 +181,17 @@ def experiments_of(
     outputs = [record.outputs[part] for record, part in parts]
     evenly = _are_even(records, float(plant.dt))
     seen = [np.isfinite(rows) for rows in outputs]
+    acting = slice(None) if plant.has_feedthrough else slice(-1)  # the last input, or not
+    ends = [np.concatenate([rows[1:], rows[-1:]]) for rows in inputs]
     return stack_experiments(
         plant,
-        [rows[:-1] for rows in inputs],
+        [rows[acting] for rows in inputs],
         outputs,
         known,
         dt=None if evenly else [np.diff(record.time[part]) for record, part in parts],
-        next_inputs=[np.where(linear, rows[1:], rows[:-1]) for rows in inputs],
+        next_inputs=[
+            np.where(linear, end, rows)[acting] for rows, end in zip(inputs, ends, strict=True)
+        ],
         seen=None if all(rows.all() for rows in seen) else seen,
     )
 

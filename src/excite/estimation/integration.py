@@ -93,11 +93,14 @@ def _changed(
     e, n = experiments, max(_LONGEST // len(experiments.valid), 2)
     sd = NLS().weights(plant, experiments, estimate)[None, None]
     noise = jnp.sqrt(jnp.sum((estimate.residual / sd) ** 2) / jnp.sum(e.valid))
+    valid = e.valid[:, :n]
+    if plant.has_feedthrough:  # the last sample has no input any more
+        valid = valid.at[:, -1].set(False)
     part = dataclasses.replace(
         e,
         inputs=e.inputs[:, : n - 1],
         measured=e.measured[:, :n],
-        valid=e.valid[:, :n],
+        valid=valid,
         dt=None if e.dt is None else e.dt[:, : n - 1],
         next_inputs=None if e.next_inputs is None else e.next_inputs[:, : n - 1],
     )

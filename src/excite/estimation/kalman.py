@@ -69,7 +69,8 @@ def innovations(
 
     def advance(belief: tuple[Array, Array], now: tuple) -> tuple[tuple[Array, Array], Innovations]:
         inputs, measured, valid = now
-        belief, found = _corrected(plant, params, noise_sd, *belief, measured, valid)
+        at_once = plant.at_once(inputs[0])
+        belief, found = _corrected(plant, params, noise_sd, *belief, at_once, measured, valid)
         return _predicted(plant, params, process_noise, *belief, *inputs), found
 
     now = acting(plant, params, *steps)
@@ -84,16 +85,20 @@ def _corrected(
     noise_sd: Float[Array, " output"],
     state: Float[Array, " state"],
     covariance: Float[Array, "state state"],
+    at_once: tuple[Float[Array, " input"], ...],
     measured: Float[Array, " output"],
     valid: Bool[Array, " output"],
 ) -> tuple[tuple[Array, Array], Innovations]:
     """Mean and covariance after the outputs of one sample, and the innovations."""
     scales = jnp.asarray([s.scale for s in plant.definition.states])
     width = jnp.sqrt(jnp.diagonal(covariance) + (_NARROW * scales) ** 2)
-    output = jax.vmap(plant.output, in_axes=(0, None))
+
+    def output(state: Array) -> Array:
+        return plant.output(state, *at_once, params)
+
     aside = jnp.diag(width)
-    above, below = output(state[None] + aside, params), output(state[None] - aside, params)
-    C, predicted = ((above - below) / (2 * width[:, None])).T, plant.output(state, params)
+    above, below = jax.vmap(output)(state[None] + aside), jax.vmap(output)(state[None] - aside)
+    C, predicted = ((above - below) / (2 * width[:, None])).T, output(state)
     sd = jnp.sqrt(jnp.einsum("oi,ij,oj->o", C, covariance, C) + noise_sd**2)
     error = jnp.where(valid, measured - predicted, 0.0)
     change, P, each = jnp.zeros_like(state), covariance, []

@@ -282,20 +282,22 @@ class MultipleShooting(eqx.Module):
         (first, last), change = jax.tree.map(cut, (now, change))
         return dataclasses.replace(self.segments, steps=Steps(first, s.dt, last, change))
 
-    def advance(self, x: Array, now: Steps, params: Params, delay: Array | None = None) -> Array:
-        """State one sample later; `delay` is that of the inputs, for the derivatives."""
-        ends, own = (now.inputs, now.next_inputs), self.plant.delay(params)
-        if now.change is not None and delay is not None and own is not None:
-            ends = jax.tree.map(lambda u, slope: u + (own - delay) * slope, ends, now.change)
-        return step(self.plant, x, ends[0], params, now.dt, ends[1])
-
     def simulated(
         self, start: Array, steps: Steps, params: Params, delay: Array | None = None
     ) -> tuple[Array, Array]:
-        """The end state of a segment, and its outputs; the start state is over its scales."""
+        """The end state of a segment, and its outputs; the start state is over its scales.
+
+        `delay` is that of the inputs, for the derivatives.
+        """
+        plant, own = self.plant, self.plant.delay(params)
+        later = None if own is None or delay is None else own - delay
 
         def advance(x: Array, now: Steps) -> tuple[Array, Array]:
-            return self.advance(x, now, params, delay), self.plant.output(x, params)
+            ends = now.inputs, now.next_inputs
+            if now.change is not None and later is not None:
+                ends = jax.tree.map(lambda u, slope: u + later * slope, ends, now.change)
+            outputs = plant.output(x, *plant.at_once(ends[0]), params)
+            return step(plant, x, ends[0], params, now.dt, ends[1]), outputs
 
         return jax.lax.scan(advance, start * self.scales, steps)
 

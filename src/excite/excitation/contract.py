@@ -28,6 +28,11 @@ SignalState: TypeAlias = tuple[Sequence, Int[Array, ""]]
 class AbstractExcitation(eqx.Module):
     """Base of all excitations."""
 
+    @property
+    def measures(self) -> bool:
+        """Whether an input depends on the measurements before it."""
+        return True
+
     @abc.abstractmethod
     def init(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> PyTree:
         """State before the first sample of an experiment of `num_steps` steps."""
@@ -46,6 +51,11 @@ class AbstractExcitation(eqx.Module):
 
 class AbstractSignal(AbstractExcitation):
     """An excitation that ignores the measurement: a sequence known beforehand."""
+
+    @property
+    def measures(self) -> bool:
+        """No."""
+        return False
 
     @abc.abstractmethod
     def sequence(self, plant: AbstractPlant, num_steps: int, key: PRNGKeyArray) -> Sequence:

@@ -162,6 +162,11 @@ class Coast(AbstractExcitation):
     excitation: AbstractExcitation
     num_steps: int = eqx.field(static=True)
 
+    @property
+    def measures(self) -> bool:
+        """As the excitation."""
+        return self.excitation.measures
+
     @classmethod
     def after(
         cls, excitation: AbstractExcitation, num_steps: int, coast: int

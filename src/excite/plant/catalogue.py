@@ -27,6 +27,7 @@ from ..files import class_at, damaged, is_class_word, read_json
 from .aero2 import Aero2, Aero2Detailed, Aero2Lag
 from .cart_pole import CartPole
 from .contract import (
+    AbstractARXPlant,
     AbstractPlant,
     Sensor,
     require_double_precision,
@@ -238,7 +239,7 @@ def _check_plant(plant: AbstractPlant, where: str) -> None:
     state, inputs = plant.initial_state, jnp.zeros(len(d.inputs))
     functions: list[tuple[str, tuple[Any, ...], int]] = [
         ("derivative", (state, inputs, plant.nominal), len(d.states)),
-        ("output", (state, plant.nominal), len(d.outputs)),
+        ("output", (state, *plant.at_once(inputs), plant.nominal), len(d.outputs)),
         ("delay", (plant.nominal,), len(d.inputs)),
     ]
     if isinstance(plant, AbstractStaticTask):  # its other functions follow from this one
@@ -259,6 +260,11 @@ def _check_plant(plant: AbstractPlant, where: str) -> None:
             raise ValueError(f"{what} returns shape {found.shape}; {needed}")
         if jnp.issubdtype(found.dtype, jnp.complexfloating):
             raise ValueError(f"{what} returns complex numbers; real ones are needed")
+    if isinstance(plant, AbstractARXPlant) and plant.has_feedthrough:
+        raise ValueError(
+            f"{where} is an ARX plant, whose output does not depend on the input directly: make it "
+            "an AbstractPlant, or define output(self, state, params)"
+        )
     if has_own_noise(plant):
         _check_own_noise(plant, where)
 
@@ -317,7 +323,8 @@ def _traced(plant: AbstractPlant, name: str, arguments: tuple[Any, ...], what: s
 
 _SHAPES = {
     "derivative": "; its arguments are (self, state, input, params), arrays and a tuple: input[0]",
-    "output": "; its arguments are (self, state, params), the first an array: state[0]",
+    "output": "; its arguments are (self, state, params), the first an array: state[0] (or (self, "
+    "state, input, params), if an input acts on the outputs directly)",
     "delay": "; its arguments are (self, params)",
 }
 
@@ -338,9 +345,9 @@ def _missing_name(plant: AbstractPlant, error: BaseException, what: str) -> Valu
 
 
 def require_inputs(plant: AbstractPlant) -> None:
-    """Raises ValueError for a plant without inputs, or with inputs that act late.
+    """Raises ValueError for a plant without inputs, with inputs that act late, or feedthrough.
 
-    Designs, policies, studies and rigs need inputs that act at once.
+    Designs, policies, studies and rigs measure, and then choose the input that acts next.
     """
     if not plant.definition.inputs:
         raise ValueError(
@@ -351,6 +358,12 @@ def require_inputs(plant: AbstractPlant) -> None:
         raise ValueError(
             f"plant {plant.definition.name!r} delays its inputs: it can be simulated and "
             "identified, but not be used for designs, policies, studies and rigs"
+        )
+    if plant.has_feedthrough:
+        raise ValueError(
+            f"an input of plant {plant.definition.name!r} acts on an output directly: it can be "
+            "simulated and identified, but not be used for designs, policies, studies and rigs, "
+            "which measure before they choose the input"
         )
 
 

@@ -4,7 +4,8 @@ A new plant is one class with a `definition` (plain data) and two pure functions
 
     x'(t) = derivative(x, u, params)        y(t) = output(x, params)
 
-Simulation, sensitivities, estimation and training need nothing else. Numbers of a plant
+Simulation, sensitivities, estimation and training need nothing else. Outputs on which an input
+acts at once, as on an accelerometer, are output(x, u, params). Numbers of a plant
 are leaves of the pytree, names and limits are static. Two plants of a class that differ
 in a constant, in sensor noise or in the initial state share one compilation.
 """
@@ -14,6 +15,7 @@ from __future__ import annotations
 import abc
 import copy
 import dataclasses
+import inspect
 import math
 from collections import namedtuple
 from collections.abc import Mapping
@@ -64,6 +66,11 @@ Params: TypeAlias = Any
 def _tuple_type(title: str, names: tuple[str, ...]) -> type:
     # One class for one set of names: a pytree of another class would compile again.
     return namedtuple(title, names)  # pyright: ignore[reportUntypedNamedTuple]
+
+
+@cache
+def _takes_input(kind: type[AbstractPlant]) -> bool:
+    return len(inspect.signature(kind.output).parameters) == len(("self", "x", "u", "params"))
 
 
 class Sensor(eqx.Module):
@@ -179,23 +186,38 @@ class AbstractPlant(_Module):
         """Time derivative of the state, in state units per second."""
 
     @abc.abstractmethod
-    def output(self, state: Float[Array, " state"], params: Params) -> Float[Array, " output"]:
-        """Noise-free outputs. An input acts only through the state."""
+    def output(self, *arguments: Any, **named: Any) -> Float[Array, " output"]:
+        """Noise-free outputs: a plant defines `output(self, state, params)`.
 
-    def true_output(self, state: Float[Array, " state"], params: Params) -> Float[Array, " output"]:
+        Where an input acts on an output directly (feedthrough), it defines
+        `output(self, state, input, params)`: sample k depends on the input of sample k, as in
+        y_k = C x_k + D u_k.
+        """
+
+    def true_output(self, *arguments: Any) -> Float[Array, " output"]:
         """What is judged against the levels: the outputs without errors of their sensor.
 
-        `output`, which identification predicts, has these errors, such as a bias.
+        `output`, which identification predicts, has these errors, such as a bias. The arguments
+        are the same.
         """
-        return self.output(state, params)
+        return self.output(*arguments)
 
     def true_and_shown(
-        self, state: Float[Array, " state"], params: Params
+        self, *arguments: Any
     ) -> tuple[Float[Array, " output"], Float[Array, " output"]]:
         """`true_output` and `output`: computed once where they are the same."""
-        shown = self.output(state, params)
+        shown = self.output(*arguments)
         is_same = type(self).true_output is AbstractPlant.true_output
-        return (shown if is_same else self.true_output(state, params)), shown
+        return (shown if is_same else self.true_output(*arguments)), shown
+
+    @property
+    def has_feedthrough(self) -> bool:
+        """Whether `output` depends on the input directly."""
+        return _takes_input(type(self))
+
+    def at_once(self, input: Float[Array, "*row input"]) -> tuple[Float[Array, "*row input"], ...]:
+        """What `output` takes between state and params: the input, if there is feedthrough."""
+        return (input,) if self.has_feedthrough else ()
 
     def delay(self, params: Params) -> Float[Array, " input"] | None:
         """Time after which each input acts [s]; None: all inputs act at once.

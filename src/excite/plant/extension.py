@@ -19,7 +19,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from functools import cache
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -136,8 +136,27 @@ class Extended(AbstractPlant):
     ) -> Float[Array, " state"]:
         """Of the plain plant's states, then of those of lags and drifts."""
         own_states = len(self.plain.definition.states)
-        inputs, added, slopes = list(input), list(state[own_states:]), []
+        acting, slopes = self._acting(state, input, params)
         friction = [jnp.asarray(0.0)] * own_states
+        for e in self.extensions:
+            value, at = getattr(params, e.name), e.index
+            if e.kind == "coulomb":
+                smooth = _SHARP * self.definition.states[at].scale
+                friction[at] += value * jnp.tanh(state[at] / smooth)
+            elif e.kind == "drag":
+                friction[at] += value * state[at] * jnp.abs(state[at])
+            elif e.kind == "drift":
+                slopes.append(value)
+        slope = self._plain().derivative(state[:own_states], acting, self._own(params))
+        slope = slope - jnp.stack(friction)
+        return jnp.concatenate([slope, jnp.stack(slopes)]) if slopes else slope
+
+    def _acting(
+        self, state: Float[Array, " state"], input: Float[Array, " input"], params: Params
+    ) -> tuple[Float[Array, " input"], list[Float[Array, ""]]]:
+        """The inputs as they act on the plain plant, and the slopes of the states of lags."""
+        inputs, slopes = list(input), []
+        added = list(state[len(self.plain.definition.states) :])
         for e in self.extensions:
             value, at = getattr(params, e.name), e.index
             if e.kind == "lag":
@@ -152,22 +171,18 @@ class Extended(AbstractPlant):
                 inputs[at] = jnp.clip(inputs[at], -value, value)
             elif e.kind == "dead_zone":
                 inputs[at] -= jnp.clip(inputs[at], -value, value)
-            elif e.kind == "coulomb":
-                smooth = _SHARP * self.definition.states[at].scale
-                friction[at] += value * jnp.tanh(state[at] / smooth)
-            elif e.kind == "drag":
-                friction[at] += value * state[at] * jnp.abs(state[at])
-            elif e.kind == "drift":
-                slopes.append(value)
-        acting = jnp.stack(inputs) if inputs else input
-        slope = self._plain().derivative(state[:own_states], acting, self._own(params))
-        slope = slope - jnp.stack(friction)
-        return jnp.concatenate([slope, jnp.stack(slopes)]) if slopes else slope
+        return (jnp.stack(inputs) if inputs else input), slopes
 
-    def output(self, state: Float[Array, " state"], params: Params) -> Float[Array, " output"]:
+    @property
+    def has_feedthrough(self) -> bool:
+        """As the plain plant."""
+        return self._plain().has_feedthrough
+
+    def output(self, *arguments: Any) -> Float[Array, " output"]:
         """Of the plain plant, with biases and drifts."""
+        state, *_, params = arguments
         num_own = len(self.plain.definition.states)
-        outputs = list(self._plain().output(state[:num_own], self._own(params)))
+        outputs = list(self._plain().output(*self._of_plain(*arguments)))
         drifts = list(state[num_own + sum(e.kind == "lag" for e in self.extensions) :])
         for e in self.extensions:
             value = getattr(params, e.name)
@@ -177,10 +192,15 @@ class Extended(AbstractPlant):
                 outputs[e.index] += jnp.where(value != 0, drifts.pop(0), 0.0)
         return jnp.stack(outputs)
 
-    def true_output(self, state: Float[Array, " state"], params: Params) -> Float[Array, " output"]:
+    def true_output(self, *arguments: Any) -> Float[Array, " output"]:
         """Of the plain plant: biases and drifts are of its sensors."""
-        num_own = len(self.plain.definition.states)
-        return self._plain().true_output(state[:num_own], self._own(params))
+        return self._plain().true_output(*self._of_plain(*arguments))
+
+    def _of_plain(self, *arguments: Any) -> tuple[Any, ...]:
+        """Arguments of the plain plant's `output`."""
+        state, *input, params = arguments
+        own = (self._acting(state, at_once, params)[0] for at_once in input)
+        return state[: len(self.plain.definition.states)], *own, self._own(params)
 
     def delay(self, params: Params) -> Float[Array, " input"] | None:
         """Of the plain plant, and the added ones."""
