@@ -39,6 +39,7 @@ PRIOR_TOO = " or is the prior far from the truth (--prior)?"
 _STARTS, _SIZE_OF_MANY_STARTS = 8, 50_000  # measured values up to which so many are tried
 _TELLING = 50  # measured values from which the residual tells whether the search missed something
 _MORE_THAN_CHANCE = 10.0  # of a chi-squared variable of one degree of freedom
+_STILL, _OFTEN = 1e-9, 0.1  # of an output's scale; of its samples
 _FAR_OFF = 100.0  # times a positive parameter's start, or scales from it: the search ran away
 _FREE = 100.0  # scales of a parameter of free sign that are small for its standard error
 
@@ -166,7 +167,8 @@ def _estimate(
     """Estimates, the best first; the search is repeated where it may have missed the best one.
 
     Where more than noise is left, or a short record cannot tell, it begins at other starts as
-    well, default random ones; where it does not converge, it has longer segments.
+    well, default random ones; where it does not converge, it has longer segments. Where a
+    saturated output tells nothing of the states, segments may lead astray: then it has one.
     """
 
     def search(estimator: AbstractEstimator, start: Params) -> Estimate:
@@ -181,6 +183,9 @@ def _estimate(
     if not isinstance(estimator, NLS):
         return found
     size, num_samples = experiments.valid.size, experiments.valid.shape[1]
+    if size <= _SIZE_OF_MANY_STARTS and _is_saturated(plant, experiments, found[0]):
+        found.append(search(dataclasses.replace(estimator, segment_length=num_samples), start))
+        found.sort(key=quality)
     is_in_doubt = size < _TELLING or not is_noise(plant, experiments, found[0])
     if size <= _SIZE_OF_MANY_STARTS and is_in_doubt:
         others = _starts_around(plant, start, free) if others is None else others
@@ -221,6 +226,28 @@ def is_noise(plant: AbstractPlant, experiments: Experiments, estimate: Estimate)
         < RARE
         for i, o in enumerate(plant.definition.outputs)
     )
+
+
+def _is_saturated(plant: AbstractPlant, experiments: Experiments, estimate: Estimate) -> bool:
+    """Whether a simulated output often stays exactly where it is, as at the end of its range.
+
+    What is exact has not been led astray.
+    """
+    if is_exact(plant, estimate) or not np.isfinite(estimate.residual).all():
+        return False
+    is_seen = np.asarray(experiments.valid)
+    simulated = np.asarray(experiments.measured) - np.asarray(estimate.residual)
+    scales = np.array([o.scale for o in plant.definition.outputs])
+    stays = np.abs(np.diff(simulated, axis=1)) < _STILL * scales
+    is_pair = is_seen[:, 1:] & is_seen[:, :-1]
+    often = (stays & is_pair).sum((0, 1)) > _OFTEN * is_pair.sum((0, 1))
+    return bool(np.any(often))
+
+
+def is_exact(plant: AbstractPlant, estimate: Estimate) -> bool:
+    """Whether the residual is nothing but rounding."""
+    scales = [o.scale for o in plant.definition.outputs]
+    return not any(map(is_more_than_rounding, np.asarray(estimate.residual).T, scales))
 
 
 def is_centred(experiments: Experiments, estimate: Estimate) -> bool:

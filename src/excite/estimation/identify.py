@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -13,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..description import (
+    HALF_95,
     RARE,
     Named,
     PlantDescription,
@@ -25,7 +27,7 @@ from ..description import (
 from ..files import json_ready
 from ..information.identifiability import UNSEEN_SD, identifiability
 from ..plant import AbstractPlant, Params, params_from
-from ..plant.catalogue import PLANTS, PlantLike, plant_from
+from ..plant.catalogue import PLANTS, PlantLike, plant_from, word_of
 from ..plant.extension import plain_kind
 from ..plant.static import require_sensor_noise
 from ..progress import SHOWN, Progress
@@ -69,6 +71,7 @@ from .fit import (
     NothingLeftError,
     fit_of,
     is_centred,
+    is_exact,
     is_noise,
     known_parameters,
     with_initial_state,
@@ -101,6 +104,7 @@ from .validation import fitted_all, predicted_in_steps, state_from, validated, w
 InitialState = Literal["auto", "free", "known"]
 Intervals = Literal["linear", "profile"]
 _SIZE_OF_SUSPECTS = 10_000  # measured values in which suspects are looked for
+_FAR = 5.0  # standard errors between two ends of the search that are not one
 _SAME = 0.01  # difference of sums of squares at one minimum, over the noise
 _FAR_ABOVE = 10.0  # times the declared noise; a larger residual is remarked
 _FAR_FACTOR = 10.0  # between an estimate and what was expected of it; a larger one is remarked
@@ -733,16 +737,12 @@ def _suspects(
     if estimator.likelihood != "normal" or estimator.prior is not None:
         return (), ()  # outliers would hide them, a prior explain what they explain
     residual, valid = np.asarray(fit.estimate.residual), np.asarray(experiments.valid)
-    if not np.any(residual):
+    if is_exact(plant, fit.estimate):
         return (), ()  # nothing is left to explain
     is_white = is_noise(plant, experiments, fit.estimate) and is_centred(experiments, fit.estimate)
     if is_white and outliers(residual, valid) is None:
         return (), ()
 
-    name, plus, extensions = plant.definition.name.partition("+")
-    word = (
-        f"{name if name in PLANTS else 'FILE.py:' + plain_kind(plant).__name__}{plus}{extensions}"
-    )
     question = Question(
         plant,
         experiments,
@@ -755,7 +755,7 @@ def _suspects(
         fit.estimate,
         is_best,
         ~fit.known,
-        word,
+        _word(plant),
     )
 
     def told(text: str, done: float, total: float) -> None:
@@ -771,6 +771,17 @@ def _suspects(
     return found, (f"likely causes were looked for in {where}",)
 
 
+def _word(plant: AbstractPlant) -> str:
+    """The name of a plant in a command."""
+    try:
+        path, colon, name = word_of(plant).rpartition(":")
+    except ValueError:  # of a notebook
+        _, plus, extensions = plant.definition.name.partition("+")
+        return f"FILE.py:{plain_kind(plant).__name__}{plus}{extensions}"
+    near = os.path.relpath(path) if path else ""
+    return f"{path if near.startswith('..') else near}{colon}{name}"
+
+
 def _remedies(found: Sequence[Suspect]) -> tuple[str, ...]:
     """Sentences on the suspects, the likeliest first."""
     if not found:
@@ -781,13 +792,26 @@ def _remedies(found: Sequence[Suspect]) -> tuple[str, ...]:
 
 
 def _agreement(fit: Fit) -> tuple[str, ...]:
-    """A sentence on how many of several starts ended at the estimate."""
+    """How many of several starts ended at the estimate, and one elsewhere that fits as well."""
     if not fit.is_successful or not fit.others:
         return ()
-    ends = [fit.estimate, *fit.others]
-    most = (1 + _SAME / fit.estimate.residual.size) * float(fit.estimate.cost)
+    ends, cost = [fit.estimate, *fit.others], float(fit.estimate.cost)
+    noise = cost / max(np.count_nonzero(fit.estimate.residual), 1)
+    most = (1 + _SAME / fit.estimate.residual.size) * cost
     same = sum(float(end.cost) <= most for end in ends)
-    return (f"{same} of {len(ends)} starts of the search ended at this estimate",)
+    told = f"{same} of {len(ends)} starts of the search ended at this estimate"
+    std_error = np.sqrt(np.diagonal(fit.estimate.covariance))
+    for end in fit.others:
+        is_as_good = float(end.cost) - cost <= HALF_95**2 * noise
+        away = np.abs(np.stack(end.params) - np.stack(fit.estimate.params))
+        if int(end.status) == Status.SUCCESSFUL and is_as_good and np.any(away > _FAR * std_error):
+            found = zip(end.params._fields, end.params, fit.free, strict=True)
+            values = ", ".join(f"{name}={float(value):.4g}" for name, value, own in found if own)
+            return (
+                f"{told}, and one at {values}, where the fit is as good but for chance: the "
+                "intervals leave that out",
+            )
+    return (told,)
 
 
 def _with_causes(refusal: str, found: Sequence[Suspect]) -> ValueError:
