@@ -221,3 +221,16 @@ def test_a_petab_table_that_is_no_single_record_is_refused(rows, words, tmp_path
     with pytest.raises(ValueError, match=words) as error:
         read_record(path, Conversion.definition)
     assert "\n" not in str(error.value)
+
+
+def test_few_values_are_said_to_widen_the_intervals():
+    """Four samples of one output for two rates: Student's t has 2 degrees of freedom."""
+    whole = measured(Product, 1e-3)
+    few = Record(whole.time[::3], whole.inputs[::3], whole.outputs[::3], source="few.csv")
+    result = ex.identify(few, Product, start=TRUTH, initial_state="known")
+    assert f"(2 degrees of freedom): the intervals are {student_95(2):.3g} standard" in " ".join(
+        result.verdict
+    )
+    assert not any(
+        "degrees" in s for s in ex.identify(whole, Product, initial_state="known").verdict
+    )

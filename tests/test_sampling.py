@@ -1,5 +1,6 @@
 """Records as they are sampled: uneven times, gaps, missing outputs, held or linear inputs."""
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -10,6 +11,7 @@ import scipy.optimize
 from catalogue import LONG
 from experiments import spread_params
 
+import excite as ex
 from excite.estimation import ARX, NLS
 from excite.estimation.contract import stack_experiments
 from excite.estimation.identify import identify
@@ -165,3 +167,12 @@ def test_an_estimator_in_discrete_time_says_what_it_cannot_use(record, hold, wor
 def test_the_hold_of_an_input_that_does_not_exist_is_refused():
     with pytest.raises(ValueError, match=r"'aero2' has no input 'volt' to hold; it has voltage"):
         identify(solved(EVEN), PLANT, hold_input={"volt": "linear"})
+
+
+def test_an_input_that_is_recorded_late_is_told():
+    record = ex.simulate("dc_motor", "prbs", seed=1)
+    late = np.concatenate([np.repeat(record.inputs[:1], 3, axis=0), record.inputs[:-3]])
+    told = "the delay of voltage is negative (-0.00"
+    result = ex.identify(dataclasses.replace(record, inputs=late), "dc_motor+delay")
+    assert told in " ".join(result.verdict)
+    assert told not in " ".join(ex.identify(record, "dc_motor+delay").verdict)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeAlias, get_args
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -59,6 +60,7 @@ from .diagnosis import (
     is_more_than_rounding,
     misfit_factor,
     robust_covariance,
+    student_95,
     whiteness_of,
     widened,
     with_independent,
@@ -106,6 +108,7 @@ Intervals = Literal["linear", "profile"]
 _SIZE_OF_SUSPECTS = 10_000  # measured values in which suspects are looked for
 _FAR = 5.0  # standard errors between two ends of the search that are not one
 _SAME = 0.01  # difference of sums of squares at one minimum, over the noise
+_FEW_DEGREES = 5.0  # of Student's t, below which it widens an interval by a third and more
 _FAR_ABOVE = 10.0  # times the declared noise; a larger residual is remarked
 _FAR_FACTOR = 10.0  # between an estimate and what was expected of it; a larger one is remarked
 _BY_CHANCE = 1e-3  # a fit with a larger p-value explains nothing
@@ -585,11 +588,45 @@ def _confidence(
         values = dict(zip(names, map(float, fit.estimate.params), strict=True))
         sd = dict(zip(names, np.sqrt(np.diag(np.asarray(fit.estimate.covariance))), strict=True))
         remarks += estimator.prior.verdict(values, {n: sd[n] for n in names if sd[n] > 0})
+    remarks += [*_recorded_late(plant, fit.estimate, covariance), *_few_degrees(degrees[fit.free])]
     held = told_of_held(
         plant, experiments, estimator, fit.estimate, fit.free, fit.known, tuple(fit.reasons)
     )
     seen = _certainty(names, covariance / np.outer(size, size), fit.free)
     return covariance, degrees, factor, (*fit.reasons.values(), *held, *seen, *remarks)
+
+
+def _recorded_late(
+    plant: AbstractPlant, estimate: Estimate, covariance: np.ndarray
+) -> tuple[str, ...]:
+    """A sentence on each input whose delay is below zero by more than chance."""
+    found = jnp.stack([*estimate.params])
+
+    def delays(values: jax.Array) -> jax.Array | None:
+        return plant.delay(plant.Params(*values))
+
+    if (delay := delays(found)) is None:
+        return ()
+    slope = np.asarray(jax.jacfwd(delays)(found))
+    highest = np.asarray(delay) + HALF_95 * np.sqrt(np.diagonal(slope @ covariance @ slope.T))
+    return tuple(
+        f"the delay of {name} is negative ({float(value):.4g} s): {name} is recorded later than it "
+        "acts, or it is linear between samples (--hold-input), or the plant answers faster than "
+        "its equations"
+        for name, value, high in zip(names_of(plant.definition.inputs), delay, highest, strict=True)
+        if high < 0
+    )
+
+
+def _few_degrees(degrees: np.ndarray) -> tuple[str, ...]:
+    """A sentence where few values make the intervals wide."""
+    least = float(np.min(degrees, initial=np.inf))
+    if not least < _FEW_DEGREES:
+        return ()
+    return (
+        f"few values are left to tell the noise ({least:.3g} degrees of freedom): the intervals "
+        f"are {student_95(least):.3g} standard errors to either side",
+    )
 
 
 def _certainty(names: tuple[str, ...], covariance: np.ndarray, free: np.ndarray) -> tuple[str, ...]:
