@@ -30,11 +30,6 @@ from .held import structure_of
 from .nls import NLS
 from .pem import PEM
 
-NOTHING_SEEN = (
-    "no parameter is identifiable from the data; are columns, signs and units right, and does the "
-    "input move the plant beyond the noise? or did the search begin too far from the truth "
-    "(--start)?"
-)
 PRIOR_TOO = " or is the prior far from the truth (--prior)?"
 _STARTS, _SIZE_OF_MANY_STARTS = 8, 50_000  # measured values up to which so many are tried
 _TELLING = 50  # measured values from which the residual tells whether the search missed something
@@ -42,6 +37,15 @@ _MORE_THAN_CHANCE = 10.0  # of a chi-squared variable of one degree of freedom
 _STILL, _OFTEN = 1e-9, 0.1  # of an output's scale; of its samples
 _FAR_OFF = 100.0  # times a positive parameter's start, or scales from it: the search ran away
 _FREE = 100.0  # scales of a parameter of free sign that are small for its standard error
+
+
+def nothing_seen(plant: AbstractPlant) -> str:
+    """Why no parameter may be identifiable, as questions."""
+    moves = "does the input move the plant" if plant.definition.inputs else "do the outputs move"
+    return (
+        f"no parameter is identifiable from the data; are columns, signs and units right, and "
+        f"{moves} beyond the noise? or did the search begin too far from the truth (--start)?"
+    )
 
 
 def known_parameters(plant: AbstractPlant, estimator: AbstractEstimator) -> np.ndarray:
@@ -143,7 +147,7 @@ def _fit_seen(
             tested = structure_of(plant, experiments, start, known)
             groups = tested.not_identifiable if tested else ()
             lost = [f"{STRUCTURALLY_NOT}: {group.sentence}" for group in groups]
-            raise NothingLeftError("; ".join([*lost, NOTHING_SEEN]), first)
+            raise NothingLeftError("; ".join([*lost, nothing_seen(plant)]), first)
         found = _estimate(plant, experiments, estimator, start, free, progress, [last])
         contradicts = ""
         if bound is None and _fits_worse(plant, found[0], ended):

@@ -67,7 +67,6 @@ from .diagnosis import (
 )
 from .excerpt import spans_of
 from .fit import (
-    NOTHING_SEEN,
     PRIOR_TOO,
     Fit,
     NothingLeftError,
@@ -76,6 +75,7 @@ from .fit import (
     is_exact,
     is_noise,
     known_parameters,
+    nothing_seen,
     with_initial_state,
 )
 from .from_records import (
@@ -270,7 +270,7 @@ def identify(
     is_fit = not is_judged or _explains(records, residual, int(fit.free.sum()) - num_priors)
     found, where = find(fit, is_fit and fit.is_successful)
     if not is_fit:
-        raise _with_causes(NOTHING_SEEN + too, found)
+        raise _with_causes(nothing_seen(plant) + too, found)
     whiteness = {
         name: whiteness_of([finite(r[:, i]) for r in residual], plant.definition.outputs[i].scale)
         for i, name in enumerate(names_of(plant.definition.outputs))
