@@ -15,6 +15,7 @@ import scipy.stats
 from documented import documented
 from experiments import NUM_STEPS, autoregressive, record_of, recording, spread_params
 
+import excite as ex
 from excite.description import Input, Output, Parameter, PlantDescription, State
 from excite.estimation import ARX, NLS
 from excite.estimation.identify import identify
@@ -714,3 +715,13 @@ def test_emps_is_identified_from_starts_that_are_30_percent_off(signs, emps_reco
     assert any("not white" in sentence for sentence in result.verdict)
     low, high = result.ci95("M")
     assert low < 95.1089 < high  # the value published with the data
+
+
+def test_white_noise_far_above_the_declared_one_is_in_doubt():
+    """A search that missed the plant may leave a residual that looks white."""
+    record = ex.simulate("aero2", "prbs", noise={"pitch": 0.004}, seed=2)
+    result = ex.identify(record, "aero2")
+    assert result.whiteness["pitch"] > 0.01
+    assert len(result.starts) == 8
+    assert "times its declared noise" in " ".join(result.verdict)
+    assert not result.suspects

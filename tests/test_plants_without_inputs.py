@@ -228,9 +228,8 @@ def test_few_values_are_said_to_widen_the_intervals():
     whole = measured(Product, 1e-3)
     few = Record(whole.time[::3], whole.inputs[::3], whole.outputs[::3], source="few.csv")
     result = ex.identify(few, Product, start=TRUTH, initial_state="known")
-    assert f"(2 degrees of freedom): the intervals are {student_95(2):.3g} standard" in " ".join(
-        result.verdict
-    )
+    told = f"(2 degrees of freedom): Student's t, {student_95(2):.3g} in place of 1.96"
+    assert told in " ".join(result.verdict)
     assert not any(
         "degrees" in s for s in ex.identify(whole, Product, initial_state="known").verdict
     )

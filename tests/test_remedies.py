@@ -1,6 +1,7 @@
 """What a plant leaves out is found and named."""
 
 import re
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +17,7 @@ from excite.estimation.diagnosis import innovations
 from excite.estimation.excerpt import Span, excerpt_of, spans_of
 from excite.estimation.remedies import outliers
 from excite.excitation.catalogue import EXCITATIONS, LOOP
-from excite.plant.catalogue import PLANTS, plant_from
+from excite.plant.catalogue import PLANTS, plant_from, word_in_command
 from excite.plant.extension import extensions_of
 from excite.record import Record
 from excite.simulation import response
@@ -292,3 +293,17 @@ def test_a_record_of_the_very_plant_is_no_alarm(plant):
             result = ex.identify(record, plant, initial_state=("known", "free")[seed % 2])
             alarms += any("follows the input" in sentence for sentence in result.verdict)
     assert alarms < 4
+
+
+def test_a_likely_cause_names_the_file_of_the_plant_as_a_shell_reads_it(tmp_path, monkeypatch):
+    folder = tmp_path / "my plants"
+    folder.mkdir()
+    source = Path(__file__).parent.parent / "examples" / "flexible_drive.py"
+    (folder / "drive.py").write_text(source.read_text())
+    drive = plant_from(f"{folder}/drive.py:FlexibleDrive+offset_torque")
+    assert word_in_command(drive) == f"'{folder}/drive.py:FlexibleDrive+offset_torque'"
+    monkeypatch.chdir(tmp_path)
+    assert word_in_command(drive) == "'my plants/drive.py:FlexibleDrive+offset_torque'"
+    monkeypatch.chdir(folder)
+    assert word_in_command(drive) == "drive.py:FlexibleDrive+offset_torque"
+    assert word_in_command(plant_from("aero2+delay")) == "aero2+delay_voltage"

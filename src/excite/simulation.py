@@ -186,18 +186,19 @@ def response(
     steps = acting(plant, params, inputs, dt, next_inputs)
 
     def advance(state: Array, now: tuple) -> tuple[Array, Array]:
-        (input, dt, next_input), at_once = now
+        (input, dt, next_input), following = now
         state = step(plant, state, input, params, dt, next_input)
-        return state, plant.output(state, *at_once, params)
+        return state, plant.output(state, *following, params)
 
     if isinstance(plant, AbstractStaticTask):  # all designs at once: none waits for another
         outputs = jax.vmap(lambda design: plant.output(plant.after(design), params))(inputs)
         return jnp.concatenate([plant.output(start, params)[None], outputs])
-    first, _, ends = steps
-    last = first[-1:] if ends is None else ends[-1:]
-    at_once = plant.at_once(jnp.concatenate([first[1:], last]))
-    _, outputs = jax.lax.scan(advance, start, (steps, at_once))
-    return jnp.concatenate([plant.output(start, *plant.at_once(first[0]), params)[None], outputs])
+    begin, following = (), ()
+    if plant.has_feedthrough:
+        last = inputs[-1:] if next_inputs is None else next_inputs[-1:]
+        begin, following = (inputs[0],), (jnp.concatenate([inputs[1:], last]),)
+    _, outputs = jax.lax.scan(advance, start, (steps, following))
+    return jnp.concatenate([plant.output(start, *begin, params)[None], outputs])
 
 
 @eqx.filter_jit
@@ -336,26 +337,26 @@ def run_episode(
     """
     noise = sensor_noise(plant, num_steps, key) if noise is None else noise
     lower, upper = plant.input_limits
-    if plant.has_feedthrough and excitation.measures:
+    if plant.has_feedthrough and excitation.uses_measurements:
         raise ValueError(
-            f"an input of plant {plant.definition.name!r} acts on an output directly (an algebraic "
-            "loop): the excitation must be a signal, which needs no measurement"
+            f"an input of plant {plant.definition.name!r} acts on an output directly; with an "
+            "excitation that measures, this is an algebraic loop: use a signal, such as chirp"
         )
 
     delay = plant.delay(params)
 
-    def delayed_input(past: Array, input: Array, k: Array) -> tuple[Array, Array, Array | None]:
-        """The input at the beginning and the end of step k, None where it is held."""
+    def moved(state: Array, past: Array, input: Array, k: Array) -> tuple[Array, Array]:
         if delay is None:
-            return past, input, None
+            return step(plant, state, input, params), past
         past = past.at[k].set(input)
-        return past, *_delayed_step(past, delay / plant.dt, k)
+        first, last = _delayed_step(past, delay / plant.dt, k)
+        return step(plant, state, first, params, next_input=last), past
 
     disturbance_key = jax.random.fold_in(key, 0)
 
-    def sampled(state: Array, at_once: tuple[Array, ...], noise: Array) -> tuple[Array, Array]:
-        """The measurement and the true outputs."""
-        output, shown = plant.true_and_shown(state, *at_once, params)
+    def sampled(state: Array, input: Array, noise: Array) -> tuple[Array, Array]:
+        """The measurement and the true outputs; the input counts where there is feedthrough."""
+        output, shown = plant.true_and_shown(state, *plant.feedthrough_input(input), params)
         return measure(plant, state, params, shown, noise), output
 
     def excited(memory: PyTree, measured: Array) -> tuple[PyTree, Array]:
@@ -363,26 +364,22 @@ def run_episode(
         return memory, jnp.clip(input, lower, upper)
 
     def advance(carry: tuple, now: tuple) -> tuple[tuple, tuple]:
-        (state, past, memory, _), (noise, k) = carry, now
+        (state, past, memory), (noise, k) = carry, now
         if plant.has_feedthrough:  # the input is there before the measurement
             memory, input = excited(memory, jnp.zeros_like(noise))
-            past, first, last = delayed_input(past, input, k)
-            measured, output = sampled(state, plant.at_once(first), noise)
+            measured, output = sampled(state, input, noise)
         else:
-            measured, output = sampled(state, (), noise)
+            measured, output = sampled(state, jnp.zeros_like(lower), noise)
             memory, input = excited(memory, measured)
-            past, first, last = delayed_input(past, input, k)
-        state = step(plant, state, first, params, next_input=last)
+        state, past = moved(state, past, input, k)
         state = disturbed(plant, state, jax.random.fold_in(disturbance_key, k))
-        end = plant.at_once(first if last is None else last)
-        return (state, past, memory, end), (input, measured, output)
+        return (state, past, memory), (input, measured, output)
 
     past = jnp.zeros((0 if delay is None else num_steps, len(lower)))
-    memory = excitation.init(plant, num_steps, jax.random.split(key)[0])
-    start = plant.initial_state, past, memory, plant.at_once(jnp.zeros(len(lower)))
+    start = plant.initial_state, past, excitation.init(plant, num_steps, jax.random.split(key)[0])
     steps = noise[:-1], jnp.arange(num_steps)
-    (state, *_, end), (inputs, measured, outputs) = jax.lax.scan(advance, start, steps)
-    final, last = sampled(state, end, noise[-1])
+    (state, *_), (inputs, measured, outputs) = jax.lax.scan(advance, start, steps)
+    final, last = sampled(state, inputs[-1], noise[-1])
     return Trajectory(
         time=jnp.arange(num_steps + 1) * plant.dt,
         inputs=inputs,

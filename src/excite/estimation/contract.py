@@ -54,8 +54,9 @@ class Experiments(eqx.Module):
     """One or several experiments of one plant, padded to one length.
 
     Attributes:
-        inputs: row k acts from sample k to k + 1.
-        measured: measured outputs.
+        inputs: row k acts from sample k to k + 1, and with feedthrough on sample k.
+        measured: measured outputs, one row more than inputs. With feedthrough the last one is
+            padded, because the last measured sample needs an input.
         valid: False where an output was not measured or an experiment was padded.
         initial_state: known, or the start of its search.
         initial_state_known: False where it is estimated too.
@@ -84,8 +85,8 @@ def stack_experiments(
 ) -> Experiments:
     """Experiments of any lengths side by side; each has one more output than inputs.
 
-    A plant with feedthrough needs the input of the last sample, too: it is repeated where it is
-    not given. So these experiments end with a step after which nothing is measured.
+    With feedthrough, the last row of inputs is that of the last sample; where inputs have one row
+    less than the outputs, it is repeated.
 
     Args:
         dt: see `Experiments`.

@@ -78,8 +78,8 @@ def excerpt_of(
     given = jax.device_put((estimate.params, e, estimate.initial_state))
     states = np.asarray(_states(plant, *given))
     initial = np.stack([states[s.experiment, s.first] for s in spans])
-    # The last sample of a part has no input: with feedthrough it is left out.
-    counts = np.array([[s.stop - s.first - plant.has_feedthrough] for s in spans])
+    # The input of a part's last sample is cut off: with feedthrough that sample is left out.
+    counts = np.array([[s.stop - s.first - int(plant.has_feedthrough)] for s in spans])
     is_part = np.arange(length)[None] < counts
     between = (None if rows is None else cut(rows, length - 1) for rows in (e.dt, e.next_inputs))
     dt, next_inputs = jax.device_put(tuple(between))

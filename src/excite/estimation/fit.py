@@ -34,7 +34,10 @@ PRIOR_TOO = " or is the prior far from the truth (--prior)?"
 _STARTS, _SIZE_OF_MANY_STARTS = 8, 50_000  # measured values up to which so many are tried
 _TELLING = 50  # measured values from which the residual tells whether the search missed something
 _MORE_THAN_CHANCE = 10.0  # of a chi-squared variable of one degree of freedom
-_STILL, _OFTEN = 1e-9, 0.1  # of an output's scale; of its samples
+_STILL, _OFTEN = 1e-5, 0.1  # of an output's range: gaps are closed so far; of its samples
+_SAME = 0.01  # difference of sums of squares at one minimum, over the noise
+_FAR_ABOVE = 10.0  # times the declared noise
+_FAR = 5.0  # standard errors between two ends of the search that are not one minimum
 _FAR_OFF = 100.0  # times a positive parameter's start, or scales from it: the search ran away
 _FREE = 100.0  # scales of a parameter of free sign that are small for its standard error
 
@@ -170,9 +173,9 @@ def _estimate(
 ) -> list[Estimate]:
     """Estimates, the best first; the search is repeated where it may have missed the best one.
 
-    Where more than noise is left, or a short record cannot tell, it begins at other starts as
-    well, default random ones; where it does not converge, it has longer segments. Where a
-    saturated output tells nothing of the states, segments may lead astray: then it has one.
+    Where more than noise is left, or a short record cannot tell, it is repeated as one simulation,
+    because segments in which little is measured lead astray, and from other starts, default random
+    ones; where it does not converge, it has longer segments.
     """
 
     def search(estimator: AbstractEstimator, start: Params) -> Estimate:
@@ -187,11 +190,15 @@ def _estimate(
     if not isinstance(estimator, NLS):
         return found
     size, num_samples = experiments.valid.size, experiments.valid.shape[1]
-    if size <= _SIZE_OF_MANY_STARTS and _is_saturated(plant, experiments, found[0]):
-        found.append(search(dataclasses.replace(estimator, segment_length=num_samples), start))
-        found.sort(key=quality)
-    is_in_doubt = size < _TELLING or not is_noise(plant, experiments, found[0])
-    if size <= _SIZE_OF_MANY_STARTS and is_in_doubt:
+    length, is_short = estimator.length_of_segments(plant, num_samples), size < _TELLING
+    few = size <= _SIZE_OF_MANY_STARTS
+    is_in_doubt = is_short or not is_noise(plant, experiments, found[0])
+    if few and length < num_samples and (is_in_doubt or _is_saturated(experiments, found[0])):
+        whole = search(dataclasses.replace(estimator, segment_length=num_samples), start)
+        if is_elsewhere(whole, found[0]):
+            found = sorted([whole, *found], key=quality)
+            is_in_doubt = is_short or not is_noise(plant, experiments, found[0])
+    if few and is_in_doubt:
         others = _starts_around(plant, start, free) if others is None else others
         for i, other in enumerate(others):
             best = min(found, key=quality)
@@ -203,7 +210,6 @@ def _estimate(
             )
             found.append(search(estimator, other))
         found.sort(key=quality)
-    length = estimator.length_of_segments(plant, num_samples)
     while int(found[0].status) == Status.ITERATIONS_EXHAUSTED and length < num_samples:
         length *= 4
         longer = search(dataclasses.replace(estimator, segment_length=length), start)
@@ -221,8 +227,11 @@ def _starts_around(plant: AbstractPlant, start: Params, free: np.ndarray) -> lis
 
 
 def is_noise(plant: AbstractPlant, experiments: Experiments, estimate: Estimate) -> bool:
-    """Whether a search ended where only white noise is left; then it missed no better minimum."""
-    if int(estimate.status) != Status.SUCCESSFUL:
+    """Whether a search ended where only white noise is left; then it missed no better minimum.
+
+    What is far larger than the declared noise is something else.
+    """
+    if int(estimate.status) != Status.SUCCESSFUL or far_above_declared(plant, estimate):
         return False
     residual, valid = np.asarray(estimate.residual), np.asarray(experiments.valid)
     return all(
@@ -232,26 +241,49 @@ def is_noise(plant: AbstractPlant, experiments: Experiments, estimate: Estimate)
     )
 
 
-def _is_saturated(plant: AbstractPlant, experiments: Experiments, estimate: Estimate) -> bool:
-    """Whether a simulated output often stays exactly where it is, as at the end of its range.
+def _is_saturated(experiments: Experiments, estimate: Estimate) -> bool:
+    """Whether a simulated output is often exactly the largest or the smallest of its experiment.
 
-    What is exact has not been led astray.
+    Not counted is a rest before the first change, which tells nothing of the parameters either.
     """
-    if is_exact(plant, estimate) or not np.isfinite(estimate.residual).all():
+    if not np.isfinite(estimate.residual).all():
         return False
-    is_seen = np.asarray(experiments.valid)
     simulated = np.asarray(experiments.measured) - np.asarray(estimate.residual)
-    scales = np.array([o.scale for o in plant.definition.outputs])
-    stays = np.abs(np.diff(simulated, axis=1)) < _STILL * scales
-    is_pair = is_seen[:, 1:] & is_seen[:, :-1]
-    often = (stays & is_pair).sum((0, 1)) > _OFTEN * is_pair.sum((0, 1))
-    return bool(np.any(often))
+    for own, valid in zip(simulated, np.asarray(experiments.valid), strict=True):
+        for y in (column[seen] for column, seen in zip(own.T, valid.T, strict=True)):
+            if not y.size:
+                continue
+            near = _STILL * np.ptp(y)
+            changed = np.abs(y - y[:1]) > near
+            after = y[np.argmax(changed) :] if changed.any() else y[:0]
+            for end in (np.max(y), np.min(y)):
+                if np.sum(np.abs(after - end) <= near) > _OFTEN * len(y):
+                    return True
+    return False
+
+
+def is_elsewhere(estimate: Estimate, other: Estimate) -> bool:
+    """Whether two ends of the search are not one minimum: by the cost, or by far by parameters."""
+    costs, size = (float(estimate.cost), float(other.cost)), estimate.residual.size
+    if not abs(costs[0] - costs[1]) <= _SAME / size * min(costs):
+        return True
+    std_error = np.sqrt(np.diagonal(np.asarray(other.covariance)))
+    away = np.abs(np.stack(estimate.params) - np.stack(other.params))
+    return bool(np.any(away > _FAR * std_error))
 
 
 def is_exact(plant: AbstractPlant, estimate: Estimate) -> bool:
     """Whether the residual is nothing but rounding."""
     scales = [o.scale for o in plant.definition.outputs]
     return not any(map(is_more_than_rounding, np.asarray(estimate.residual).T, scales))
+
+
+def far_above_declared(plant: AbstractPlant, estimate: Estimate) -> list[tuple[int, float]]:
+    """Outputs with a residual far larger than their declared noise, and its standard deviation."""
+    residual, declared = np.asarray(estimate.residual), np.asarray(plant.sensor.sd)
+    size = np.sqrt(np.sum(residual**2, axis=(0, 1)) / np.sum(residual != 0, axis=(0, 1)).clip(1))
+    pairs = enumerate(zip(size, declared, strict=True))
+    return [(i, float(own)) for i, (own, sd) in pairs if sd > 0 and own > _FAR_ABOVE * sd]
 
 
 def is_centred(experiments: Experiments, estimate: Estimate) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -28,7 +27,7 @@ from ..description import (
 from ..files import json_ready
 from ..information.identifiability import UNSEEN_SD, identifiability
 from ..plant import AbstractPlant, Params, params_from
-from ..plant.catalogue import PLANTS, PlantLike, plant_from, word_of
+from ..plant.catalogue import PLANTS, PlantLike, plant_from, word_in_command
 from ..plant.extension import plain_kind
 from ..plant.static import require_sensor_noise
 from ..progress import SHOWN, Progress
@@ -70,8 +69,10 @@ from .fit import (
     PRIOR_TOO,
     Fit,
     NothingLeftError,
+    far_above_declared,
     fit_of,
     is_centred,
+    is_elsewhere,
     is_exact,
     is_noise,
     known_parameters,
@@ -106,10 +107,8 @@ from .validation import fitted_all, predicted_in_steps, state_from, validated, w
 InitialState = Literal["auto", "free", "known"]
 Intervals = Literal["linear", "profile"]
 _SIZE_OF_SUSPECTS = 10_000  # measured values in which suspects are looked for
-_FAR = 5.0  # standard errors between two ends of the search that are not one
-_SAME = 0.01  # difference of sums of squares at one minimum, over the noise
 _FEW_DEGREES = 5.0  # of Student's t, below which it widens an interval by a third and more
-_FAR_ABOVE = 10.0  # times the declared noise; a larger residual is remarked
+_POOR = -1.0  # percent of fit, below which a simulation is worse than a constant
 _FAR_FACTOR = 10.0  # between an estimate and what was expected of it; a larger one is remarked
 _BY_CHANCE = 1e-3  # a fit with a larger p-value explains nothing
 
@@ -254,7 +253,7 @@ def identify(
     try:
         fit = fit_of(seen, experiments, estimator, begin, progress)
     except NothingLeftError as refusal:
-        raise _with_causes(str(refusal) + too, find(refusal.fit, False)[0]) from None
+        raise _with_causes(str(refusal) + too, find(refusal.fit, False, False)[0]) from None
     params, prediction = fit.estimate.params, fit.estimate.prediction
     if by_steps:
         error, prediction = predicted_in_steps(seen, whole, experiments, params)
@@ -268,9 +267,6 @@ def identify(
     # What the data do not tell of parameters that all have a prior, the prior does.
     is_judged = is_normal and not fit.has_ended_in(Status.NOT_FINITE) and not free <= known_before
     is_fit = not is_judged or _explains(records, residual, int(fit.free.sum()) - num_priors)
-    found, where = find(fit, is_fit and fit.is_successful)
-    if not is_fit:
-        raise _with_causes(nothing_seen(plant) + too, found)
     whiteness = {
         name: whiteness_of([finite(r[:, i]) for r in residual], plant.definition.outputs[i].scale)
         for i, name in enumerate(names_of(plant.definition.outputs))
@@ -280,6 +276,9 @@ def identify(
         for i, name in enumerate(whiteness)
     }
     wrong = [n for n, p in structure.items() if p < RARE / len(structure)] * fit.is_successful
+    found, where = find(fit, is_fit and fit.is_successful, bool(wrong))
+    if not is_fit:
+        raise _with_causes(nothing_seen(plant) + too, found)
     covariance, degrees, factor, verdict = _confidence(
         seen, experiments, estimator, fit, whiteness, uncertain_sd, bool(wrong), by_steps
     )
@@ -289,8 +288,7 @@ def identify(
     )
     wrong = _wrong_structure(wrong, factor, estimator)
     large = _above_declared(seen, fit) if fit.is_successful else ()
-    is_predicted = fit.is_successful and prediction is not None
-    astray = _simulates_poorly(fitted) if is_predicted else ()
+    astray = _simulates_poorly(fitted, prediction is not None) if fit.is_successful else ()
     remedies = *_remedies(found), *where
     verdict = (*others, *wrong, *large, *astray, *remedies, *_agreement(fit), *verdict)
     if fit.has_ended_in(Status.NOT_FINITE) and not by_steps:
@@ -588,7 +586,7 @@ def _confidence(
         values = dict(zip(names, map(float, fit.estimate.params), strict=True))
         sd = dict(zip(names, np.sqrt(np.diag(np.asarray(fit.estimate.covariance))), strict=True))
         remarks += estimator.prior.verdict(values, {n: sd[n] for n in names if sd[n] > 0})
-    remarks += [*_recorded_late(plant, fit.estimate, covariance), *_few_degrees(degrees[fit.free])]
+    remarks += [*_recorded_late(plant, fit.estimate, covariance), *_few_degrees(fit)]
     held = told_of_held(
         plant, experiments, estimator, fit.estimate, fit.free, fit.known, tuple(fit.reasons)
     )
@@ -599,7 +597,7 @@ def _confidence(
 def _recorded_late(
     plant: AbstractPlant, estimate: Estimate, covariance: np.ndarray
 ) -> tuple[str, ...]:
-    """A sentence on each input whose delay is below zero by more than chance."""
+    """A sentence on each input whose estimated delay is below zero by more than chance."""
     found = jnp.stack([*estimate.params])
 
     def delays(values: jax.Array) -> jax.Array | None:
@@ -608,24 +606,27 @@ def _recorded_late(
     if (delay := delays(found)) is None:
         return ()
     slope = np.asarray(jax.jacfwd(delays)(found))
-    highest = np.asarray(delay) + HALF_95 * np.sqrt(np.diagonal(slope @ covariance @ slope.T))
+    std_error = np.sqrt(np.diagonal(slope @ covariance @ slope.T))
+    names = names_of(plant.definition.inputs)
     return tuple(
-        f"the delay of {name} is negative ({float(value):.4g} s): {name} is recorded later than it "
-        "acts, or it is linear between samples (--hold-input), or the plant answers faster than "
-        "its equations"
-        for name, value, high in zip(names_of(plant.definition.inputs), delay, highest, strict=True)
-        if high < 0
+        f"the delay of {name} is negative ({value:.4g} s): {name} is recorded later than it acts, "
+        "or is not as assumed between samples (--hold-input), or the plant answers faster than its "
+        "equations"
+        for name, value, sd in zip(names, map(float, delay), std_error, strict=True)
+        if sd > 0 and value < -HALF_95 * sd
     )
 
 
-def _few_degrees(degrees: np.ndarray) -> tuple[str, ...]:
+def _few_degrees(fit: Fit) -> tuple[str, ...]:
     """A sentence where few values make the intervals wide."""
-    least = float(np.min(degrees, initial=np.inf))
+    if fit.estimate.degrees is None:
+        return ()
+    least = float(np.min(np.asarray(fit.estimate.degrees)[fit.free], initial=np.inf))
     if not least < _FEW_DEGREES:
         return ()
     return (
-        f"few values are left to tell the noise ({least:.3g} degrees of freedom): the intervals "
-        f"are {student_95(least):.3g} standard errors to either side",
+        f"few values are left to tell the noise ({least:.3g} degrees of freedom): Student's t, "
+        f"{student_95(least):.3g} in place of 1.96, makes the intervals wide",
     )
 
 
@@ -703,25 +704,27 @@ def _wrong_structure(
 
 def _above_declared(plant: AbstractPlant, fit: Fit) -> tuple[str, ...]:
     """A sentence on each output whose residual is far larger than its declared noise."""
-    residual, declared = np.asarray(fit.estimate.residual), np.asarray(plant.sensor.sd)
-    size = np.sqrt(np.sum(residual**2, axis=(0, 1)) / np.sum(residual != 0, axis=(0, 1)).clip(1))
+    found = far_above_declared(plant, fit.estimate)
+    parts = [(plant.definition.outputs[i], own, float(plant.sensor.sd[i])) for i, own in found]
     return tuple(
         f"the residual of {part.name} is {own / sd:.3g} times its declared noise ({own:.3g} for "
         f"{sd:.3g} {part.unit}): the plant leaves something out, or the declaration is wrong"
-        for part, own, sd in zip(plant.definition.outputs, size, declared, strict=True)
-        if sd > 0 and own > _FAR_ABOVE * sd
+        for part, own, sd in parts
     )
 
 
-def _simulates_poorly(fitted: Sequence[Fitted]) -> tuple[str, ...]:
-    """A sentence where predictions are good only because samples correct them."""
-    poor = {name for record in fitted for name, fit in record.fit_percent.items() if fit < 0}
+def _simulates_poorly(fitted: Sequence[Fitted], is_predicted: bool) -> tuple[str, ...]:
+    """A sentence where a simulation is no better than a constant."""
+    poor = {n for own in fitted for n, fit in own.fit_percent.items() if fit < _POOR}
     if not poor:
         return ()
-    return (
-        f"the simulation of {listed(sorted(poor))} is worse than a constant: process noise "
-        "explains what the equations should; use these parameters to predict, not to simulate",
+    because = (
+        "process noise explains what the equations should; use these parameters to predict, not to "
+        "simulate"
+        if is_predicted
+        else "the plant leaves something out, or the search ended far from the truth (--start)"
     )
+    return (f"the simulation of {listed(sorted(poor))} is worse than a constant: {because}",)
 
 
 def _far_from_expected(
@@ -765,6 +768,7 @@ def _suspects(
     progress: Progress,
     fit: Fit,
     is_best: bool,
+    follows_input: bool,
 ) -> tuple[tuple[Suspect, ...], tuple[str, ...]]:
     """What the plant may leave out, where more than noise is left, and in which rows."""
     if not isinstance(estimator, NLS) or fit.has_ended_in(Status.NOT_FINITE):
@@ -777,7 +781,7 @@ def _suspects(
     if is_exact(plant, fit.estimate):
         return (), ()  # nothing is left to explain
     is_white = is_noise(plant, experiments, fit.estimate) and is_centred(experiments, fit.estimate)
-    if is_white and outliers(residual, valid) is None:
+    if is_white and not follows_input and outliers(residual, valid) is None:
         return (), ()
 
     question = Question(
@@ -792,7 +796,7 @@ def _suspects(
         fit.estimate,
         is_best,
         ~fit.known,
-        _word(plant),
+        word_in_command(plant),
     )
 
     def told(text: str, done: float, total: float) -> None:
@@ -808,17 +812,6 @@ def _suspects(
     return found, (f"likely causes were looked for in {where}",)
 
 
-def _word(plant: AbstractPlant) -> str:
-    """The name of a plant in a command."""
-    try:
-        path, colon, name = word_of(plant).rpartition(":")
-    except ValueError:  # of a notebook
-        _, plus, extensions = plant.definition.name.partition("+")
-        return f"FILE.py:{plain_kind(plant).__name__}{plus}{extensions}"
-    near = os.path.relpath(path) if path else ""
-    return f"{path if near.startswith('..') else near}{colon}{name}"
-
-
 def _remedies(found: Sequence[Suspect]) -> tuple[str, ...]:
     """Sentences on the suspects, the likeliest first."""
     if not found:
@@ -832,21 +825,18 @@ def _agreement(fit: Fit) -> tuple[str, ...]:
     """How many of several starts ended at the estimate, and one elsewhere that fits as well."""
     if not fit.is_successful or not fit.others:
         return ()
-    ends, cost = [fit.estimate, *fit.others], float(fit.estimate.cost)
-    noise = cost / max(np.count_nonzero(fit.estimate.residual), 1)
-    most = (1 + _SAME / fit.estimate.residual.size) * cost
-    same = sum(float(end.cost) <= most for end in ends)
-    told = f"{same} of {len(ends)} starts of the search ended at this estimate"
-    std_error = np.sqrt(np.diagonal(fit.estimate.covariance))
-    for end in fit.others:
-        is_as_good = float(end.cost) - cost <= HALF_95**2 * noise
-        away = np.abs(np.stack(end.params) - np.stack(fit.estimate.params))
-        if int(end.status) == Status.SUCCESSFUL and is_as_good and np.any(away > _FAR * std_error):
+    best, count = fit.estimate, 1 + len(fit.others)
+    noise = float(best.cost) / max(np.count_nonzero(best.residual), 1)
+    others = [end for end in fit.others if is_elsewhere(end, best)]
+    told = f"{count - len(others)} of {count} starts of the search ended at this estimate"
+    for end in others:
+        is_as_good = float(end.cost) - float(best.cost) <= HALF_95**2 * noise
+        if int(end.status) == Status.SUCCESSFUL and is_as_good:
             found = zip(end.params._fields, end.params, fit.free, strict=True)
             values = ", ".join(f"{name}={float(value):.4g}" for name, value, own in found if own)
             return (
-                f"{told}, and one at {values}, where the fit is as good but for chance: the "
-                "intervals leave that out",
+                f"{told}; another ended at {values}, which fits as well but for chance and lies "
+                "outside the intervals",
             )
     return (told,)
 

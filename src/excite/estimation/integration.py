@@ -94,7 +94,7 @@ def _changed(
     sd = NLS().weights(plant, experiments, estimate)[None, None]
     noise = jnp.sqrt(jnp.sum((estimate.residual / sd) ** 2) / jnp.sum(e.valid))
     valid = e.valid[:, :n]
-    if plant.has_feedthrough:  # the last sample has no input any more
+    if plant.has_feedthrough:  # the input of the last sample is cut off
         valid = valid.at[:, -1].set(False)
     part = dataclasses.replace(
         e,
@@ -104,7 +104,8 @@ def _changed(
         dt=None if e.dt is None else e.dt[:, : n - 1],
         next_inputs=None if e.next_inputs is None else e.next_inputs[:, : n - 1],
     )
-    own = eqx.tree_at(lambda x: x.residual, estimate, estimate.residual[:, :n])
+    residual = jnp.where(valid, estimate.residual[:, :n], 0.0)
+    own = eqx.tree_at(lambda x: x.residual, estimate, residual)
     finer = plant.integrated_in(2 * plant.substeps)
     simulated = simulate_experiments(finer, estimate.params, part, estimate.initial_state)
     return part, own, (residual_of(part, simulated) - own.residual) / sd, noise

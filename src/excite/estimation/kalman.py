@@ -69,8 +69,7 @@ def innovations(
 
     def advance(belief: tuple[Array, Array], now: tuple) -> tuple[tuple[Array, Array], Innovations]:
         inputs, measured, valid = now
-        at_once = plant.at_once(inputs[0])
-        belief, found = _corrected(plant, params, noise_sd, *belief, at_once, measured, valid)
+        belief, found = _corrected(plant, params, noise_sd, *belief, inputs[0], measured, valid)
         return _predicted(plant, params, process_noise, *belief, *inputs), found
 
     now = acting(plant, params, *steps)
@@ -85,7 +84,7 @@ def _corrected(
     noise_sd: Float[Array, " output"],
     state: Float[Array, " state"],
     covariance: Float[Array, "state state"],
-    at_once: tuple[Float[Array, " input"], ...],
+    input: Float[Array, " input"],
     measured: Float[Array, " output"],
     valid: Bool[Array, " output"],
 ) -> tuple[tuple[Array, Array], Innovations]:
@@ -94,7 +93,7 @@ def _corrected(
     width = jnp.sqrt(jnp.diagonal(covariance) + (_NARROW * scales) ** 2)
 
     def output(state: Array) -> Array:
-        return plant.output(state, *at_once, params)
+        return plant.output(state, *plant.feedthrough_input(input), params)
 
     aside = jnp.diag(width)
     above, below = jax.vmap(output)(state[None] + aside), jax.vmap(output)(state[None] - aside)

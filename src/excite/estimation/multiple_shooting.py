@@ -296,7 +296,7 @@ class MultipleShooting(eqx.Module):
             ends = now.inputs, now.next_inputs
             if now.change is not None and later is not None:
                 ends = jax.tree.map(lambda u, slope: u + later * slope, ends, now.change)
-            outputs = plant.output(x, *plant.at_once(ends[0]), params)
+            outputs = plant.output(x, *plant.feedthrough_input(ends[0]), params)
             return step(plant, x, ends[0], params, now.dt, ends[1]), outputs
 
         return jax.lax.scan(advance, start * self.scales, steps)

@@ -201,8 +201,8 @@ def _outputs_give_state(plant: AbstractPlant) -> bool:
 @eqx.filter_jit
 def _slope(plant: AbstractPlant) -> Float[Array, "output state"]:
     """Derivative of the outputs with respect to the states, at the initial state."""
-    at_once = plant.at_once(jnp.zeros(len(plant.definition.inputs)))
-    return jax.jacfwd(plant.output)(plant.initial_state, *at_once, plant.nominal)
+    rest = plant.feedthrough_input(jnp.zeros(len(plant.definition.inputs)))
+    return jax.jacfwd(plant.output)(plant.initial_state, *rest, plant.nominal)
 
 
 def validated(

@@ -29,7 +29,7 @@ class AbstractExcitation(eqx.Module):
     """Base of all excitations."""
 
     @property
-    def measures(self) -> bool:
+    def uses_measurements(self) -> bool:
         """Whether an input depends on the measurements before it."""
         return True
 
@@ -53,8 +53,8 @@ class AbstractSignal(AbstractExcitation):
     """An excitation that ignores the measurement: a sequence known beforehand."""
 
     @property
-    def measures(self) -> bool:
-        """No."""
+    def uses_measurements(self) -> bool:
+        """False: a signal is known beforehand."""
         return False
 
     @abc.abstractmethod

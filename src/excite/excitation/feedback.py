@@ -163,9 +163,9 @@ class Coast(AbstractExcitation):
     num_steps: int = eqx.field(static=True)
 
     @property
-    def measures(self) -> bool:
+    def uses_measurements(self) -> bool:
         """As the excitation."""
-        return self.excitation.measures
+        return self.excitation.uses_measurements
 
     @classmethod
     def after(

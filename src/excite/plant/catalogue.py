@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -36,7 +37,7 @@ from .contract import (
 )
 from .dc_motor import DCMotor
 from .emps import EMPS
-from .extension import extended, plain_kind
+from .extension import delayed_feedthrough, extended, plain_kind
 from .fields import floats
 from .static import AbstractStaticTask, has_own_noise, own_functions, require_sensor_noise
 
@@ -153,6 +154,18 @@ def word_of(plant: AbstractPlant) -> str:
         ) from None
 
 
+def word_in_command(plant: AbstractPlant) -> str:
+    """The name for a shell, as short as the working directory allows; FILE.py:... if in no file."""
+    try:
+        path, colon, name = word_of(plant).rpartition(":")
+    except ValueError:
+        _, plus, extensions = plant.definition.name.partition("+")
+        return f"FILE.py:{plain_kind(plant).__name__}{plus}{extensions}"
+    here = Path.cwd()
+    near = Path(path).relative_to(here) if path and Path(path).is_relative_to(here) else path
+    return shlex.quote(f"{near}{colon}{name}")
+
+
 PLANT_ENDING = ".json"
 
 
@@ -239,7 +252,7 @@ def _check_plant(plant: AbstractPlant, where: str) -> None:
     state, inputs = plant.initial_state, jnp.zeros(len(d.inputs))
     functions: list[tuple[str, tuple[Any, ...], int]] = [
         ("derivative", (state, inputs, plant.nominal), len(d.states)),
-        ("output", (state, *plant.at_once(inputs), plant.nominal), len(d.outputs)),
+        ("output", (state, *plant.feedthrough_input(inputs), plant.nominal), len(d.outputs)),
         ("delay", (plant.nominal,), len(d.inputs)),
     ]
     if isinstance(plant, AbstractStaticTask):  # its other functions follow from this one
@@ -260,6 +273,8 @@ def _check_plant(plant: AbstractPlant, where: str) -> None:
             raise ValueError(f"{what} returns shape {found.shape}; {needed}")
         if jnp.issubdtype(found.dtype, jnp.complexfloating):
             raise ValueError(f"{what} returns complex numbers; real ones are needed")
+    if plant.has_feedthrough and plant.delay(plant.nominal) is not None:
+        raise ValueError(delayed_feedthrough(d.name))
     if isinstance(plant, AbstractARXPlant) and plant.has_feedthrough:
         raise ValueError(
             f"{where} is an ARX plant, whose output does not depend on the input directly: make it "
@@ -347,7 +362,7 @@ def _missing_name(plant: AbstractPlant, error: BaseException, what: str) -> Valu
 def require_inputs(plant: AbstractPlant) -> None:
     """Raises ValueError for a plant without inputs, with inputs that act late, or feedthrough.
 
-    Designs, policies, studies and rigs measure, and then choose the input that acts next.
+    Policies and rigs measure, and then choose the input that acts next.
     """
     if not plant.definition.inputs:
         raise ValueError(
@@ -362,8 +377,7 @@ def require_inputs(plant: AbstractPlant) -> None:
     if plant.has_feedthrough:
         raise ValueError(
             f"an input of plant {plant.definition.name!r} acts on an output directly: it can be "
-            "simulated and identified, but not be used for designs, policies, studies and rigs, "
-            "which measure before they choose the input"
+            "simulated and identified, but not be used by design, train, studies and rigs"
         )
 
 

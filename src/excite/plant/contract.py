@@ -70,7 +70,8 @@ def _tuple_type(title: str, names: tuple[str, ...]) -> type:
 
 @cache
 def _takes_input(kind: type[AbstractPlant]) -> bool:
-    return len(inspect.signature(kind.output).parameters) == len(("self", "x", "u", "params"))
+    needed = [p for p in inspect.signature(kind.output).parameters.values() if p.default is p.empty]
+    return len(needed) == len(("self", "state", "input", "params"))
 
 
 class Sensor(eqx.Module):
@@ -215,7 +216,9 @@ class AbstractPlant(_Module):
         """Whether `output` depends on the input directly."""
         return _takes_input(type(self))
 
-    def at_once(self, input: Float[Array, "*row input"]) -> tuple[Float[Array, "*row input"], ...]:
+    def feedthrough_input(
+        self, input: Float[Array, " input"]
+    ) -> tuple[Float[Array, " input"], ...]:
         """What `output` takes between state and params: the input, if there is feedthrough."""
         return (input,) if self.has_feedthrough else ()
 

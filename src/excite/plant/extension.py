@@ -53,8 +53,9 @@ class _Extension:
         return f"{self.kind}_{self.channel}"
 
 
-def _extensions(d: PlantDescription) -> tuple[_Extension, ...]:
-    """All that a plant can have, in their order."""
+def _extensions(kind: type[AbstractPlant]) -> tuple[_Extension, ...]:
+    """All that a plant can have, in their order; with feedthrough, inputs cannot be delayed."""
+    d, has_feedthrough = kind.definition, kind().has_feedthrough
     velocities = [(i, s.name) for i, s in enumerate(d.states) if s.unit in _VELOCITIES]
     channels = (
         (_INPUT, list(enumerate(names_of(d.inputs)))),
@@ -62,17 +63,18 @@ def _extensions(d: PlantDescription) -> tuple[_Extension, ...]:
         (_OUTPUT, list(enumerate(names_of(d.outputs)))),
     )
     return tuple(
-        _Extension(kind, channel, index)
-        for kinds, of_kind in channels
-        for kind in kinds
+        _Extension(effect, channel, index)
+        for effects, of_kind in channels
+        for effect in effects
         for index, channel in of_kind
+        if not (has_feedthrough and effect == "delay")
     )
 
 
 def extensions_of(plant: AbstractPlant) -> tuple[str, ...]:
     """Names of the extensions that a plant can have, and does not have yet."""
     kind, own = plain_kind(plant), names_of(plant.definition.parameters)
-    return tuple(e.name for e in _extensions(kind.definition) if e.name not in own)
+    return tuple(e.name for e in _extensions(kind) if e.name not in own)
 
 
 def plain_kind(plant: AbstractPlant) -> type[AbstractPlant]:
@@ -92,10 +94,12 @@ def extended(plant: AbstractPlant, extensions: Sequence[str]) -> AbstractPlant:
     kind = plain_kind(plant)
     if extensions:
         require_sensor_noise(plant)
-    possible, chosen = _extensions(kind.definition), {*names_of(plant.definition.parameters)}
+    possible, chosen = _extensions(kind), {*names_of(plant.definition.parameters)}
     for word in extensions:
         found = [e.name for e in possible if word in (e.kind, e.name)]
         if len(found) != 1:
+            if plant.has_feedthrough and word.startswith("delay"):
+                raise ValueError(delayed_feedthrough(kind.definition.name))
             if option := _option_for(kind.definition, word):
                 raise ValueError(
                     f"{word!r} is no extension of plant {kind.definition.name!r}, but the option "
@@ -115,6 +119,14 @@ def extended(plant: AbstractPlant, extensions: Sequence[str]) -> AbstractPlant:
     own = {p.name: p.nominal for p in plant.definition.parameters}
     is_changed = any(made.definition.parameter(name).nominal != own[name] for name in own)
     return with_nominal(made, own) if is_changed else made
+
+
+def delayed_feedthrough(name: str) -> str:
+    """Why a plant with feedthrough has no delay."""
+    return (
+        f"an input of plant {name!r} acts on an output directly, and cannot be delayed, too: shift "
+        "the rows of the input in the file instead"
+    )
 
 
 def _option_for(d: PlantDescription, word: str) -> str | None:
@@ -199,7 +211,7 @@ class Extended(AbstractPlant):
     def _of_plain(self, *arguments: Any) -> tuple[Any, ...]:
         """Arguments of the plain plant's `output`."""
         state, *input, params = arguments
-        own = (self._acting(state, at_once, params)[0] for at_once in input)
+        own = (self._acting(state, given, params)[0] for given in input)
         return state[: len(self.plain.definition.states)], *own, self._own(params)
 
     def delay(self, params: Params) -> Float[Array, " input"] | None:

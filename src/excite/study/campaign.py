@@ -43,7 +43,7 @@ from ..estimation.result import Identification
 from ..excitation import PolicyExcitation, Replay
 from ..information import require_noise, running_information
 from ..plant import AbstractPlant, Params
-from ..plant.catalogue import PlantLike, plant_from
+from ..plant.catalogue import PlantLike, plant_from, require_inputs
 from ..policy import Policy, mismatch, read_policy
 from ..policy.file import shipped_policies
 from ..record import Record
@@ -224,6 +224,7 @@ class Campaign:
             TypeError: for an argument of another type.
         """
         self.declared = self.plant = plant_from(plant)
+        require_inputs(self.plant)
         require_noise(self.plant)
         description = self.plant.description
         self.targets = targets_from(self.plant, target)
