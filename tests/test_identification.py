@@ -1,6 +1,7 @@
 import contextlib
 import dataclasses
 import json
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from experiments import NUM_STEPS, autoregressive, record_of, recording, spread_
 import excite as ex
 from excite.description import Input, Output, Parameter, PlantDescription, State
 from excite.estimation import ARX, NLS
+from excite.estimation.fit import is_elsewhere
 from excite.estimation.identify import identify
 from excite.estimation.result import Identification
 from excite.excitation import PRBS, Chirp, Random, Replay
@@ -725,3 +727,16 @@ def test_white_noise_far_above_the_declared_one_is_in_doubt():
     assert len(result.starts) == 8
     assert "times its declared noise" in " ".join(result.verdict)
     assert not result.suspects
+
+
+def test_ends_without_variances_are_compared_silently():
+    """A page that identified a hopeless record ended with a warning of NumPy."""
+    record = ex.simulate("aero2", "prbs", steps=100)
+    basis = ex.identify(record, "aero2").basis
+    assert basis is not None
+    end = basis.estimate
+    lost = dataclasses.replace(end, covariance=-end.covariance)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert not is_elsewhere(end, end)
+        assert not is_elsewhere(end, lost)

@@ -267,9 +267,10 @@ def is_elsewhere(estimate: Estimate, other: Estimate) -> bool:
     costs, size = (float(estimate.cost), float(other.cost)), estimate.residual.size
     if not abs(costs[0] - costs[1]) <= _SAME / size * min(costs):
         return True
-    std_error = np.sqrt(np.diagonal(np.asarray(other.covariance)))
-    away = np.abs(np.stack(estimate.params) - np.stack(other.params))
-    return bool(np.any(away > _FAR * std_error))
+    with np.errstate(invalid="ignore"):  # a search that failed may have no variances
+        std_error = np.sqrt(np.diagonal(np.asarray(other.covariance)))
+        away = np.abs(np.stack(estimate.params) - np.stack(other.params))
+        return bool(np.any(away > _FAR * std_error))
 
 
 def is_exact(plant: AbstractPlant, estimate: Estimate) -> bool:
