@@ -734,7 +734,7 @@ def test_ends_without_variances_are_compared_silently():
     record = ex.simulate("aero2", "prbs", steps=100)
     basis = ex.identify(record, "aero2").basis
     assert basis is not None
-    end = basis.estimate
+    end = jax.device_put(basis.estimate)
     lost = dataclasses.replace(end, covariance=-end.covariance)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
