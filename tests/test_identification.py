@@ -19,8 +19,8 @@ from experiments import NUM_STEPS, autoregressive, record_of, recording, spread_
 import excite as ex
 from excite.description import Input, Output, Parameter, PlantDescription, State
 from excite.estimation import ARX, NLS
-from excite.estimation.fit import is_elsewhere
-from excite.estimation.identify import identify
+from excite.estimation.fit import Fit, is_elsewhere
+from excite.estimation.identify import agreement, identify
 from excite.estimation.result import Identification
 from excite.excitation import PRBS, Chirp, Random, Replay
 from excite.files import json_ready
@@ -740,3 +740,25 @@ def test_ends_without_variances_are_compared_silently():
         warnings.simplefilter("error")
         assert not is_elsewhere(end, end)
         assert not is_elsewhere(end, lost)
+
+
+def test_an_end_near_the_estimate_is_no_other_one():
+    """With a cost that is larger by a twentieth of the noise, it was said to be elsewhere."""
+    record = ex.simulate("aero2", "prbs", noise={"pitch": 0.004}, seed=2)
+    basis = ex.identify(record, "aero2").basis
+    assert basis is not None
+    best = basis.estimate
+    noise, error = best.cost / best.residual.size, np.sqrt(np.diag(best.covariance))
+    here = jax.device_put(best)
+
+    def ended(more: float, errors: float) -> str:
+        params = type(best.params)(*map(jnp.asarray, np.stack(best.params) + errors * error))
+        end = dataclasses.replace(here, params=params, cost=jnp.asarray(best.cost + more * noise))
+        free = np.ones(len(error), bool)
+        return agreement(Fit(best, free, ~free, {}, [end]))[0]
+
+    told = "1 of 2 starts of the search ended at this estimate"
+    assert ended(0.05, 0.2) == told
+    assert ended(0.05, 50.0).startswith(f"{told}; another ended at J_p=")
+    assert ended(50.0, 50.0) == told
+    assert ended(0.0, 0.0).startswith("2 of 2 starts")

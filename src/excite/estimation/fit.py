@@ -263,10 +263,14 @@ def _is_saturated(experiments: Experiments, estimate: Estimate) -> bool:
 
 
 def is_elsewhere(estimate: Estimate, other: Estimate) -> bool:
-    """Whether two ends of the search are not one minimum: by the cost, or by far by parameters."""
+    """Whether two ends of the search are not one minimum, by their costs or parameters."""
     costs, size = (float(estimate.cost), float(other.cost)), estimate.residual.size
-    if not abs(costs[0] - costs[1]) <= _SAME / size * min(costs):
-        return True
+    is_alike = abs(costs[0] - costs[1]) <= _SAME / size * min(costs)
+    return not is_alike or is_far(estimate, other)
+
+
+def is_far(estimate: Estimate, other: Estimate) -> bool:
+    """Whether a parameter of an end is many standard errors from that of another one."""
     with np.errstate(invalid="ignore"):  # a search that failed may have no variances
         std_error = np.sqrt(np.diagonal(np.asarray(other.covariance)))
         away = np.abs(np.stack(estimate.params) - np.stack(other.params))

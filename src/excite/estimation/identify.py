@@ -74,6 +74,7 @@ from .fit import (
     is_centred,
     is_elsewhere,
     is_exact,
+    is_far,
     is_noise,
     known_parameters,
     nothing_seen,
@@ -108,7 +109,7 @@ InitialState = Literal["auto", "free", "known"]
 Intervals = Literal["linear", "profile"]
 _SIZE_OF_SUSPECTS = 10_000  # measured values in which suspects are looked for
 _FEW_DEGREES = 5.0  # of Student's t, below which it widens an interval by a third and more
-_POOR = -1.0  # percent of fit, below which a simulation is worse than a constant
+_POOR = -1.0  # percent of fit, below which least squares are worse than a constant by no chance
 _FAR_FACTOR = 10.0  # between an estimate and what was expected of it; a larger one is remarked
 _BY_CHANCE = 1e-3  # a fit with a larger p-value explains nothing
 
@@ -290,7 +291,7 @@ def identify(
     large = _above_declared(seen, fit) if fit.is_successful else ()
     astray = _simulates_poorly(fitted, prediction is not None) if fit.is_successful else ()
     remedies = *_remedies(found), *where
-    verdict = (*others, *wrong, *large, *astray, *remedies, *_agreement(fit), *verdict)
+    verdict = (*others, *wrong, *large, *astray, *remedies, *agreement(fit), *verdict)
     if fit.has_ended_in(Status.NOT_FINITE) and not by_steps:
         verdict = (*verdict, *infinite_slope(plant, begin, whole))
     names = names_of(plant.definition.parameters)
@@ -715,7 +716,8 @@ def _above_declared(plant: AbstractPlant, fit: Fit) -> tuple[str, ...]:
 
 def _simulates_poorly(fitted: Sequence[Fitted], is_predicted: bool) -> tuple[str, ...]:
     """A sentence where a simulation is no better than a constant."""
-    poor = {n for own in fitted for n, fit in own.fit_percent.items() if fit < _POOR}
+    least = 0.0 if is_predicted else _POOR
+    poor = {n for own in fitted for n, fit in own.fit_percent.items() if fit < least}
     if not poor:
         return ()
     because = (
@@ -821,7 +823,7 @@ def _remedies(found: Sequence[Suspect]) -> tuple[str, ...]:
     return (f"likely cause: {found[0].sentence}", *less)
 
 
-def _agreement(fit: Fit) -> tuple[str, ...]:
+def agreement(fit: Fit) -> tuple[str, ...]:
     """How many of several starts ended at the estimate, and one elsewhere that fits as well."""
     if not fit.is_successful or not fit.others:
         return ()
@@ -831,7 +833,7 @@ def _agreement(fit: Fit) -> tuple[str, ...]:
     told = f"{count - len(others)} of {count} starts of the search ended at this estimate"
     for end in others:
         is_as_good = float(end.cost) - float(best.cost) <= HALF_95**2 * noise
-        if int(end.status) == Status.SUCCESSFUL and is_as_good:
+        if int(end.status) == Status.SUCCESSFUL and is_as_good and is_far(end, best):
             found = zip(end.params._fields, end.params, fit.free, strict=True)
             values = ", ".join(f"{name}={float(value):.4g}" for name, value, own in found if own)
             return (
