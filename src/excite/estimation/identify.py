@@ -607,7 +607,7 @@ def _recorded_late(
     if (delay := delays(found)) is None:
         return ()
     slope = np.asarray(jax.jacfwd(delays)(found))
-    std_error = np.sqrt(np.diagonal(slope @ covariance @ slope.T))
+    std_error = np.sqrt(np.maximum(np.diagonal(slope @ covariance @ slope.T), 0.0))
     names = names_of(plant.definition.inputs)
     return tuple(
         f"the delay of {name} is negative ({value:.4g} s): {name} is recorded later than it acts, "
