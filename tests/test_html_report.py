@@ -465,9 +465,10 @@ def test_parameters_are_those_of_the_command_line(name, made, capsys, monkeypatc
         assert re.search(r"\s+".join(map(re.escape, row[:-1])), shown)
     for sentence in result.verdict:
         assert sentence in page.words
-    (output, fit, _, *tests), *held_out = page.table_with("output", "fit")[1:]
+    (output, fit, size, *tests), *held_out = page.table_with("output", "fit")[1:]
     assert f"{output}: fit {fit}, {residual_in_words(result, output)}\n" in shown
     assert tests == residual_cells(result, output)
+    assert f"residual {size} RMS, " in shown
     assert len(held_out) == len(result.validation)
     correlation = re.search("largest correlation: (.*)", shown)
     assert correlation
@@ -478,20 +479,21 @@ def test_parameters_are_those_of_the_command_line(name, made, capsys, monkeypatc
     ("white", "structure", "cells", "words"),
     [
         (0.03, 0.04, ["yes", "0.0300", "no", "0.0400"],
-         "residual white (p = 0.0300), does not follow the input (p = 0.0400)"),
+         "residual 1.50 deg RMS, white (p = 0.0300), does not follow the input (p = 0.0400)"),
         (1e-9, 0.009, ["no", "1.00e-09", "yes", "0.00900"],
-         "residual not white (p = 1.00e-09), follows the input (p = 0.00900)"),
-        (None, math.nan, ["–", "–", "–", "–"], "residual too small or too short to be tested"),
+         "residual 1.50 deg RMS, not white (p = 1.00e-09), follows the input (p = 0.00900)"),
+        (None, math.nan, ["–", "–", "–", "–"], "residual 1.50 deg RMS, too small or too short to be tested"),
     ],
 )  # fmt: skip
 def test_a_residual_is_judged_at_one_percent_everywhere(white, structure, cells, words, here):
     path = here / "one" / "estimate.json"
     tests = {"whiteness_p_value": {"pitch": white}, "structure_p_value": {"pitch": structure}}
-    path.write_text(json.dumps({**read(path), **tests}))
+    size = {"pitch": {"rms": math.radians(1.5), "sum_of_squares": 1.0, "unit": "rad"}}
+    path.write_text(json.dumps({**read(path), **tests, "residual": size}))
     page = Page(report_html([here / "one"]))
     header, row = page.table_with("output", "fit")
     assert header[3:] == ["white", "p", "follows the input", "p"]
-    assert row[3:] == cells
+    assert row[2:] == ["1.50 deg", *cells]
     assert residual_in_words(estimate(here / "one"), "pitch") == words
 
 

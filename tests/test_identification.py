@@ -241,6 +241,18 @@ def decay() -> Identification:
     return identify([free_decay()], PLANT, start={"K_pu": 0.03})
 
 
+def test_the_size_of_the_residual_leaves_out_what_was_not_measured(result):
+    fitted = result.fitted[0]
+    outputs = fitted.record.outputs.copy()
+    outputs[10:400] = np.nan
+    record = dataclasses.replace(fitted.record, outputs=outputs)
+    fewer = dataclasses.replace(result, fitted=(dataclasses.replace(fitted, record=record),))
+    left = np.delete(fitted.record.outputs - fitted.simulated, slice(10, 400))
+    size = fewer.residual()["pitch"]
+    assert size["sum_of_squares"] == pytest.approx(left @ left)
+    assert size["rms"] == pytest.approx(np.sqrt(np.mean(left**2)))
+
+
 def test_a_free_decay_holds_the_input_gain_and_fits_the_rest(decay):
     assert decay.status == "partly identifiable"
     assert decay.is_usable
@@ -615,6 +627,10 @@ def test_the_dictionary_says_what_the_result_says(result):
         assert entry["relative_to_nominal"] == pytest.approx(result.params[name] / float(nominal))
     assert d["params"]["D_p"]["unit"] == "N m s/rad"
     assert d["fit_percent"] == {"pitch": result.fit()["pitch"]}
+    residual = np.concatenate([f.record.outputs - f.simulated for f in result.fitted])
+    assert d["residual"]["pitch"]["sum_of_squares"] == pytest.approx(np.vdot(residual, residual))
+    assert d["residual"]["pitch"]["rms"] == pytest.approx(np.std(residual), rel=0.01)
+    assert d["residual"]["pitch"]["unit"] == "rad"
     held_out = result.validation[0]
     assert d["validation"] == [
         {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -177,6 +178,23 @@ class Identification:
         predicted = [f.model for f in self.fitted]
         return self._fit_of(predicted, [np.isnan(values) for values in predicted])
 
+    def residual(self) -> dict[str, dict[str, Any]]:
+        """Size of the residual by output, over all records: `rms`, `sum_of_squares`, `unit`.
+
+        The residual is that of the simulation, with `pem` that of the one-step prediction.
+        """
+        values = np.concatenate([f.record.outputs - f.model for f in self.fitted])
+        squares = np.nansum(values**2, axis=0)
+        counts = np.sum(~np.isnan(values), axis=0)
+        return {
+            o.name: {
+                "rms": math.sqrt(s / n) if n else math.nan,
+                "sum_of_squares": float(s),
+                "unit": o.unit,
+            }
+            for o, s, n in zip(self.plant.outputs, squares, counts, strict=True)
+        }
+
     def _fit_of(
         self, values: Sequence[np.ndarray], without: Sequence[np.ndarray] | None = None
     ) -> dict[str, float]:
@@ -327,6 +345,7 @@ class Identification:
                 for p in self.plant.parameters
             },
             "fit_percent": self.fit(),
+            "residual": self.residual(),
             "validation": [
                 {
                     "file": f.record.source,

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..description import RARE
+from ..description import RARE, display_unit
 from .numbers import digits_for, number
 from .rows import EstimatedParameter, EstimateSummary
 from .tables import Table
@@ -53,16 +53,27 @@ def residual_cells(result: EstimateSummary, output: str) -> list[str]:
     return cells
 
 
+def residual_size(result: EstimateSummary, output: str) -> str:
+    """Root mean square of a residual with its unit."""
+    if output not in result.residual:
+        return "–"
+    size = result.residual[output]
+    unit, factor = display_unit(size.unit)
+    return f"{number(factor * size.rms)} {unit}".rstrip()
+
+
 def residual_in_words(result: EstimateSummary, output: str) -> str:
-    """The same tests as part of a sentence."""
+    """The size of the residual and the same tests as part of a sentence."""
     white, p_white, follows, p_follows = residual_cells(result, output)
-    parts = []
+    parts = [f"{residual_size(result, output)} RMS"] if output in result.residual else []
     if white != "–":
-        parts.append(f"residual {'white' if white == 'yes' else 'not white'} (p = {p_white})")
+        parts.append(f"{'white' if white == 'yes' else 'not white'} (p = {p_white})")
     if follows != "–":
         word = "follows" if follows == "yes" else "does not follow"
         parts.append(f"{word} the input (p = {p_follows})")
-    return ", ".join(parts) or "residual too small or too short to be tested"
+    if white == follows == "–":
+        parts.append("too small or too short to be tested")
+    return f"residual {', '.join(parts)}"
 
 
 def largest_correlation(result: EstimateSummary) -> str:

@@ -341,6 +341,14 @@ class FoundSuspect(Saved):
     remedy: str
 
 
+class ResidualSize(Saved):
+    """Size of the residual of one output, over all records, in `unit` and its square."""
+
+    rms: Number
+    sum_of_squares: Number
+    unit: str
+
+
 class EstimateSummary(Saved):
     """`estimate.json`: the result of an identification as plain data.
 
@@ -353,6 +361,7 @@ class EstimateSummary(Saved):
     status: str
     params: dict[str, EstimatedParameter]
     fit_percent: dict[str, Number]
+    residual: dict[str, ResidualSize] = {}
     validation: tuple[HeldOut, ...]
     files: tuple[str, ...]
     initial_state: str

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...description import RARE, PlantDescription, display_unit, names_of
+from ...description import RARE, PlantDescription, names_of
 from ...files import read_columns
 from ...record import Record
 from ...record.figure import episode_figure
@@ -22,6 +22,7 @@ from ..estimates import (
     parameter_cells,
     parameter_header,
     residual_cells,
+    residual_size,
 )
 from ..figures import (
     autocorrelation_figure,
@@ -206,12 +207,9 @@ def _residual_values(experiment: Experiment) -> list[np.ndarray]:
 def _residuals(experiment: Experiment) -> Table:
     """Fit and tests by output, and the fit of held-out records."""
     result, rows = experiment.result, []
-    residuals = np.concatenate(_residual_values(experiment))
-    for i, part in enumerate(experiment.plant.outputs):
-        unit, factor = display_unit(part.unit)
-        size = f"{number(factor * float(np.sqrt(np.mean(residuals[:, i] ** 2))))} {unit}"
-        fit = f"{number(result.model_fit_percent[part.name], 4)} %"
-        rows.append([part.name, fit, size, *residual_cells(result, part.name)])
+    for name, percent in result.model_fit_percent.items():
+        size, tests = residual_size(result, name), residual_cells(result, name)
+        rows.append([name, f"{number(percent, 4)} %", size, *tests])
     simulated = "simulated, " if result.is_predicted else ""
     others = [(result.fit_percent, "simulated")] if simulated else []
     for held_out in result.validation:
