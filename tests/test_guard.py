@@ -129,7 +129,7 @@ def test_the_brake_brings_the_slowest_plant_to_rest(name):
     def sample(carry, _):
         state, inputs = carry
         known = belief._replace(mean=jnp.concatenate([state, slowest]), inputs=inputs)
-        input = guard.decided(jnp, rules, known, jnp.zeros(len(rules.rest)))
+        input = guard.decided(jnp, rules, functions, known, jnp.zeros(len(rules.rest)))
         inputs = jnp.concatenate([inputs[1:], input[None]])
         point = jnp.concatenate([state, slowest])[None]
         state = functions.advance(point, inputs[None, -rules.depth :])[0]
@@ -170,6 +170,22 @@ def test_declared_plants_do_not_trip(guarding):
 
 
 @pytest.mark.science
+def test_a_whole_experiment_ends_with_the_brake(guarding):
+    """Zero volts in mid-swing would let the plant swing on."""
+    left, braked = (
+        run_batch(
+            drawn_hardware(PLANT, READINGS, 0.3, jax.random.split(jax.random.key(8), 8)),
+            CHIRP, guarding.supervision(RULES), STEPS, READINGS, *filter_,
+        )
+        for filter_ in ((), (guarding,))
+    )  # fmt: skip
+    np.testing.assert_array_equal(braked.inputs[:, :STEPS], left.inputs)
+    assert len(braked.measured[0]) == len(left.measured[0]) + guarding.num_more
+    assert np.abs(left.measured[:, -1]).max() > 0.1
+    assert np.abs(braked.measured[:, -1]).max() < 0.1 * RULES.critical[0]
+
+
+@pytest.mark.science
 def test_a_wrong_sign_is_found_at_once_and_ends_the_experiment_at_rest(guarding):
     runs = played(guarding, gain_voltage=-1.0)
     np.testing.assert_array_equal(runs.trip, Trip.UNEXPLAINED)
@@ -199,7 +215,7 @@ def test_other_faults_are_not_taken_for_a_turned_sign(guarding, what):
             measured = model.output(point[None])[0] + rules.noise * rng.normal(size=1)
             jump = 80 * rules.noise if what == "biased" and is_wrong else 0.0
             belief = guard.observed(np, rules, model, belief, measured + jump)
-            input = guard.decided(np, rules, belief, np.array([12.0 * (-1) ** (k // 4)]))
+            input = guard.decided(np, rules, model, belief, np.array([12.0 * (-1) ** (k // 4)]))
             belief = guard.moved(np, rules, model, belief, input)
             past = np.concatenate([past[1:], input[None]])
             late, gain = 3 * (what == "late" and is_wrong), 3.0 if what == "strong" else 1.0
@@ -224,7 +240,7 @@ def test_the_estimate_starts_again_where_the_sign_turns(guarding):
         if belief.sign < 0:
             errors.append(np.abs(belief.mean[:n] - point[:n]) / rules.state_scale)
         sign = -1.0 if k >= 15 else 1.0
-        input = guard.decided(np, rules, belief, np.array([12.0 * (-1) ** (k // 4)]))
+        input = guard.decided(np, rules, model, belief, np.array([12.0 * (-1) ** (k // 4)]))
         belief = guard.moved(np, rules, model, belief, input)
         past = np.concatenate([past[1:], sign * input[None]])
         point[:n] = model.advance(point[None], past[None])[0]
@@ -235,11 +251,12 @@ def test_the_estimate_starts_again_where_the_sign_turns(guarding):
 
 @pytest.mark.science
 def test_what_seems_dead_is_braked_all_the_same(guarding):
-    rules = guarding.rules
+    rules, model = guarding.rules, guarding.guard().model
     belief = guard.start(np, rules)
     belief = belief._replace(mean=belief.mean + 0.3, num_braked=np.asarray(1))
-    acting = guard.decided(np, rules, belief, np.zeros(1))
-    dead = guard.decided(np, rules, belief._replace(sign=np.asarray(0.0)), np.zeros(1))
+    acting = guard.decided(np, rules, model, belief, np.zeros(1))
+    belief = belief._replace(sign=np.asarray(0.0))
+    dead = guard.decided(np, rules, model, belief, np.zeros(1))
     np.testing.assert_array_equal(acting, dead)
     assert abs(acting[0]) > 1
 
@@ -253,7 +270,7 @@ def test_the_guard_knows_what_the_supervisor_let_through(guarding):
     runs = run_batch(hardware, CHIRP, rules, STEPS, READINGS, guarding)
     count = np.asarray(runs.memory.inputs).shape[1]
     np.testing.assert_array_equal(runs.memory.inputs, np.asarray(runs.inputs)[:, -count:])
-    np.testing.assert_array_equal(runs.memory.num_braked, 0)
+    np.testing.assert_array_equal(runs.memory.tripped_at, STEPS)  # the brake after the last sample
 
 
 @pytest.mark.science
@@ -290,7 +307,7 @@ def test_numpy_and_jax_come_to_the_same_belief(guarding):
         input = player(k, measured)
         belief = observed(belief, jnp.asarray(measured))
         proposed = jnp.asarray(record.inputs[k])
-        expected = guard.decided(jnp, guarding.rules, belief, proposed)
+        expected = guard.decided(jnp, guarding.rules, functions, belief, proposed)
         np.testing.assert_allclose(input, expected, rtol=1e-6, atol=1e-6)
         told = input if k < 12 else -3 - input
         player.applied(told)
@@ -331,6 +348,10 @@ def test_run_plays_behind_the_guard_and_records_what_it_did(guarded_file, tmp_pa
                   out=tmp_path / "good.csv")  # fmt: skip
     assert good.outcome.is_complete
     assert "did not trip" in str(good)
+    played, num_more = good.record.inputs[:30], len(good.record.inputs) - 30
+    assert np.abs(played[-1]) > 1
+    assert 5 <= num_more <= 60
+    assert np.abs(good.record.outputs[-1]) < 0.25 * RULES.critical
     bad = ex.run(policy=guarded_file, plant="aero2", guard=True, fast=True, spread=0.2,
                  fault={"gain_voltage": -1.0}, out=tmp_path / "bad.csv")  # fmt: skip
     assert bad.outcome.trip == Trip.UNEXPLAINED
@@ -371,7 +392,7 @@ def test_a_damaged_guard_is_one_sentence(guarded_file, tmp_path):
 def uncalibrated() -> Guard:
     """A guard without thresholds, which needs no experiments."""
     model, rules = model_of("aero2")
-    return GuardFilter(model, rules).guard()
+    return GuardFilter(model, rules, STEPS).guard()
 
 
 def test_a_guard_is_read_as_it_was_written():

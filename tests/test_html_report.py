@@ -482,7 +482,8 @@ def test_parameters_are_those_of_the_command_line(name, made, capsys, monkeypatc
          "residual 1.50 deg RMS, white (p = 0.0300), does not follow the input (p = 0.0400)"),
         (1e-9, 0.009, ["no", "1.00e-09", "yes", "0.00900"],
          "residual 1.50 deg RMS, not white (p = 1.00e-09), follows the input (p = 0.00900)"),
-        (None, math.nan, ["–", "–", "–", "–"], "residual 1.50 deg RMS, too small or too short to be tested"),
+        (None, math.nan, ["–", "–", "–", "–"],
+         "residual 1.50 deg RMS, too small or too short to be tested"),
     ],
 )  # fmt: skip
 def test_a_residual_is_judged_at_one_percent_everywhere(white, structure, cells, words, here):

@@ -142,7 +142,7 @@ class Play:
         self.num_readings, self.seed = readings_per_sample(self.plant), seed
         self.rules = Supervision.of(self.plant.description)
         model = GuardModel.for_rig(self.plant, self.spread, self.ranges)
-        self.guard = GuardFilter(model, Guard.from_dict(policy.guard).rules)
+        self.guard = GuardFilter(model, Guard.from_dict(policy.guard).rules, STEPS)
 
     def row(self, name, effects, faults, runs):
         """Of one scenario."""
@@ -154,7 +154,8 @@ class Play:
             )
         )  # fmt: skip
         belief = guarded.memory
-        found, sample = np.asarray(belief.num_braked) > 0, np.asarray(belief.tripped_at)
+        sample = np.asarray(belief.tripped_at)
+        found = sample < STEPS
         size, alone = self.size(guarded.max_abs_output), self.size(without.max_abs_output)
         bad, is_bad_alone = ~(size < 1), ~(alone < 1)
         row = {
@@ -174,7 +175,7 @@ class Play:
                                                        "actuator_sign"))  # fmt: skip
         onset = jnp.min(jnp.stack(list(times)), axis=0)
         best = self.size(
-            braked_at_once(hardware, onset, BREAKING[name], self.excitation, self.guard.rules,
+            braked_at_once(hardware, onset, BREAKING[name], self.excitation, self.guard,
                            float(self.plant.dt), self.num_readings)
         )  # fmt: skip
         late = sample - np.ceil(np.asarray(onset) / float(self.plant.dt))
@@ -217,11 +218,12 @@ class Play:
 
 
 @eqx.filter_jit
-def braked_at_once(hardware, onset, sign, excitation, rules, dt, num_readings):
+def braked_at_once(hardware, onset, sign, excitation, guarding, dt, num_readings):
     """Largest outputs where the guard's brake acts from the first sample after the fault on.
 
     It knows the true state, and the factor of the actuator.
     """
+    rules, model = guarding.rules, guarding.model.functions()
 
     def one(hardware, onset):
         def sample(carry, k):
@@ -232,7 +234,7 @@ def braked_at_once(hardware, onset, sign, excitation, rules, dt, num_readings):
                 mean=jnp.concatenate([state.plant_state, away]),
                 num_braked=jnp.where(k * dt >= onset, 1, 0),
             )
-            input = guard.decided(jnp, rules, known, proposed)
+            input = guard.decided(jnp, rules, model, known, proposed)
             input = jnp.clip(input, rules.lower, rules.upper)
             player = excitation.applied(player, input)
             belief = belief._replace(inputs=jnp.concatenate([belief.inputs[1:], input[None]]))

@@ -63,7 +63,7 @@ def _options(command: Callable[..., int]) -> Callable[..., int]:
                      "could no longer be brought to rest before its critical level."),
         click.option("--guard", is_flag=True,
                      help="Brake where no plant of the policy's declared uncertainty explains the "
-                     "measurements (excite falsify --guard)."),
+                     "measurements, and after the last sample (excite falsify --guard)."),
         click.option("--require-certificate", is_flag=True,
                      help="Refuse a policy without a certificate (excite falsify) for this plant "
                      "and spread."),

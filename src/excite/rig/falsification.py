@@ -113,13 +113,14 @@ class OnRig(AbstractExperiments):
     def replayed(self, case: Cases) -> tuple[Trajectory, float]:
         """The record of one case, what is read when inputs begin to act, and its nearness."""
         run = _run(self, case)
-        time = jnp.arange(self.num_steps + 1) * self.rules.dt
+        time = jnp.arange(len(run.measured)) * self.rules.dt
         size = nearness(self.uncertainty.plant, run.max_abs_output[None])
         return Trajectory(time, run.inputs, run.measured, run.measured), float(size)
 
     def noise(self, case: Cases) -> Float[Array, "sample output"]:
         """The noise of a case's seed at all readings, in standard deviations."""
-        count = (self.num_steps + 1) * self.num_readings + 1
+        length = self.num_steps + self.safety_filter.num_more
+        count = (length + 1) * self.num_readings + 1
         return self.hardware(case).reading_noise(count)
 
     def hardware(self, case: Cases) -> Hardware:

@@ -72,6 +72,11 @@ class AbstractFilter(eqx.Module):
         """A supervisor's rules beside this filter."""
         return rules
 
+    @property
+    def num_more(self) -> int:
+        """Samples that it plays after the last one of the excitation."""
+        return 0
+
     def is_over(self, memory: PyTree) -> Bool[Array, ""]:
         """Whether the experiment ends."""
         del memory

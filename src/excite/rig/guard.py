@@ -7,8 +7,9 @@ N. Poulsen, O. Ravn, New developments in state estimation for nonlinear systems,
 measurements: an innovation is too large, the last ten are on average, or the estimate leaves
 the declared box. Its thresholds are those that declared plants do not reach (`calibrated`).
 
-Zero is no safe input in mid-swing. After a trip the guard brakes with linear feedback of the
-estimated state, then the experiment ends. What was wrong is inferred from the last samples:
+Zero is no safe input in mid-swing. After a trip, and after the last sample of a whole
+experiment, the guard brakes with linear feedback of the estimated state, then the experiment
+ends. What was wrong is inferred from the last samples:
 where the actuator acted with the other sign, or not at all, it brakes with that in mind, and
 where a sensor stands still it does not believe it.
 
@@ -53,9 +54,12 @@ The first is as declared. A fault of the newest input alone is not told from a l
 """
 
 _SQUARE = 3.0  # of the distance of the filter's points, in standard deviations: that of a normal
+# Parts of the way from the last input to the one of the feedback, and the fraction of a critical
+# level that they must keep below.
+_PARTS, _NEAR = np.linspace(1.0, 0.0, 6), 0.9
 _WIDE = 0.05  # after a trip, how far a state may move in one sample unexplained, in its scales
 _QUIET = 0.25  # fraction of critical levels and input limits below which it is at rest
-_NUM_QUIET, _LONGEST = 5, 60  # samples of rest that end the brake; samples after which it ends
+_NUM_QUIET, LONGEST_BRAKE = 5, 120  # samples of rest that end the brake; after which it ends
 _LOST = 2.0  # times the critical levels: what is beyond is not braked any more
 # Another sign must explain the last samples better by _BETTER, in squares of standard deviations,
 # and leave less than _EXPLAINED, or than the part _PART of what the present sign leaves.
@@ -251,8 +255,8 @@ class Belief(NamedTuple):
 
     @property
     def is_over(self) -> AnyArray:
-        """Whether the brake has done its work."""
-        return (self.num_quiet >= _NUM_QUIET) | (self.num_braked > _LONGEST)
+        """Whether the brake has brought the plant to rest, or took too long."""
+        return (self.num_quiet >= _NUM_QUIET) | (self.num_braked > LONGEST_BRAKE)
 
 
 def start(xp: ModuleType, rules: GuardRules) -> Belief:
@@ -342,16 +346,42 @@ def observed(
     )
 
 
-def decided(xp: ModuleType, rules: GuardRules, belief: Belief, proposed: AnyArray) -> AnyArray:
-    """The input to apply: the proposed one, or that of the brake."""
+def decided(
+    xp: ModuleType, rules: GuardRules, model: Model, belief: Belief, proposed: AnyArray
+) -> AnyArray:
+    """The input to apply: the proposed one, or that of the brake.
+
+    A sudden brake may itself pass a level, as the current of a fast motor: it goes only so far
+    from the last input to that of the feedback as the estimated plant stays below its levels.
+    """
+    if xp is np and not belief.num_braked:  # on a rig, what is not needed takes time
+        return proposed
+    last, brake = belief.inputs[-1], _fed_back(xp, rules, belief)
+    tried = last[None] + xp.asarray(_PARTS)[:, None] * (brake - last)[None]
+    past = xp.broadcast_to(belief.inputs[-rules.depth :], (len(tried), rules.depth, len(last)))
+    points = xp.broadcast_to(belief.mean, (len(tried), len(belief.mean)))
+    near = xp.zeros(len(tried))
+    for _ in range(rules.depth):
+        past = xp.concatenate([past[:, 1:], tried[:, None]], axis=1)
+        states = model.advance(points, belief.sign * past)
+        points = xp.concatenate([states, points[:, rules.num_states :]], axis=1)
+        sizes = abs(model.output(points)[:, rules.watched]) / xp.asarray(rules.critical)
+        near = xp.maximum(near, xp.max(sizes, axis=1, initial=0.0))
+    # The first that keeps below, or the one that comes least near.
+    near = xp.where(xp.isfinite(near), near, xp.inf)
+    brake = tried[xp.argmin(xp.where(near < _NEAR, 0.0, near))]
+    return xp.where(belief.num_braked > 0, brake, proposed)
+
+
+def _fed_back(xp: ModuleType, rules: GuardRules, belief: Belief) -> AnyArray:
+    """The input of linear feedback of the estimated state."""
     away, rest = (belief.mean - xp.asarray(rules.mean))[: rules.num_states], xp.asarray(rules.rest)
     count = rules.depth - 1
     past = belief.sign * belief.inputs[len(belief.inputs) - count :] - rest[None]
     brake = xp.asarray(rules.feedback) @ away + xp.asarray(rules.past_feedback) @ xp.ravel(past)
     # One that seems dead may only be late: it is driven all the same.
     brake = xp.where(belief.sign < 0, -1.0, 1.0) * (rest - brake)
-    brake = xp.clip(xp.where(xp.isfinite(brake), brake, rules.rest), rules.lower, rules.upper)
-    return xp.where(belief.num_braked > 0, brake, proposed)
+    return xp.clip(xp.where(xp.isfinite(brake), brake, rules.rest), rules.lower, rules.upper)
 
 
 def moved(
@@ -490,15 +520,26 @@ class GuardedPlayer(AbstractPlayer):
     def __call__(self, k: int, measured: np.ndarray) -> np.ndarray:
         """The player's input, or that of the brake."""
         with np.errstate(all="ignore"):  # what is not finite trips
-            belief = observed(np, self._rules, self._model, self._belief, np.asarray(measured))
+            measured, is_played = np.asarray(measured), k >= self.num_steps
+            belief = observed(np, self._rules, self._model, self._belief, measured, is_played)
             self._belief = belief
             proposed = self._rules.rest if belief.num_braked > 0 else self._player(k, measured)
-            return np.array(decided(np, self._rules, belief, proposed))
+            return np.array(decided(np, self._rules, self._model, belief, proposed))
 
     @property
     def is_over(self) -> bool:
+        """Whether the brake has done its work after a trip."""
+        return self._has_tripped and bool(self._belief.is_over)
+
+    @property
+    def is_at_rest(self) -> bool:
         """Whether the brake has done its work."""
         return bool(self._belief.is_over)
+
+    @property
+    def _has_tripped(self) -> bool:
+        """Whether it braked before the last sample."""
+        return bool(self._belief.tripped_at < min(self._belief.k, self.num_steps))
 
     def applied(self, input: np.ndarray) -> None:
         """Passes the applied input to the player, and moves the belief to the next sample."""
@@ -513,12 +554,11 @@ class GuardedPlayer(AbstractPlayer):
     def facts(self) -> Mapping[str, object]:
         """Also whether and when the guard tripped, and how near to its thresholds it came."""
         belief, names = self._belief, ("innovation", "mean of innovations", "outside the box")
-        has_tripped = bool(belief.num_braked > 0)
         shares = zip(names, belief.largest.tolist(), self._rules.thresholds.tolist(), strict=True)
         return {
             **self._player.facts(),
             "guard": {
-                "tripped_at": int(belief.tripped_at) if has_tripped else None,
+                "tripped_at": int(belief.tripped_at) if self._has_tripped else None,
                 "largest_and_threshold": {name: [a, b] for name, a, b in shares},
                 "actuator_sign": float(belief.sign),
                 "sensor_frozen": bool(belief.is_blind),

@@ -268,11 +268,11 @@ def guard_for(
     model = GuardModel.for_rig(plant, spread, ranges)
     keys = jax.random.split(jax.random.key(seed), num_runs)
     cases = Cases(jax.vmap(box.draw)(keys), jnp.arange(num_runs) + seed * num_runs)
-    stops = jax.random.randint(jax.random.key(seed), (num_runs,), 1, num_steps)
+    stops = jax.random.randint(jax.random.key(seed), (num_runs,), 1, num_steps + 1)
 
     def played(function: Callable[..., Array], rules: GuardRules, *series: Array) -> np.ndarray:
         """A function of all experiments, chunk by chunk."""
-        play, rows = OnRig.of(box, excitation, num_steps, GuardFilter(model, rules)), []
+        play, rows = OnRig.of(box, excitation, num_steps, GuardFilter(model, rules, num_steps)), []
         for first in range(0, num_runs, _CHUNK):
             progress("calibrating the guard", first, num_runs)
             chunk = jax.tree.map(lambda x, at=first: x[at : at + _CHUNK], (cases, *series))
@@ -291,7 +291,7 @@ def guard_for(
     top = np.nanmax(played(_scores, chosen), axis=0)
     progress("calibrating the guard", num_runs, num_runs)
     thresholds = np.append(_MARGIN * top[:2], top[2] + _MARGIN_OUTSIDE)
-    return GuardFilter(model, dataclasses.replace(chosen, thresholds=thresholds))
+    return GuardFilter(model, dataclasses.replace(chosen, thresholds=thresholds), num_steps)
 
 
 @eqx.filter_jit
@@ -330,12 +330,14 @@ class GuardFilter(AbstractFilter):
     Attributes:
         model: the declared plants.
         rules: of the guard.
-        trips_at: sample at which it trips in any case; None for none.
+        num_steps: samples of the experiment, after which it brakes.
+        trips_at: sample at which it trips in any case.
     """
 
     model: GuardModel
     rules: GuardRules
-    trips_at: Int[Array, ""] | None = None
+    num_steps: int = eqx.field(static=True)
+    trips_at: Int[Array, ""] | float = math.inf
 
     def start(self) -> Belief:
         """Before the first measurement."""
@@ -346,18 +348,23 @@ class GuardFilter(AbstractFilter):
     ) -> tuple[Belief, Float[Array, " input"], Bool[Array, ""]]:
         """The belief after a measurement, the input to apply, and whether it is the brake's."""
         model = self.model.functions()
-        is_asked = False if self.trips_at is None else belief.k >= self.trips_at
+        is_asked = belief.k >= jnp.minimum(self.num_steps, self.trips_at)
         belief = guard.observed(jnp, self.rules, model, belief, measured, is_asked)
-        input = guard.decided(jnp, self.rules, belief, proposed)
+        input = guard.decided(jnp, self.rules, model, belief, proposed)
         return belief, input, belief.num_braked > 0
 
     def applied(self, memory: Belief, input: Float[Array, " input"]) -> Belief:
         """The belief at the next sample."""
         return guard.moved(jnp, self.rules, self.model.functions(), memory, input)
 
+    @property
+    def num_more(self) -> int:
+        """The longest brake."""
+        return guard.LONGEST_BRAKE
+
     def is_over(self, memory: Belief) -> Bool[Array, ""]:
-        """Whether the brake has done its work."""
-        return memory.is_over
+        """Whether the brake has done its work after a trip."""
+        return memory.is_over & (memory.tripped_at < self.num_steps)
 
     def supervision(self, rules: Supervision) -> Supervision:
         """A supervisor's rules beside this guard, which notices a frozen sensor and brakes."""

@@ -11,6 +11,7 @@ record is readable and has the reason.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import signal
 import threading
@@ -357,9 +358,9 @@ def _play(
 ) -> None:
     """Plays the sampling instants, and takes the measurement at the end."""
     rig, latency = run.rig, run.rig.num_latency
-    for k in range(player.num_steps + 1):
+    for k in itertools.count():
         run.watch = check_sample(np, run.rules, run.watch)
-        is_last = k == player.num_steps
+        is_last = k >= player.num_steps and player.is_at_rest
         proposed = rig.safe_input if is_last or run.is_over else player(k, run.last.outputs)
         run.look_at_player()
         if player.is_over:

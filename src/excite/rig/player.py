@@ -30,6 +30,11 @@ class AbstractPlayer(abc.ABC):
         """Whether it ends the experiment before its time."""
         return False
 
+    @property
+    def is_at_rest(self) -> bool:
+        """Whether the experiment may end where it has been played."""
+        return True
+
     @abc.abstractmethod
     def __call__(self, k: int, measured: np.ndarray) -> np.ndarray:
         """Proposed input at sampling instant k, in the plant's units."""

@@ -246,7 +246,8 @@ def run(
         slew: largest change of an input in one second, in its unit.
         filter: adds a predictive safety filter for parameters within the `spread`.
         guard: watches whether a declared plant explains the measurements, and brakes where none
-            does; for a policy with a guard in its file (`excite falsify --guard`).
+            does, and after the last sample; for a policy with a guard in its file
+            (`excite falsify --guard`).
         require_certificate: refuses a policy without a certificate that a search on this plant,
             with this `spread`, found it safe.
         address: board identifier of the Quanser rig.

@@ -427,9 +427,10 @@ def one_run(
 
     Args:
         key: of the excitation; default the hardware's.
-        noise: of all (num_steps + 1) num_readings + 1 readings in standard deviations; default
-            that of the hardware's key.
+        noise: of all readings in standard deviations, one of the start and num_readings of each
+            sample, the filter's and one at the end included; default that of the hardware's key.
     """
+    length = num_steps + safety_filter.num_more
     interval = rules.dt / num_readings
     latency = jnp.round(hardware.latency / interval).astype(int)
 
@@ -467,7 +468,7 @@ def one_run(
 
     first = by_sample = last = None
     if noise is not None:
-        first, later = noise[0], noise[1:].reshape(num_steps + 1, num_readings, -1)
+        first, later = noise[0], noise[1:].reshape(length + 1, num_readings, -1)
         by_sample, last = later[:-1], later[-1]
     state = hardware.start(first)
     # A signal is made for the sampling time, not for the interval between two readings.
@@ -476,7 +477,7 @@ def one_run(
     watch = Watch.start(jnp, rules, state.shown)
     carry = state, watch, player, safety_filter.start(), jnp.asarray(0)
     (state, watch, _, memory, count), (inputs, measured) = jax.lax.scan(
-        sample, carry, by_sample, length=num_steps
+        sample, carry, by_sample, length=length
     )
     trip, safe = watch.trip, jnp.asarray(rules.safe_input, float)
     (state, _), last_acted_on = hold(state, watch, safe, last)
