@@ -350,7 +350,8 @@ def test_run_plays_behind_the_guard_and_records_what_it_did(guarded_file, tmp_pa
     assert "did not trip" in str(good)
     played, num_more = good.record.inputs[:30], len(good.record.inputs) - 30
     assert np.abs(played[-1]) > 1
-    assert 5 <= num_more <= 60
+    assert 5 <= num_more <= guard.LONGEST_BRAKE
+    assert good.outcome.player["guard"]["num_braked"] == num_more
     assert np.abs(good.record.outputs[-1]) < 0.25 * RULES.critical
     bad = ex.run(policy=guarded_file, plant="aero2", guard=True, fast=True, spread=0.2,
                  fault={"gain_voltage": -1.0}, out=tmp_path / "bad.csv")  # fmt: skip
@@ -360,6 +361,28 @@ def test_run_plays_behind_the_guard_and_records_what_it_did(guarded_file, tmp_pa
     assert isinstance(facts, dict)
     assert facts["tripped_at"] < 10
     assert np.abs(bad.record.outputs).max() < np.deg2rad(40)
+
+
+@pytest.mark.science
+@pytest.mark.parametrize("fault", ["actuator_sign", "actuator_stuck"])
+def test_a_fault_while_the_experiment_ends_is_told(guarded_file, tmp_path, fault):
+    """Whether at rest after all, or never."""
+    run = ex.run(policy=guarded_file, plant="aero2", guard=True, fast=True, spread=0.2,
+                 fault={fault: 3.05}, out=tmp_path / "ends.csv")  # fmt: skip
+    assert run.outcome.num_samples > 30
+    assert run.outcome.trip == Trip.UNEXPLAINED
+    assert run.outcome.player["guard"]["tripped_at"] == 30
+    assert "tripped at sample 30" in str(run)
+
+
+def test_equal_readings_do_not_end_a_whole_experiment_blind():
+    """As of an encoder near rest."""
+    player = GuardedPlayer(SignalPlayer(np.zeros((3, 1))), uncalibrated())
+    for k in range(12):
+        player.applied(player(k, np.array([1e-3])))
+    assert player.is_at_rest
+    assert not player.is_over
+    assert not player.facts()["guard"]["sensor_frozen"]
 
 
 @pytest.mark.science

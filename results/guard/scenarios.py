@@ -3,7 +3,8 @@
     python results/guard/scenarios.py aero2 --declared 2000 --out results/guard/aero2.json
 
 Every scenario is played on simulated rigs with plants drawn from the declared uncertainty of the
-policy, on the same plants and noise without and with the guard of the policy's file. Where
+policy, on the same plants and noise without and with the guard of the policy's file. What follows
+the last sample counts, too: the free motion without a guard, the brake with it. Where
 something breaks in mid-run, an oracle is played too: it knows the true state and the fault, and
 brakes at the first sample after the fault. What it leaves is what braking at once would leave.
 """
@@ -27,6 +28,7 @@ from excite.plant.catalogue import plant_from
 from excite.plant.uncertainty import Uncertainty
 from excite.rig import guard
 from excite.rig.faults import Faults
+from excite.rig.filter import AbstractFilter
 from excite.rig.guard import Guard, GuardedPlayer
 from excite.rig.guard_design import GuardFilter, GuardModel
 from excite.rig.player import PolicyPlayer
@@ -132,6 +134,21 @@ BREAKING = {"actuator stuck": 0.0, "actuator dead": 0.0, "sign flip": -1.0}
 """Scenarios with an oracle, and the factor of the actuator after the fault."""
 
 
+class FreeMotion(AbstractFilter):
+    """The safe input after the experiment, for as long as a guard may brake."""
+
+    rest: jax.Array
+    num_more = guard.LONGEST_BRAKE
+
+    def start(self):
+        """The first sample."""
+        return jnp.asarray(0)
+
+    def __call__(self, memory, measured, proposed):
+        """The proposed input, or the safe one."""
+        return memory + 1, jnp.where(memory < STEPS, proposed, self.rest), jnp.asarray(False)
+
+
 class Play:
     """Experiments of one policy on simulated rigs, without and with its guard."""
 
@@ -147,10 +164,11 @@ class Play:
     def row(self, name, effects, faults, runs):
         """Of one scenario."""
         hardware = self.hardware(effects, faults, runs)
+        free = FreeMotion(jnp.asarray(self.guard.rules.rest))
         without, guarded = (
             run_batch(hardware, self.excitation, rules, STEPS, self.num_readings, *filter)
             for rules, filter in (
-                (self.rules, ()), (self.guard.supervision(self.rules), (self.guard,)),
+                (self.rules, (free,)), (self.guard.supervision(self.rules), (self.guard,)),
             )
         )  # fmt: skip
         belief = guarded.memory
@@ -247,7 +265,8 @@ def braked_at_once(hardware, onset, sign, excitation, guarding, dt, num_readings
         plant = eqx.tree_at(lambda p: p.dt, hardware.plant, jnp.asarray(dt))
         belief = guard.start(jnp, rules)._replace(sign=jnp.asarray(sign))
         carry = hardware.start(), excitation.init(plant, STEPS, hardware.key), belief
-        (state, _, _), _ = jax.lax.scan(sample, carry, jnp.arange(STEPS))
+        count = STEPS + guard.LONGEST_BRAKE
+        (state, _, _), _ = jax.lax.scan(sample, carry, jnp.arange(count))
         return state.largest
 
     return jax.vmap(one)(hardware, onset)

@@ -229,7 +229,7 @@ class Belief(NamedTuple):
         is_blind: whether the brake does not believe the sensor.
         k: samples so far.
         num_braked: samples since the trip; 0 before it.
-        num_quiet: samples of rest since.
+        num_quiet: samples of rest since; -1 where the brake seems to push.
     """
 
     mean: AnyArray
@@ -254,9 +254,14 @@ class Belief(NamedTuple):
         return self.k - self.num_braked
 
     @property
+    def is_at_rest(self) -> AnyArray:
+        """Whether the brake has brought the plant to rest."""
+        return self.num_quiet >= _NUM_QUIET
+
+    @property
     def is_over(self) -> AnyArray:
-        """Whether the brake has brought the plant to rest, or took too long."""
-        return (self.num_quiet >= _NUM_QUIET) | (self.num_braked > LONGEST_BRAKE)
+        """Whether the brake ends: at rest, or because it pushes or takes too long."""
+        return self.is_at_rest | (self.num_quiet < 0) | (self.num_braked >= LONGEST_BRAKE)
 
 
 def start(xp: ModuleType, rules: GuardRules) -> Belief:
@@ -294,7 +299,7 @@ def observed(
 
     Args:
         measured: outputs.
-        is_asked: whether it trips in any case.
+        is_asked: whether it brakes in any case; then a reading that stands still is believed.
     """
     is_braking = belief.num_braked > 0
     mean, root, innovation = _corrected(xp, rules, model, belief, measured)
@@ -307,7 +312,7 @@ def observed(
     is_explained = (score < xp.asarray(rules.thresholds)).all() & ~is_over & ~xp.asarray(is_asked)
     trips = ~is_braking & ~is_explained
     was_frozen = (measured == belief.measured[-1]).any()
-    is_blind = belief.is_blind | ((is_braking | trips) & was_frozen)
+    is_blind = belief.is_blind | ((is_braking | trips) & was_frozen & ~xp.asarray(is_asked))
     if xp is np and not (trips or is_braking):  # on a rig, what is not needed takes time
         state, sign = mean[: rules.num_states], belief.sign
     else:
@@ -327,7 +332,8 @@ def observed(
     reach = _QUIET * (xp.asarray(rules.upper) - xp.asarray(rules.lower)) / 2
     is_quiet = (size < _QUIET).all() & (abs(belief.inputs[-1] - rules.rest) < reach).all()
     num_quiet = xp.where(is_quiet, belief.num_quiet + 1, 0)
-    num_quiet = xp.where((size > _LOST).any(), _NUM_QUIET, num_quiet)  # the brake seems to push
+    num_quiet = xp.where((size > _LOST).any(), -1, num_quiet)
+    num_quiet = xp.where(belief.is_over, belief.num_quiet, num_quiet)
     return belief._replace(
         mean=mean,
         root=root,
@@ -365,7 +371,7 @@ def decided(
         past = xp.concatenate([past[:, 1:], tried[:, None]], axis=1)
         states = model.advance(points, belief.sign * past)
         points = xp.concatenate([states, points[:, rules.num_states :]], axis=1)
-        sizes = abs(model.output(points)[:, rules.watched]) / xp.asarray(rules.critical)
+        sizes = abs(model.output(points)[:, rules.watched]) / xp.asarray(rules.critical)[None]
         near = xp.maximum(near, xp.max(sizes, axis=1, initial=0.0))
     # The first that keeps below, or the one that comes least near.
     near = xp.where(xp.isfinite(near), near, xp.inf)
@@ -515,31 +521,37 @@ class GuardedPlayer(AbstractPlayer):
         """Before the first sample."""
         self._player, self._rules, self._model = player, guard.rules, guard.model
         self.num_steps = player.num_steps
-        self._belief = start(np, guard.rules)
+        self._belief, self._reaches_level = start(np, guard.rules), False
 
     def __call__(self, k: int, measured: np.ndarray) -> np.ndarray:
         """The player's input, or that of the brake."""
         with np.errstate(all="ignore"):  # what is not finite trips
-            measured, is_played = np.asarray(measured), k >= self.num_steps
-            belief = observed(np, self._rules, self._model, self._belief, measured, is_played)
+            measured, rules = np.asarray(measured), self._rules
+            is_asked = k >= self.num_steps
+            belief = observed(np, rules, self._model, self._belief, measured, is_asked)
+            self._reaches_level |= bool((abs(measured[rules.watched]) >= rules.critical).any())
             self._belief = belief
             proposed = self._rules.rest if belief.num_braked > 0 else self._player(k, measured)
             return np.array(decided(np, self._rules, self._model, belief, proposed))
 
     @property
     def is_over(self) -> bool:
-        """Whether the brake has done its work after a trip."""
-        return self._has_tripped and bool(self._belief.is_over)
+        """Whether the brake has ended, and not as after a whole experiment of a declared plant."""
+        return self._is_unexplained and bool(self._belief.is_over)
 
     @property
     def is_at_rest(self) -> bool:
-        """Whether the brake has done its work."""
-        return bool(self._belief.is_over)
+        """Whether the brake has brought the plant to rest."""
+        return bool(self._belief.is_at_rest)
 
     @property
-    def _has_tripped(self) -> bool:
-        """Whether it braked before the last sample."""
-        return bool(self._belief.tripped_at < min(self._belief.k, self.num_steps))
+    def _is_unexplained(self) -> bool:
+        """Whether it braked before the last sample, or could not brake as declared plants can."""
+        belief = self._belief
+        if belief.tripped_at < min(belief.k, self.num_steps):
+            return True
+        has_failed = bool(belief.is_over and not belief.is_at_rest)
+        return has_failed or self._reaches_level or bool(belief.sign != 1 or belief.is_blind)
 
     def applied(self, input: np.ndarray) -> None:
         """Passes the applied input to the player, and moves the belief to the next sample."""
@@ -558,7 +570,8 @@ class GuardedPlayer(AbstractPlayer):
         return {
             **self._player.facts(),
             "guard": {
-                "tripped_at": int(belief.tripped_at) if self._has_tripped else None,
+                "tripped_at": int(belief.tripped_at) if self._is_unexplained else None,
+                "num_braked": int(belief.num_braked),
                 "largest_and_threshold": {name: [a, b] for name, a, b in shares},
                 "actuator_sign": float(belief.sign),
                 "sensor_frozen": bool(belief.is_blind),

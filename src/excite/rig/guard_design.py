@@ -351,6 +351,7 @@ class GuardFilter(AbstractFilter):
         is_asked = belief.k >= jnp.minimum(self.num_steps, self.trips_at)
         belief = guard.observed(jnp, self.rules, model, belief, measured, is_asked)
         input = guard.decided(jnp, self.rules, model, belief, proposed)
+        input = jnp.where(belief.is_over, jnp.asarray(self.rules.rest), input)
         return belief, input, belief.num_braked > 0
 
     def applied(self, memory: Belief, input: Float[Array, " input"]) -> Belief:
@@ -363,8 +364,9 @@ class GuardFilter(AbstractFilter):
         return guard.LONGEST_BRAKE
 
     def is_over(self, memory: Belief) -> Bool[Array, ""]:
-        """Whether the brake has done its work after a trip."""
-        return memory.is_over & (memory.tripped_at < self.num_steps)
+        """Whether the brake has ended, and not as after a whole experiment of a declared plant."""
+        is_planned = (memory.tripped_at >= self.num_steps) & memory.is_at_rest
+        return memory.is_over & ~(is_planned & (memory.sign == 1) & ~memory.is_blind)
 
     def supervision(self, rules: Supervision) -> Supervision:
         """A supervisor's rules beside this guard, which notices a frozen sensor and brakes."""
