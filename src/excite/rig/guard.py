@@ -59,7 +59,10 @@ _SQUARE = 3.0  # of the distance of the filter's points, in standard deviations:
 _PARTS, _NEAR = np.linspace(1.0, 0.0, 6), 0.9
 _WIDE = 0.05  # after a trip, how far a state may move in one sample unexplained, in its scales
 _QUIET = 0.25  # fraction of critical levels and input limits below which it is at rest
-_NUM_QUIET, LONGEST_BRAKE = 5, 120  # samples of rest that end the brake; after which it ends
+_NUM_QUIET, _LONGEST = 5, 60  # samples of rest that end the brake; after a trip, its last sample
+LONGEST_BRAKE = 150
+"""Samples of the brake after a whole experiment, at most."""
+
 _LOST = 2.0  # times the critical levels: what is beyond is not braked any more
 # Another sign must explain the last samples better by _BETTER, in squares of standard deviations,
 # and leave less than _EXPLAINED, or than the part _PART of what the present sign leaves.
@@ -229,7 +232,7 @@ class Belief(NamedTuple):
         is_blind: whether the brake does not believe the sensor.
         k: samples so far.
         num_braked: samples since the trip; 0 before it.
-        num_quiet: samples of rest since; -1 where the brake seems to push.
+        num_quiet: samples of rest since; -1 where the brake seems to push, or takes too long.
     """
 
     mean: AnyArray
@@ -260,7 +263,7 @@ class Belief(NamedTuple):
 
     @property
     def is_over(self) -> AnyArray:
-        """Whether the brake ends: at rest, or because it pushes or takes too long."""
+        """Whether the brake ends."""
         return self.is_at_rest | (self.num_quiet < 0) | (self.num_braked >= LONGEST_BRAKE)
 
 
@@ -332,7 +335,8 @@ def observed(
     reach = _QUIET * (xp.asarray(rules.upper) - xp.asarray(rules.lower)) / 2
     is_quiet = (size < _QUIET).all() & (abs(belief.inputs[-1] - rules.rest) < reach).all()
     num_quiet = xp.where(is_quiet, belief.num_quiet + 1, 0)
-    num_quiet = xp.where((size > _LOST).any(), -1, num_quiet)
+    gives_up = (size > _LOST).any() | (belief.num_braked >= _LONGEST) & ~xp.asarray(is_asked)
+    num_quiet = xp.where(gives_up & ~belief.is_at_rest, -1, num_quiet)
     num_quiet = xp.where(belief.is_over, belief.num_quiet, num_quiet)
     return belief._replace(
         mean=mean,
