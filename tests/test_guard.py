@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import json
+from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
@@ -150,6 +151,13 @@ RULES = Supervision.of(PLANT.description)
 def guarding() -> GuardFilter:
     ranges = {"delay_voltage": (0, 0.05), "initial_state": "2%"}
     return guard_for(PLANT, CHIRP, 0.3, ranges, num_steps=STEPS, num_runs=100)
+
+
+def of_guard(facts: Mapping[str, object]) -> dict:
+    """What the guard did, of the facts of a player."""
+    found = facts["guard"]
+    assert isinstance(found, dict)
+    return found
 
 
 def played(guarding: GuardFilter, faults=None, **effects):
@@ -313,8 +321,7 @@ def test_numpy_and_jax_come_to_the_same_belief(guarding):
         player.applied(told)
         belief = moved(belief, jnp.asarray(told))
     assert int(belief.num_braked) > 0
-    facts = player.facts()["guard"]
-    assert isinstance(facts, dict)
+    facts = of_guard(player.facts())
     assert facts["tripped_at"] == int(belief.tripped_at)
 
 
@@ -351,14 +358,13 @@ def test_run_plays_behind_the_guard_and_records_what_it_did(guarded_file, tmp_pa
     played, num_more = good.record.inputs[:30], good.outcome.num_samples - 30
     assert np.abs(played[-1]) > 1
     assert 5 <= num_more <= guard.LONGEST_BRAKE
-    assert good.outcome.player["guard"]["num_braked"] == num_more
+    assert of_guard(good.outcome.player)["num_braked"] == num_more
     assert np.abs(good.record.outputs[-1]) < 0.25 * RULES.critical
     bad = ex.run(policy=guarded_file, plant="aero2", guard=True, fast=True, spread=0.2,
                  fault={"gain_voltage": -1.0}, out=tmp_path / "bad.csv")  # fmt: skip
     assert bad.outcome.trip == Trip.UNEXPLAINED
     assert "no plant of the declared uncertainty" in bad.outcome.reason
-    facts = bad.outcome.player["guard"]
-    assert isinstance(facts, dict)
+    facts = of_guard(bad.outcome.player)
     assert facts["tripped_at"] < 10
     assert np.abs(bad.record.outputs).max() < np.deg2rad(40)
 
@@ -370,7 +376,7 @@ def test_a_plant_that_does_not_come_to_rest_after_the_experiment_is_told():
         player.applied(player(k, np.array([0.4])))
     assert player.is_over
     assert not player.is_at_rest
-    assert player.facts()["guard"]["tripped_at"] == 3
+    assert of_guard(player.facts())["tripped_at"] == 3
 
 
 @pytest.mark.science
@@ -379,7 +385,7 @@ def test_a_sign_that_flips_while_the_experiment_ends_is_told(guarded_file, tmp_p
                  fault={"actuator_sign": 3.05}, out=tmp_path / "ends.csv")  # fmt: skip
     assert run.outcome.num_samples > 30
     assert run.outcome.trip == Trip.UNEXPLAINED
-    assert run.outcome.player["guard"]["tripped_at"] == 30
+    assert of_guard(run.outcome.player)["tripped_at"] == 30
     assert "tripped at sample 30" in str(run)
 
 
@@ -390,7 +396,7 @@ def test_equal_readings_do_not_end_a_whole_experiment_blind():
         player.applied(player(k, np.array([1e-3])))
     assert player.is_at_rest
     assert not player.is_over
-    assert not player.facts()["guard"]["sensor_frozen"]
+    assert not of_guard(player.facts())["sensor_frozen"]
 
 
 @pytest.mark.science
