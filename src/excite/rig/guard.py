@@ -266,6 +266,12 @@ class Belief(NamedTuple):
         """Whether the brake ends."""
         return self.is_at_rest | (self.num_quiet < 0) | (self.num_braked >= LONGEST_BRAKE)
 
+    def is_unexplained(self, num_steps: int) -> AnyArray:
+        """Whether it braked before the last of so many samples, or not as declared plants brake."""
+        has_tripped = (self.num_braked > 0) & (self.tripped_at < num_steps)
+        has_failed = self.is_over & ~self.is_at_rest
+        return has_tripped | has_failed | (self.sign != 1) | self.is_blind
+
 
 def start(xp: ModuleType, rules: GuardRules) -> Belief:
     """Before the first measurement."""
@@ -336,7 +342,7 @@ def observed(
     is_quiet = (size < _QUIET).all() & (abs(belief.inputs[-1] - rules.rest) < reach).all()
     num_quiet = xp.where(is_quiet, belief.num_quiet + 1, 0)
     gives_up = (size > _LOST).any() | (belief.num_braked >= _LONGEST) & ~xp.asarray(is_asked)
-    num_quiet = xp.where(gives_up & ~belief.is_at_rest, -1, num_quiet)
+    num_quiet = xp.where(gives_up, -1, num_quiet)
     num_quiet = xp.where(belief.is_over, belief.num_quiet, num_quiet)
     return belief._replace(
         mean=mean,
@@ -530,13 +536,12 @@ class GuardedPlayer(AbstractPlayer):
     def __call__(self, k: int, measured: np.ndarray) -> np.ndarray:
         """The player's input, or that of the brake."""
         with np.errstate(all="ignore"):  # what is not finite trips
-            measured, rules = np.asarray(measured), self._rules
-            is_asked = k >= self.num_steps
-            belief = observed(np, rules, self._model, self._belief, measured, is_asked)
+            measured, rules, model = np.asarray(measured), self._rules, self._model
+            belief = observed(np, rules, model, self._belief, measured, k >= self.num_steps)
             self._reaches_level |= bool((abs(measured[rules.watched]) >= rules.critical).any())
             self._belief = belief
-            proposed = self._rules.rest if belief.num_braked > 0 else self._player(k, measured)
-            return np.array(decided(np, self._rules, self._model, belief, proposed))
+            proposed = rules.rest if belief.num_braked > 0 else self._player(k, measured)
+            return np.array(decided(np, rules, model, belief, proposed))
 
     @property
     def is_over(self) -> bool:
@@ -550,12 +555,8 @@ class GuardedPlayer(AbstractPlayer):
 
     @property
     def _is_unexplained(self) -> bool:
-        """Whether it braked before the last sample, or could not brake as declared plants can."""
-        belief = self._belief
-        if belief.tripped_at < min(belief.k, self.num_steps):
-            return True
-        has_failed = bool(belief.is_over and not belief.is_at_rest)
-        return has_failed or self._reaches_level or bool(belief.sign != 1 or belief.is_blind)
+        """Whether a declared plant would have ended the experiment in another way."""
+        return self._reaches_level or bool(self._belief.is_unexplained(self.num_steps))
 
     def applied(self, input: np.ndarray) -> None:
         """Passes the applied input to the player, and moves the belief to the next sample."""

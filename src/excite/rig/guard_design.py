@@ -365,8 +365,7 @@ class GuardFilter(AbstractFilter):
 
     def is_over(self, memory: Belief) -> Bool[Array, ""]:
         """Whether the brake has ended, and not as after a whole experiment of a declared plant."""
-        is_planned = (memory.tripped_at >= self.num_steps) & memory.is_at_rest
-        return memory.is_over & ~(is_planned & (memory.sign == 1) & ~memory.is_blind)
+        return memory.is_over & memory.is_unexplained(self.num_steps)
 
     def supervision(self, rules: Supervision) -> Supervision:
         """A supervisor's rules beside this guard, which notices a frozen sensor and brakes."""
