@@ -51,10 +51,12 @@ class Block:
         for start, _ in pairs:
             assert any(command.startswith(start) for command in self.commands), start
         commands = [command.partition(" #")[0].strip() for command in self.commands]
-        return [
-            command + "".join(more for start, more in pairs if command.startswith(start))
-            for command in commands
-        ]
+        played = list[str]()
+        for command in commands:
+            more = "".join(more for start, more in pairs if command.startswith(start))
+            options, otherwise, code = command.partition(" || ")
+            played.append(options + more + otherwise + code)
+        return played
 
 
 def name(page: Path) -> str:
