@@ -83,7 +83,8 @@ from .options import (
 @click.option(
     "--guard",
     is_flag=True,
-    help="Make a guard for rigs, too, in the file of --certify: see excite run --guard.",
+    help="Make a guard for rigs, too, in the file of --certify (see excite run --guard), from "
+    "500 more experiments or a twentieth of the budget.",
 )
 @click.option("--overwrite", is_flag=True, help="Replace these files if they exist.")
 @plot_option

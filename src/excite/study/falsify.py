@@ -306,7 +306,8 @@ def falsify(
         rig: whether experiments are made on the plant's simulated rig, with its latency, readings
             between the samples and supervisor.
         filter: whether they are made there behind the predictive safety filter.
-        guard: makes a guard of the policy for rigs, too, see `excite.rig.guard`.
+        guard: makes a guard of the policy for rigs, too, see `excite.rig.guard`. It is calibrated
+            with 500 more experiments, or with a twentieth of the budget where that is more.
         progress: called with a text, how much is done, and the total.
 
     Raises:
@@ -385,8 +386,9 @@ def falsify(
     made = None
     if guard:
         made = guard_for(
-            chosen, found, reach, ranges, num_steps=num_steps, seed=seed, progress=progress
-        ).guard()
+            chosen, found, reach, ranges, num_steps=num_steps, num_runs=max(500, budget // 20),
+            seed=seed, progress=progress,
+        ).guard()  # fmt: skip
     record, largest, values, tuned = replayed(result.worst)
     noise_record, noise_largest, noise_values, _ = replayed(with_noise)
     return Falsification(
