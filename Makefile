@@ -4,7 +4,9 @@ BIN := .venv/bin
 # Modules are compiled when they are first imported: of most packages few are.
 INSTALL := $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check --constraint constraints.txt
 
-PYTEST := $(BIN)/python -m pytest -n 2
+# A process a core, but two at least and four at most: each needs up to 2 GB.
+PROCESSES := $(shell n=$$(nproc 2>/dev/null || echo 2); echo $$((n < 2 ? 2 : n > 4 ? 4 : n)))
+PYTEST := $(BIN)/python -m pytest -n $(PROCESSES)
 # Thousands of small programs are compiled in the tests and run once: compiling is most of their time.
 # What `optimised` of tests/compiled.py decorates computes for longer. The flags are of the jaxlib in constraints.txt: without
 # optimisation, its gradients of trainings are NaN where additions and multiplications are fused. AVX does not fuse.
@@ -35,9 +37,9 @@ units: .venv/dev ## unit and command-line tests
 test-slow: .venv/dev ## the unit and command-line tests that take more than about three seconds
 	$(QUICK) $(PYTEST) --dist loadfile -m 'slow and not science'
 
-# A test of the page waits for a browser and a server most of its time: three processes keep two cores busy.
+# A test of the page waits for a browser and a server most of its time: one process more keeps the cores busy.
 test-pages: .venv/dev ## commands of the documentation, and the bench page in a browser
-	$(QUICK) $(PYTEST) -n 3 --dist worksteal tests/pages
+	$(QUICK) $(PYTEST) -n $$(($(PROCESSES) + 1)) --dist worksteal tests/pages
 
 test-science: .venv/dev ## promises of the shipped policies, baselines, trainings from end to end
 	$(QUICK) $(PYTEST) --dist worksteal -m science

@@ -60,6 +60,11 @@ def hang(marker: str) -> None:
     time.sleep(300)
 
 
+def process() -> int:
+    """Its number."""
+    return os.getpid()
+
+
 def environment() -> dict[str, Any]:
     """What this process was told before anything was imported, and what is imported."""
     names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NPROC")

@@ -474,7 +474,10 @@ def test_a_start_that_fails_leaves_no_folder(tmp_path):
 def test_a_study_whose_tasks_all_fail_leaves_no_folder(tmp_path, monkeypatch):
     study = tiny(agents={"a": {"method": "gradient"}})
     error = ValueError("no memory")
-    failing = lambda _, tasks, *__, **___: dict.fromkeys(tasks, error)  # noqa: E731
+
+    def failing(stages, *_: object, **__: object) -> dict[str, ValueError]:
+        return {name: error for _, tasks in stages for name in tasks}
+
     monkeypatch.setattr("excite.study.run.run", failing)
     with pytest.raises(ValueError, match=r"no memory\); nothing is finished$"):
         run_study(study, tmp_path / "run", workers=1)

@@ -56,7 +56,8 @@ def work(
         assert name not in results
         results[name] = result
 
-    failures = engine.run(function, tasks, where, on_done=on_done, **options)
+    stages = [(function, tasks)]
+    failures = engine.run(stages, where, len(tasks), on_done=on_done, **options)
     return results, sentences(failures)
 
 
@@ -161,6 +162,20 @@ def test_results_arrive_and_what_fails_is_tried_again(tmp_path):
     }
 
 
+def test_a_stage_follows_the_one_before_in_the_same_worker():
+    results = {}
+
+    def stages() -> Iterator[engine.Stage]:
+        yield functions.process, {"first": {}}
+        assert list(results) == ["first"]
+        yield functions.add, {}
+        yield functions.process, {"second": {}, "third": {}}
+
+    assert engine.run(stages(), engine.local_engine(1), 2, on_done=results.__setitem__) == {}
+    assert list(results) == ["first", "second", "third"]
+    assert len(set(results.values())) == 1
+
+
 def test_workers_that_die_take_nobody_along(tmp_path):
     tasks: dict[str, Any] = {"always": {"function": "die"}}
     tasks["once"] = {"function": "die", "marker": str(tmp_path / "died"), "a": 1, "b": 2}
@@ -238,7 +253,7 @@ def test_an_error_of_on_done_ends_the_workers_and_is_told(tmp_path):
     tasks: dict[str, Any] = {"hang": {"function": "hang", "marker": str(marker)}}
     tasks["sum"] = {"function": "add", "a": 1, "b": 1}
     with pytest.raises(OSError, match="disk full"):
-        engine.run(functions.any_of_them, tasks, engine.local_engine(2), on_done=on_done)
+        engine.run([(functions.any_of_them, tasks)], engine.local_engine(2), 2, on_done=on_done)
     assert wait_for(lambda: not is_alive(int(marker.read_text())))
 
 
@@ -247,7 +262,7 @@ def test_a_killed_driver_leaves_no_worker(tmp_path):
     tasks = {m.name: {"marker": str(m)} for m in markers}
     code = (
         "import tasks\nfrom excite.study import engine\n"
-        f"engine.run(tasks.hang, {tasks}, engine.local_engine(2), on_done=print)"
+        f"engine.run([(tasks.hang, {tasks})], engine.local_engine(2), 2, on_done=print)"
     )
     driver = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL)
     try:
@@ -287,7 +302,8 @@ def test_a_cluster_that_loses_a_worker_gives_what_the_local_engine_gives(cluster
             cluster.kill(1)
 
     where = dask.dask_engine(cluster.address)
-    failures = sentences(engine.run(functions.any_of_them, tasks, where, on_done=on_done))
+    failures = engine.run([(functions.any_of_them, tasks)], where, len(tasks), on_done=on_done)
+    failures = sentences(failures)
     for kind in ("os", "two", "value"):
         (tmp_path / kind).unlink()
     assert (results, failures) == work(functions.any_of_them, tasks, engine.local_engine(2))
@@ -328,8 +344,9 @@ def test_ctrl_c_calls_back_what_waits_on_a_cluster_and_a_lost_one_is_told(
     assert num_calls < 40
 
     monkeypatch.setattr(dask, "CONNECT_TIMEOUT", 1.0)
+    stages = [(functions.add, {f"{i}": task for i in range(40)})]
     with pytest.raises(ValueError, match="no Dask scheduler answers"):
-        engine.run(functions.add, {f"{i}": task for i in range(40)}, where, on_done=lose)
+        engine.run(stages, where, 40, on_done=lose)
 
 
 def test_a_cluster_without_workers_is_waited_for_and_that_is_told(tmp_path):
@@ -354,7 +371,7 @@ def test_a_scheduler_that_does_not_answer_is_one_sentence(is_silent):
     code = (
         "import sys\nfrom excite.study import cluster, engine\ncluster.CONNECT_TIMEOUT = 1.0\n"
         "try:\n    where = cluster.dask_engine(sys.argv[1])\n"
-        "    engine.run(print, {'t': {}}, where, on_done=print)\n"
+        "    engine.run([(print, {'t': {}})], where, 1, on_done=print)\n"
         "except ValueError as error:\n    print(error)"
     )
     with socket.create_server(("127.0.0.1", 0)) as server:

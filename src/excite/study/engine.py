@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from functools import partial
 from pathlib import Path
@@ -87,24 +87,31 @@ class _Local:
         self._pool.close()
 
 
+Stage = tuple[Callable[..., object], Mapping[str, Mapping[str, object]]]
+"""A function of a module, which the workers import, and its tasks: keyword arguments by name."""
+
+
 def run(
-    function: Callable[..., object],
-    tasks: Mapping[str, Mapping[str, object]],
+    stages: Iterable[Stage],
     engine: Engine,
+    num_together: int,
     *,
     on_done: Callable[[str, object], object],
     on_tick: Callable[[], object] = lambda: None,
     num_tries: int = 3,
 ) -> dict[str, Exception]:
-    """Calls a function for each task with its arguments, and passes each result to `on_done`.
+    """Calls a stage's function for each of its tasks, and passes each result to `on_done`.
 
-    A task whose worker dies, or that raises, is tried again later, except for a ValueError,
-    which is a mistake of the user. If this function ends by an exception, for example one of
-    `on_done` or `on_tick`, none of its tasks continues on this computer.
+    A stage is taken when those before it have ended. Its tasks run in the same workers: one takes
+    seconds to start, and keeps what it has compiled. A task whose worker dies, or that raises, is
+    tried again later, except for a ValueError, which is a mistake of the user. If this function
+    ends by an exception, for example one of `on_done` or `on_tick`, none of its tasks continues on
+    this computer.
 
     Args:
-        function: of a module, which the workers import.
-        tasks: keyword arguments by the name of the task: JSON-ready data or bytes.
+        stages: arguments are JSON-ready data or bytes; a name stands for one task of all.
+        engine: opened where there is a task.
+        num_together: tasks of the largest stage.
         on_done: called with the name of a task and its result, in the order of completion.
         on_tick: called about once a second.
         num_tries: how often a task is tried in all.
@@ -115,16 +122,18 @@ def run(
     Raises:
         ValueError: where the engine cannot be opened.
     """
-    work = _Work(f"{function.__module__}:{function.__qualname__}", tasks, engine, num_tries)
+    work = _Work(engine, num_together, num_tries)
     next_tick = time.monotonic() + TICK
     try:
-        while work.queue or work.running:
-            work.submit()
-            for name, result in work.finished(max(0.0, next_tick - time.monotonic())):
-                on_done(name, result)
-            if time.monotonic() >= next_tick:
-                on_tick()
-                next_tick = time.monotonic() + TICK
+        for function, tasks in stages:
+            work.add(f"{function.__module__}:{function.__qualname__}", tasks)
+            while work.queue or work.running:
+                work.submit()
+                for name, result in work.finished(max(0.0, next_tick - time.monotonic())):
+                    on_done(name, result)
+                if time.monotonic() >= next_tick:
+                    on_tick()
+                    next_tick = time.monotonic() + TICK
         work.close(is_done=True)
     except BaseException:
         work.close(is_done=False)
@@ -135,18 +144,18 @@ def run(
 class _Work:
     """The unfinished tasks, and the errors of failed ones."""
 
-    def __init__(
-        self,
-        target: str,
-        tasks: Mapping[str, Mapping[str, object]],
-        engine: Engine,
-        num_tries: int,
-    ) -> None:
-        self.queue, self.running = deque(tasks), dict[Future[Ending], str]()
+    def __init__(self, engine: Engine, num_together: int, num_tries: int) -> None:
+        self.queue, self.running = deque[str](), dict[Future[Ending], str]()
         self.failures: dict[str, Exception] = {}
-        self._target, self._tasks, self._engine = target, tasks, engine
-        self._num_tries, self._tries, self._deaths = num_tries, Counter[str](), Counter[str]()
+        self._calls: dict[str, tuple[str, Mapping[str, object]]] = {}
+        self._engine, self._num_together, self._num_tries = engine, num_together, num_tries
+        self._tries, self._deaths = Counter[str](), Counter[str]()
         self._executor: Executor | None = None
+
+    def add(self, target: str, tasks: Mapping[str, Mapping[str, object]]) -> None:
+        """More tasks, of this function."""
+        self.queue.extend(tasks)
+        self._calls |= {name: (target, arguments) for name, arguments in tasks.items()}
 
     def submit(self) -> None:
         """Submits tasks up to the capacity."""
@@ -155,11 +164,11 @@ class _Work:
         if not self.queue:
             return
         if self._executor is None:
-            self._executor = self._engine(len(self.queue))
+            self._executor = self._engine(self._num_together)
         num_free = self._executor.num_slots() - len(self.running)
         for _ in range(min(num_free, len(self.queue))):
             name = self.queue.popleft()
-            self.running[self._executor.submit(self._target, self._tasks[name])] = name
+            self.running[self._executor.submit(*self._calls[name])] = name
 
     def finished(self, seconds: float) -> Iterator[tuple[str, object]]:
         """Names and results of finished tasks, after the first one or the timeout."""

@@ -15,6 +15,7 @@ import json
 import os
 import shutil
 import warnings
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -44,7 +45,7 @@ from ..report.study_figures import agents_figure, curves_figure
 from ..report.study_table import StudyTable, differences_csv
 from .catalogue import study_path
 from .cluster import dask_engine
-from .engine import Engine, local_engine, run
+from .engine import Engine, Stage, local_engine, run
 from .example_episodes import episodes_data, example_episodes
 from .folder import advice, agent_settings, fingerprint, read_json, seed_folder, study_of
 from .methods import compared, method_rows
@@ -434,12 +435,16 @@ def run_tasks(
             text = next((text for _, text in reversed(live.values()) if text), "")
             progress(text, int(1000 * done), 1000 * len(targets))
 
-        failures = {}
-        for kind, function in _TASKS.items():
-            chosen = {n: t for n, t in tasks.items() if targets[n][0] == kind}
-            if kind == "safety":
-                chosen = _with_policies(chosen, targets, folder)
-            failures |= run(function, chosen, engine, on_done=finished, on_tick=tick)
+        def stages() -> Iterator[Stage]:
+            for kind, function in _TASKS.items():
+                chosen = {n: t for n, t in tasks.items() if targets[n][0] == kind}
+                if kind == "safety":
+                    chosen = _with_policies(chosen, targets, folder)
+                yield function, chosen
+
+        kinds = Counter(targets[name][0] for name in tasks)
+        most = max(kinds.values(), default=0)
+        failures = run(stages(), engine, most, on_done=finished, on_tick=tick)
         if failures and is_new and holds_only(folder, _NO_RESULTS):
             shutil.rmtree(folder, ignore_errors=True)  # nothing is finished
         return failures
