@@ -14,8 +14,8 @@ QUICK := JAX_DISABLE_MOST_OPTIMIZATIONS=1 XLA_FLAGS="--xla_cpu_use_fusion_emitte
     --xla_cpu_parallel_codegen_split_count=1"
 
 # Without byte code each of hundreds of processes compiles thousands of files first: eight seconds of eleven.
-export PYTHONDONTWRITEBYTECODE :=
-export PYTHONPYCACHEPREFIX := $(CURDIR)/.venv/bytecode
+units test-slow test-pages test-science check-results coverage: export PYTHONDONTWRITEBYTECODE :=
+units test-slow test-pages test-science check-results coverage: export PYTHONPYCACHEPREFIX := $(CURDIR)/.venv/bytecode
 
 .PHONY: help demo test units test-slow test-pages test-science test-all check-results coverage lint types docs results \
     agents policies certificates evaluations clean

@@ -1012,6 +1012,7 @@ def test_plant_excitation_and_estimator_of_ones_own_work_from_a_file_to_the_next
 
 def test_a_plant_file_leaves_no_compiled_code(run, here, monkeypatch):
     monkeypatch.setattr(sys, "dont_write_bytecode", False)
+    monkeypatch.setattr(sys, "pycache_prefix", None)  # beside the file
     before = contents(here)
     assert run("information", "own.py:Tank", "--excitation", "chirp").code == 0
     assert contents(here) == before

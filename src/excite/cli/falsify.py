@@ -84,7 +84,7 @@ from .options import (
     "--guard",
     is_flag=True,
     help="Make a guard for rigs, too, in the file of --certify (see excite run --guard), from "
-    "500 more experiments or a twentieth of the budget.",
+    "500 more experiments, or a twentieth of the budget where that is more.",
 )
 @click.option("--overwrite", is_flag=True, help="Replace these files if they exist.")
 @plot_option

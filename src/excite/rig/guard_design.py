@@ -267,7 +267,7 @@ def guard_for(
     box = Uncertainty.of(plant, spread, ranges)
     model = GuardModel.for_rig(plant, spread, ranges)
     keys = jax.random.split(jax.random.key(seed), num_runs)
-    cases = Cases(jax.vmap(box.draw)(keys), jnp.arange(num_runs) + seed * num_runs)
+    cases = Cases(jax.vmap(box.draw)(keys), jnp.arange(num_runs) + seed * num_runs % 2**62)
     stops = jax.random.randint(jax.random.key(seed), (num_runs,), 1, num_steps + 1)
 
     def played(function: Callable[..., Array], rules: GuardRules, *series: Array) -> np.ndarray:

@@ -102,16 +102,15 @@ def run(
 ) -> dict[str, Exception]:
     """Calls a stage's function for each of its tasks, and passes each result to `on_done`.
 
-    A stage is taken when those before it have ended. Its tasks run in the same workers: one takes
-    seconds to start, and keeps what it has compiled. A task whose worker dies, or that raises, is
-    tried again later, except for a ValueError, which is a mistake of the user. If this function
-    ends by an exception, for example one of `on_done` or `on_tick`, none of its tasks continues on
-    this computer.
+    A stage is taken when those before it have ended. Its tasks run in the same workers, because a
+    worker takes seconds to start. A task whose worker dies, or that raises, is tried again later,
+    except for a ValueError, which is a mistake of the user. If this function ends by an exception,
+    for example one of `on_done` or `on_tick`, none of its tasks continues on this computer.
 
     Args:
-        stages: arguments are JSON-ready data or bytes; a name stands for one task of all.
-        engine: opened where there is a task.
-        num_together: tasks of the largest stage.
+        stages: arguments are JSON-ready data or bytes; names are unique over all stages.
+        engine: opened at the first task.
+        num_together: largest number of tasks in a stage, for which the engine is opened.
         on_done: called with the name of a task and its result, in the order of completion.
         on_tick: called about once a second.
         num_tries: how often a task is tried in all.
