@@ -18,7 +18,7 @@ from excite.plant import Aero2, DCMotor
 from excite.plant.catalogue import plant_named
 from excite.plant.uncertainty import Uncertainty
 from excite.policy import Layout
-from excite.rig import guard
+from excite.rig import guard, guard_design
 from excite.rig.faults import Faults
 from excite.rig.filter import linear_model
 from excite.rig.guard import Guard, GuardedPlayer
@@ -151,6 +151,13 @@ RULES = Supervision.of(PLANT.description)
 def guarding() -> GuardFilter:
     ranges = {"delay_voltage": (0, 0.05), "initial_state": "2%"}
     return guard_for(PLANT, CHIRP, 0.3, ranges, num_steps=STEPS, num_runs=100)
+
+
+@pytest.mark.slow
+def test_a_brake_that_lets_declared_plants_pass_a_level_is_told(monkeypatch):
+    monkeypatch.setattr(guard_design, "_stopped", lambda play, cases, stops: 1 + stops / 100)
+    with pytest.warns(UserWarning, match=r"of 3 that it stopped .* reached 1\.\d\d of its level$"):
+        guard_for(PLANT, CHIRP, 0.3, {}, num_steps=5, num_runs=3)
 
 
 def of_guard(facts: Mapping[str, object]) -> dict:

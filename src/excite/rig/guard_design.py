@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import warnings
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
@@ -288,6 +289,12 @@ def guard_for(
             chosen, best = rules, largest
         if largest < _SAFE:
             break
+    if not best < 1:
+        warnings.warn(
+            "the guard's brake does not keep all declared plants below their critical levels: of "
+            f"{num_runs} that it stopped at a random sample, one reached {best:.2f} of its level",
+            stacklevel=2,
+        )
     top = np.nanmax(played(_scores, chosen), axis=0)
     progress("calibrating the guard", num_runs, num_runs)
     thresholds = np.append(_MARGIN * top[:2], top[2] + _MARGIN_OUTSIDE)
