@@ -302,8 +302,8 @@ def test_a_cluster_that_loses_a_worker_gives_what_the_local_engine_gives(cluster
             cluster.kill(1)
 
     where = dask.dask_engine(cluster.address)
-    failures = engine.run([(functions.any_of_them, tasks)], where, len(tasks), on_done=on_done)
-    failures = sentences(failures)
+    stages = [(functions.any_of_them, tasks)]
+    failures = sentences(engine.run(stages, where, len(tasks), on_done=on_done))
     for kind in ("os", "two", "value"):
         (tmp_path / kind).unlink()
     assert (results, failures) == work(functions.any_of_them, tasks, engine.local_engine(2))

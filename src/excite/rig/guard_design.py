@@ -241,8 +241,8 @@ def guard_for(
     spread: SpreadLike,
     ranges: Mapping[str, Range],
     *,
-    num_steps: int = 500,
-    num_runs: int = 500,
+    num_steps: int,
+    num_runs: int,
     seed: int = 0,
     progress: Callable[[str, int, int], None] = lambda *_: None,
 ) -> GuardFilter:
