@@ -474,6 +474,15 @@ def test_a_function_of_the_library_shows_a_line_every_ten_seconds(monkeypatch, c
     assert capsys.readouterr().err == ""
 
 
+@pytest.mark.parametrize("text", ["ten", "-1", "inf", "nan"])
+def test_seconds_between_lines_that_are_no_number_are_refused(monkeypatch, text):
+    monkeypatch.setenv("EXCITE_PROGRESS", text)
+    with pytest.raises(ValueError, match=f"EXCITE_PROGRESS must be .* got '{text}'"):
+        Lines("designing")
+    monkeypatch.setenv("EXCITE_PROGRESS", "")  # as if it were not there
+    assert Lines("designing").line().startswith("designing")
+
+
 # Plants, doctor
 
 

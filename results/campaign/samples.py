@@ -1,8 +1,11 @@
 """How many samples a campaign needs, and whether it is safe, on plants of a wide spread.
 
     python results/campaign/samples.py aero2-wide --out results/campaign/aero2.json
+    python results/campaign/samples.py results/campaign/policies/aero2-wide-robust.safetensors \
+        --plants 1000 --uncertain --out results/campaign/aero2_uncertain.json
 
-Of every plant the policy's experiments are simulated, from rest and with fresh noise. A target is
+With --uncertain the plants are drawn from all that the training of the policy declared (lag,
+delay, stiffness, initial state, ...), which is then known to the bound. Of every plant the policy's experiments are simulated, from rest and with fresh noise. A target is
 reached at the first sample at which the relative standard error of every parameter (Cramér-Rao
 bound at the true parameters) is below it. The experiment ends there, or at the next sample from
 which the free motion under the input that ends it stays below 0.97 of the critical level. A second
@@ -25,8 +28,8 @@ from excite.environment.falsification import nearness
 from excite.excitation import PolicyExcitation
 from excite.files import write_json
 from excite.information import running_information
-from excite.plant import draw_params
 from excite.plant.catalogue import plant_from, with_sensor
+from excite.plant.uncertainty import Uncertainty
 from excite.safety import safe_input
 from excite.simulation import response, run_episode
 
@@ -34,10 +37,10 @@ SAFE, ROUNDS = 0.97, 3
 
 
 @eqx.filter_jit
-def played(plant, excitation, num_steps, spread, coast, key):
+def played(box, excitation, num_steps, coast, key):
     """Of one plant: information after every sample, nearness of every round and of every end."""
     params_key, *keys = jax.random.split(key, ROUNDS + 1)
-    params = draw_params(plant, params_key, spread)
+    plant, params = box.at(box.draw(params_key))
     rest = jnp.asarray(safe_input(plant.definition))
     infos, sizes, after = [], [], []
     before = jnp.zeros((len(params), len(params)))
@@ -72,6 +75,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1000)
     parser.add_argument("--spread")
     parser.add_argument("--sd", type=float, help="noise of every output, in its unit")
+    parser.add_argument("--uncertain", action="store_true", help="as declared in its training")
     parser.add_argument("--targets", default="0.005,0.001")
     parser.add_argument("--out", type=Path)
     asked = parser.parse_args()
@@ -82,11 +86,11 @@ def main() -> None:
     spread = asked.spread or policy.provenance["spread"]
     steps, coast = policy.layout.num_steps, policy.provenance.get("coast") or 100
     excitation = PolicyExcitation.of(policy)
+    ranges = policy.provenance.get("uncertainty") or {} if asked.uncertain else {}
+    box = Uncertainty.of(plant, spread, ranges)
     keys = jax.random.split(jax.random.key(asked.seed), asked.plants)
     batch = eqx.filter_jit(
-        lambda keys: jax.vmap(lambda key: played(plant, excitation, steps, spread, coast, key))(
-            keys
-        )
+        lambda keys: jax.vmap(lambda key: played(box, excitation, steps, coast, key))(keys)
     )
     parts = [batch(keys[i : i + 50]) for i in range(0, asked.plants, 50)]
     infos, sizes, after = (np.concatenate([np.asarray(p[i]) for p in parts]) for i in range(3))
@@ -99,6 +103,7 @@ def main() -> None:
         "plant": plant.definition.name,
         "noise_sd": np.asarray(plant.sensor.noise_sd).tolist(),
         "spread": spread,
+        **({"uncertainty": ranges} if ranges else {}),
         "plants": asked.plants,
         "seed": asked.seed,
         "steps": steps,

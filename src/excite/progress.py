@@ -15,7 +15,14 @@ Progress: TypeAlias = Callable[[str, float, float], None]
 
 def seconds_between() -> float:
     """Between two lines [s]: EXCITE_PROGRESS, or ten; 0 means none."""
-    return float(os.environ.get("EXCITE_PROGRESS", "10"))
+    text = os.environ.get("EXCITE_PROGRESS") or "10"
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = math.nan
+    if not 0 <= seconds < 1e6:
+        raise ValueError(f"EXCITE_PROGRESS must be a number of seconds, not below 0: got {text!r}")
+    return seconds
 
 
 class Course:

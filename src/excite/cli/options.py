@@ -277,7 +277,7 @@ class Lines(Course):
     def __init__(self, what: str) -> None:
         """`what` the command does."""
         super().__init__(what)
-        self._end = threading.Event()
+        self._seconds, self._end = seconds_between(), threading.Event()
         self._teller = threading.Thread(target=self._tell, daemon=True)
 
     def __enter__(self) -> Self:
@@ -291,8 +291,7 @@ class Lines(Course):
         self._teller.join()
 
     def _tell(self) -> None:
-        seconds = seconds_between()
-        while seconds > 0 and not self._end.wait(seconds):
+        while self._seconds > 0 and not self._end.wait(self._seconds):
             click.echo(self.line(), err=True)
 
 
