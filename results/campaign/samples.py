@@ -4,12 +4,14 @@
     python results/campaign/samples.py results/campaign/policies/aero2-wide-robust.safetensors \
         --plants 1000 --uncertain --out results/campaign/aero2_uncertain.json
 
-With --uncertain the plants are drawn from all that the training of the policy declared (lag,
-delay, stiffness, initial state, ...), which is then known to the bound. Of every plant the policy's experiments are simulated, from rest and with fresh noise. A target is
+Of every plant the policy's experiments are simulated, from rest and with fresh noise. A target is
 reached at the first sample at which the relative standard error of every parameter (Cramér-Rao
 bound at the true parameters) is below it. The experiment ends there, or at the next sample from
 which the free motion under the input that ends it stays below 0.97 of the critical level. A second
 experiment follows where one is not enough.
+
+With --uncertain, what else the policy's training declared (delay, lag, stiffness, initial state)
+is drawn with every plant, too. The bound takes it as known.
 """
 
 from __future__ import annotations

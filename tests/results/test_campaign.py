@@ -31,6 +31,23 @@ def test_the_page_says_how_many_samples_are_needed_and_that_no_level_was_reached
         assert cells == [*shown, f"{own['missed']}/{found['plants']}"]
 
 
+def test_the_page_says_what_a_policy_does_whose_plants_also_have_delay_lag_and_another_stiffness():
+    found = json.loads((FOLDER / "aero2_uncertain.json").read_text())
+    policy = read_policy(ROOT / found["policy"])
+    assert found["policy_hash"] == policy.hash
+    assert found["uncertainty"] == policy.provenance["uncertainty"]
+    assert {"d_S", "delay_voltage", "lag_voltage"} < set(found["uncertainty"])
+    assert found["violations_of_whole_rounds"] == found["violations_after_whole_rounds"] == 0
+    assert [target["violations"] for target in found["targets"].values()] == [0, 0]
+    row = found["targets"]["0.005"]
+    largest = max(target["largest"] for target in found["targets"].values())
+    (told,) = re.findall(r"[^\n]*\n[^\n]*aero2_uncertain.json(?:.+\n)+", PAGE)
+    assert f"the largest output is {found['largest']:.3f} of it" in told.replace("\n", " ")
+    assert f"and {largest:.3f} after" in told.replace("\n", " ")
+    median = row["samples_until_known"]["median"]
+    assert f"a median of {median:.0f} samples, and {row['missed']} of the 1000" in told
+
+
 def test_the_page_says_how_often_the_true_rival_is_found_with_much_noise():
     found = json.loads((FOLDER / "structure_noisy.json").read_text())
     designed = found["designed"].values()
