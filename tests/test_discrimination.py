@@ -21,6 +21,7 @@ from excite.plant.catalogue import plant_from, plant_in_file, with_sensor
 from excite.plant.contract import with_nominal
 from excite.plant.uncertainty import Uncertainty
 from excite.simulation import response
+from excite.study import campaign_on_rig
 from excite.study.discrimination import rivals_from
 from excite.training.discrimination import discriminating, error_bound
 from excite.training.redesign import first_signals
@@ -356,5 +357,41 @@ def test_a_campaign_on_a_rig_is_resumed_with_the_same_decisions(tmp_path):
             "aero2", {"J_p": "1%"}, str(tmp_path / "truth.json"), coast=COAST, rounds=4,
             fast=True, out=tmp_path / "again",
         )  # fmt: skip
-    with pytest.raises(ValueError, match="guard and filter know one plant"):
-        ex.campaign("aero2", {"J_p": "1%"}, rivals=[LAG], guard=True, out=tmp_path / "none")
+
+
+@pytest.mark.parametrize("is_decided", [False, True])
+def test_rounds_that_tell_rivals_apart_are_played_without_guard_and_filter(
+    monkeypatch, tmp_path, is_decided
+):
+    asked = []
+
+    def played(rig, policy=None, **options):
+        asked.append(options)
+        raise InterruptedError
+
+    monkeypatch.setattr(campaign_on_rig, "run", played)
+    monkeypatch.setattr(ex.Campaign, "require_reachable", lambda self: None)
+    monkeypatch.setattr(ex.Campaign, "is_undecided", not is_decided)
+    monkeypatch.setattr(ex.Campaign, "ask", lambda self: self.opening)
+    monkeypatch.setattr(ex.Campaign, "monitor", lambda self, waits: None)
+    with pytest.raises(InterruptedError):
+        ex.campaign(
+            "aero2", {"J_p": "1%"}, rivals=[LAG], policy="aero2", guard=True, filter=True,
+            fast=True, out=tmp_path / "out",
+        )  # fmt: skip
+    (options,) = asked
+    assert options["guard"] == options["filter"] == is_decided
+
+
+def test_where_no_signal_is_redesigned_a_policy_is_not_played_on_another_plant():
+    campaign = ex.Campaign("aero2", {"J_p": "1%"}, rivals=[LAG], policy="aero2", redesign=False)
+    chosen = plant_from(LAG.partition(",")[0])
+    campaign.discrimination, campaign.plant = None, chosen
+    assert campaign.ask() is None
+    assert campaign.reason == "the policy is for aero2, not for aero2_lag"
+
+
+def test_a_guard_that_the_policy_does_not_have_is_refused_before_the_first_round(tmp_path):
+    with pytest.raises(ValueError, match="policy of the aero2_lag campaign has no guard"):
+        ex.campaign("aero2_lag", {"J_p": "1%"}, guard=True, out=tmp_path / "none")
+    assert not (tmp_path / "none").exists()

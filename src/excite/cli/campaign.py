@@ -87,7 +87,7 @@ from .options import (
     multiple=True,
     metavar="PLANT,NAME=LOW:HIGH",
     help="Another plant that may be the true one, as for excite discriminate; repeatable. Signals "
-    "tell them apart first. Not with --guard or --filter.",
+    "tell them apart first, in rounds without --guard and --filter.",
 )
 @click.option(
     "--pause",

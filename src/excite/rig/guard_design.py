@@ -32,7 +32,9 @@ from .guard import Belief, Guard, GuardRules, Model
 from .tracing import program_of
 
 _WATCHED = 30.0  # weight of the outputs with a level in the brake
-_GENTLE = (10.0, 1.0, 0.1)  # weights of its inputs
+# Weights of the states and of the inputs in the brakes that are tried. The last one lets a pole
+# swing while its cart is stopped.
+_BRAKES = ((1.0, 10.0), (1.0, 1.0), (1.0, 0.1), (0.1, 10.0))
 _SAFE = 0.99  # largest output over its level that a brake may leave
 _LATENCY = 0.2  # of a rig, at most, in samples
 _MARGIN, _MARGIN_OUTSIDE = 1.3, 0.15  # of the thresholds above the largest score
@@ -118,11 +120,11 @@ class GuardModel(eqx.Module):
         return step(plant, state, mean - half, params, next_input=mean + half)
 
 
-def rules_of(model: GuardModel, gentleness: float = 1.0) -> GuardRules:
+def rules_of(model: GuardModel, weights: tuple[float, float] = (1.0, 1.0)) -> GuardRules:
     """The rules for a model, with thresholds that nothing exceeds.
 
     Args:
-        gentleness: weight of the inputs in the brake.
+        weights: of the states and of the inputs in the brake.
 
     Raises:
         ValueError: for a plant that linear feedback cannot bring to rest.
@@ -139,7 +141,7 @@ def rules_of(model: GuardModel, gentleness: float = 1.0) -> GuardRules:
     spread = np.concatenate([np.maximum(start, 1e-9 * scale), np.ones(count)])
     walk = np.concatenate([_WALK * scale, np.full(count, _WALK)])
     watched, _, critical = watched_levels(d)
-    (feedback, past_feedback), rest = _brake(model, gentleness), np.asarray(safe_input(d), float)
+    (feedback, past_feedback), rest = _brake(model, *weights), np.asarray(safe_input(d), float)
     limits = plant.input_limits
     return GuardRules(
         mean=np.concatenate([np.asarray(plant.initial_state), np.zeros(count)]),
@@ -166,7 +168,7 @@ def _noise(plant: AbstractPlant) -> np.ndarray:
     return np.maximum(np.hypot(np.asarray(sensor.noise_sd), rounding), 1e-5 * scale)
 
 
-def _brake(model: GuardModel, gentleness: float) -> tuple[np.ndarray, np.ndarray]:
+def _brake(model: GuardModel, of_states: float, of_inputs: float) -> tuple[np.ndarray, np.ndarray]:
     """Linear-quadratic feedback that keeps the outputs with a critical level small.
 
     It is made for the largest delays and lags of the box: a plant that acts sooner is easier to
@@ -196,9 +198,9 @@ def _brake(model: GuardModel, gentleness: float) -> tuple[np.ndarray, np.ndarray
         entry[-num_inputs:] = np.eye(num_inputs)
     levels = np.zeros((len(watched), len(whole)))
     levels[:, :num_states] = C[np.array(watched, int)] / critical[:, None]
-    weights = np.concatenate([states**-2.0, np.tile(1e-6 * inputs**-2.0, num_past)])
+    weights = np.concatenate([of_states * states**-2.0, np.tile(1e-6 * inputs**-2.0, num_past)])
     Q = np.diag(weights) + _WATCHED * levels.T @ levels
-    R = gentleness * np.diag(inputs**-2.0)
+    R = of_inputs * np.diag(inputs**-2.0)
     try:
         P = scipy.linalg.solve_discrete_are(whole, entry, Q, R)
     except (np.linalg.LinAlgError, ValueError) as error:
@@ -249,8 +251,9 @@ def guard_for(
     """The guard of an excitation, with thresholds that declared plants do not reach.
 
     The excitation is played on simulated rigs with plants drawn from the declared uncertainty. A
-    threshold is the largest score of all these experiments, and some more. The brake is the
-    gentlest that keeps these plants safe after a trip at any time.
+    threshold is the largest score of all these experiments, and some more. The brake is the first
+    of several that keeps these plants safe after a trip at any time, or the one that comes nearest
+    to it.
 
     Args:
         plant: for which the excitation was made.
@@ -282,8 +285,8 @@ def guard_for(
 
     chosen = rules_of(model)
     best = np.inf
-    for gentleness in _GENTLE:  # what declared plants do after a trip at any time decides
-        rules = rules_of(model, gentleness)
+    for weights in _BRAKES:  # what declared plants do after a trip at any time decides
+        rules = rules_of(model, weights)
         largest = played(_stopped, rules, stops).max()
         if largest < best:
             chosen, best = rules, largest

@@ -307,8 +307,10 @@ class Campaign:
             self.next = self._next(self.result)
         chosen = None if self.next is None else self.next.chosen
         is_other = self.plant.description.hash != self.declared.description.hash
-        if self.next is not None and chosen is None and is_other:
-            self.reason = self.next.decision  # the opening may be unsafe on this plant
+        if chosen is None and is_other:  # the opening may be unsafe on this plant
+            made_for, chosen_plant = self.declared.description.name, self.plant.description.name
+            opening = f"the {self._opening_name} is for {made_for}, not for {chosen_plant}"
+            self.reason = opening if self.next is None else self.next.decision
             return None
         self.playing = self._opening_name if chosen is None else chosen.name
         return self.opening if chosen is None else chosen.excitation

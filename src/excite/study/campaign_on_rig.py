@@ -85,7 +85,8 @@ def campaign(
         seed: of a simulated rig's hidden parameters, noise and jitter.
         fault: of a simulated rig, as for `run`.
         filter: adds a predictive safety filter for parameters within the spread.
-        guard: ends a round that no declared plant explains, as for `run`.
+        guard: ends a round that no declared plant explains, as for `run`. Guard and filter know
+            one plant: rounds that tell rivals apart are played without them.
         pause: before every round but the first, so that the plant comes to rest [s].
         command: stored in the folder, to repeat the campaign.
         progress: called with a text, how much is done, and the total.
@@ -104,8 +105,11 @@ def campaign(
     )  # fmt: skip
     if guard and made.policy is None:
         raise ValueError("a guard knows a policy: it does not go without one")
-    if rivals and (guard or filter):
-        raise ValueError("guard and filter know one plant: they do not go together with rivals")
+    if guard and made.policy is not None and made.policy.guard is None:
+        raise ValueError(
+            f"the policy of the {made.declared.description.name} campaign has no guard ('excite "
+            "falsify POLICY --guard --certify FILE' makes one)"
+        )
     require_whole("seed", seed, 0, LARGEST_SEED)
     if not 0 <= as_number("pause", pause) < 1e5:
         raise ValueError(f"pause must be a number of seconds, not below 0: got {pause!r}")
@@ -186,7 +190,8 @@ def _played(
     on_begin: Callable[[], None],
 ) -> tuple[RunResult, list[str]]:
     """One round on a rig, which ends as soon as enough is known, and signals that came."""
-    monitor = None if made.is_undecided else made.monitor(waits=not rig.is_real_time)
+    is_decided = not made.is_undecided
+    monitor = made.monitor(waits=not rig.is_real_time) if is_decided else None
     on_begin()
     with interruptible() as stop:
 
@@ -200,7 +205,8 @@ def _played(
                 excitation=asked if isinstance(asked, Replay) else None,
                 steps=len(asked.inputs) if isinstance(asked, Replay) else None,
                 out=path, overwrite=path.exists(),
-                filter=filter, guard=guard, spread=made.spread, on_sample=judge,
+                filter=filter and is_decided, guard=guard and is_decided, spread=made.spread,
+                on_sample=judge,
                 stop=stop, live_estimate=False,
             )  # fmt: skip
         finally:
