@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 from catalogue import FEW_AND_ALL, LONG, PLANTS, TwoMasses
 
+import excite as ex
 from excite.description import Input, Output, Parameter, PlantDescription, State, names_of
 from excite.estimation import NLS, AbstractEstimator, Status, bound_reached, stack_experiments
 from excite.estimation.contract import from_search, to_search
 from excite.excitation import PRBS, Chirp, Multisine, Random
 from excite.information import cramer_rao_bound, experiment_information, relative_size
-from excite.plant import Aero2, Sensor
+from excite.plant import Aero2, Aero2Detailed, Sensor
 from excite.simulation import response, run_episode
 
 NUM_STEPS = 200
@@ -389,3 +390,18 @@ def test_many_fits_are_successful_at_the_bound_and_inside_their_intervals():
     # No bias, and 95 % intervals that hold 95 %: by their errors among 180 fits.
     assert np.all(np.abs(in_bounds.mean(axis=0)) < 5 / np.sqrt(180))
     assert abs(np.mean(np.abs(in_sd) < 1.96) - 0.95) < 3 * np.sqrt(0.95 * 0.05 / 180)
+
+
+STUCK = [(0.0342, 0.00998, 0.000847), (0.0332, 0.00884, 0.001175), (0.0348, 0.00805, 0.001079)]
+"""Of `aero2_detailed`: from the nominal values the search ends where the plant hardly moves."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("values", STUCK)
+def test_a_search_that_ends_far_from_the_data_begins_elsewhere(values):
+    plant = Aero2Detailed()
+    true = plant.Params(*values)
+    record = ex.simulate(plant, "aero2_detailed", params=true._asdict(), steps=300)
+    found = NLS()(plant, stack_experiments(plant, [record.inputs[:-1]], [record.outputs], True))
+    assert Status(int(found.status)) == Status.SUCCESSFUL
+    np.testing.assert_allclose(found.params, true, rtol=0.01)

@@ -41,6 +41,7 @@ from .prior import Prior
 
 FAR = 30.0  # largest logarithm of a positive parameter over its nominal value
 _POOR = 4.0  # mean square of the residual over the assumed noise, beyond which a search is repeated
+_LITTLE, _ASIDE = 0.02, 0.2  # part of the outputs' variation left, beyond which it begins elsewhere
 _ROUNDS, _SCALE_STEPS = 3, 20  # searches with the noise found by the one before; of its scale
 Noise = Literal["declared", "known", "estimated"]
 Likelihood = Literal["normal", "student"]
@@ -50,7 +51,8 @@ class NLS(AbstractSearch):
     """Output-error nonlinear least squares by multiple shooting.
 
     A search that leaves much more than the declared noise is repeated without the first phase of
-    multiple shooting; the better end counts.
+    multiple shooting, and where a fiftieth of the outputs' variation is left, from two other
+    starts; the best end counts.
 
     Attributes:
         tolerance: the search ends before a step that would change the estimate by less than
@@ -247,15 +249,25 @@ class NLS(AbstractSearch):
             prior = problem.prior_residual(found.point.z)
             return jnp.sum((found.residual / sd[None, None]) ** 2) + jnp.sum(prior**2)
 
-        def attempt(state: tuple[_Found, Point, Array]) -> tuple[_Found, Point, Array]:
-            best, point, tries = state
-            found = search(point, sd)
-            return where_tree(squares(found) < squares(best), found, best), begin, tries + 1
+        measured = jnp.where(experiments.valid, experiments.measured, jnp.nan) / sd[None, None]
+        variation = jnp.nansum((measured - jnp.nanmean(measured, axis=(0, 1))[None, None]) ** 2)
+        aside = jnp.resize(jnp.array([_ASIDE, -_ASIDE]), begin.z.shape)
+        sides = jnp.array([0.0, 0.0, 1.0, -1.0])
+
+        def attempt(state: tuple[_Found, Array]) -> tuple[_Found, Array]:
+            best, tries = state
+            start = begin._replace(z=begin.z + sides[tries] * aside)
+            matched = shooting().matched(start, sd)
+            found = search(where_tree(tries == 1, start, matched), sd)
+            return where_tree(squares(found) < squares(best), found, best), tries + 1
 
         # Where segments that fit and gaps that close have led astray: again, without their phase.
-        def goes_on(state: tuple[_Found, Point, Array]) -> Array:
-            best, _, tries = state
-            return (tries == 0) | ((tries == 1) & ~(squares(best) < _POOR * count))
+        def goes_on(state: tuple[_Found, Array]) -> Array:
+            best, tries = state
+            left = squares(best)
+            is_poor, is_lost = ~(left < _POOR * count), ~(left < _LITTLE * variation)
+            again = is_poor & ((tries == 1) | is_lost & (tries < len(sides)))
+            return (tries == 0) | again
 
         width = begin.starts.shape[2] + len(begin.z) + 1
         nothing = _Found(
@@ -266,8 +278,7 @@ class NLS(AbstractSearch):
             sd,
             jnp.asarray(0),
         )
-        matched = shooting().matched(begin, sd)
-        found, *_ = jax.lax.while_loop(goes_on, attempt, (nothing, matched, jnp.asarray(0)))
+        found, _ = jax.lax.while_loop(goes_on, attempt, (nothing, jnp.asarray(0)))
         if self.likelihood == "student" or (self.prior is not None and self.finds_noise):
             return jax.lax.fori_loop(0, _ROUNDS, lambda _, found: again(found), found)
         if self.noise == "estimated" and problem.num_outputs > 1:

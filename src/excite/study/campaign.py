@@ -307,10 +307,12 @@ class Campaign:
             self.next = self._next(self.result)
         chosen = None if self.next is None else self.next.chosen
         is_other = self.plant.description.hash != self.declared.description.hash
-        if chosen is None and is_other:  # the opening may be unsafe on this plant
-            made_for, chosen_plant = self.declared.description.name, self.plant.description.name
-            opening = f"the {self._opening_name} is for {made_for}, not for {chosen_plant}"
-            self.reason = opening if self.next is None else self.next.decision
+        if self.next is not None and chosen is None and is_other:
+            self.reason = self.next.decision  # the opening may be unsafe on this plant
+            return None
+        if is_other and not self.redesign:
+            made_for, own = self.declared.description.name, self.plant.description.name
+            self.reason = f"the {self._opening_name} is for {made_for}, not for {own}"
             return None
         self.playing = self._opening_name if chosen is None else chosen.name
         return self.opening if chosen is None else chosen.excitation
