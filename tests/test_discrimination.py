@@ -374,11 +374,13 @@ def test_rounds_that_tell_rivals_apart_are_played_without_guard_and_filter(
     monkeypatch.setattr(ex.Campaign, "is_undecided", not is_decided)
     monkeypatch.setattr(ex.Campaign, "ask", lambda self: self.opening)
     monkeypatch.setattr(ex.Campaign, "monitor", lambda self, waits: None)
+    told = []
     with pytest.raises(InterruptedError):
         ex.campaign(
             "aero2", {"J_p": "1%"}, rivals=[LAG], policy="aero2", guard=True, filter=True,
-            fast=True, out=tmp_path / "out",
+            fast=True, out=tmp_path / "out", on_warning=told.append,
         )  # fmt: skip
+    assert told[0] == "rounds that tell rivals apart are played without guard and filter"
     (options,) = asked
     assert options["guard"] == options["filter"] == is_decided
 
@@ -391,7 +393,8 @@ def test_where_no_signal_is_redesigned_a_policy_is_not_played_on_another_plant()
     assert campaign.reason == "the policy is for aero2, not for aero2_lag"
 
 
-def test_a_guard_that_the_policy_does_not_have_is_refused_before_the_first_round(tmp_path):
-    with pytest.raises(ValueError, match="policy of the aero2_lag campaign has no guard"):
-        ex.campaign("aero2_lag", {"J_p": "1%"}, guard=True, out=tmp_path / "none")
+@pytest.mark.parametrize("policy", ["aero2_lag", "aero2"])  # none, and one for another plant
+def test_a_guard_that_the_policy_does_not_have_is_refused_before_the_first_round(tmp_path, policy):
+    with pytest.raises(ValueError, match="the policy has no guard for 'aero2_lag'"):
+        ex.campaign("aero2_lag", {"J_p": "1%"}, policy=policy, guard=True, out=tmp_path / "none")
     assert not (tmp_path / "none").exists()

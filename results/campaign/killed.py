@@ -29,7 +29,7 @@ LONGEST = 60.0
 def records(folder: Path) -> dict[str, bytes]:
     """Of all rounds, by file name; those that have at least one sample."""
     found = {path.name: path.read_bytes() for path in sorted(folder.glob("round-*.csv"))}
-    return {name: content for name, content in found.items() if content.count(b"\n") > 2}
+    return {name: content for name, content in found.items() if len(content.splitlines()) > 2}
 
 
 def main() -> None:
@@ -65,8 +65,9 @@ def main() -> None:
             if changed:
                 sys.exit(f"{folder}: {changed} changed after a kill")
             if told is None:
-                kills.append({"campaign": len(campaigns), "after": round(after, 1), "records": {
-                    name: content.count(b"\n") - 2 for name, content in now.items()}})  # fmt: skip
+                samples = {name: len(content.splitlines()) - 2 for name, content in now.items()}
+                about = {"campaign": len(campaigns), "after": round(after, 1)}
+                kills.append({**about, "samples": samples})
                 print(json.dumps(kills[-1]), flush=True)
                 kept = now
                 continue
@@ -76,6 +77,8 @@ def main() -> None:
                 sys.exit(f"{folder}: rounds {list(now)}")
             if [r["num_samples"] for r in ended["rounds"]] != lengths:
                 sys.exit(f"{folder}: the rounds are not the records")
+            if (ended["reason"], process.returncode) != ("every target is reached", 0):
+                sys.exit(f"{folder}: {ended['reason']}, exit code {process.returncode}")
             campaigns.append({"reason": ended["reason"], "exit_code": process.returncode,
                               "rounds": lengths})  # fmt: skip
             print(json.dumps(campaigns[-1]), told.decode()[-300:], flush=True)

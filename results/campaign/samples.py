@@ -39,16 +39,17 @@ SAFE, ROUNDS = 0.97, 3
 
 
 @eqx.filter_jit
-def played(box, excitation, num_steps, coast, key):
+def played(box, num_own, excitation, num_steps, coast, key):
     """Of one plant: information after every sample, nearness of every round and of every end."""
     params_key, *keys = jax.random.split(key, ROUNDS + 1)
     plant, params = box.at(box.draw(params_key))
     rest = jnp.asarray(safe_input(plant.definition))
     infos, sizes, after = [], [], []
-    before = jnp.zeros((len(params), len(params)))
+    before = jnp.zeros((num_own, num_own))
     for key in keys:
         run = run_episode(plant, params, excitation, num_steps, key)
-        infos.append(before[None] + running_information(plant, params, run.inputs))
+        info = running_information(plant, params, run.inputs)
+        infos.append(before[None] + info[:, :num_own, :num_own])  # delay and lag follow: known
         before = infos[-1][-1]
         sizes.append(nearness(plant, run.outputs))
 
@@ -91,8 +92,9 @@ def main() -> None:
     ranges = policy.provenance.get("uncertainty") or {} if asked.uncertain else {}
     box = Uncertainty.of(plant, spread, ranges)
     keys = jax.random.split(jax.random.key(asked.seed), asked.plants)
+    num_own = len(plant.definition.parameters)
     batch = eqx.filter_jit(
-        lambda keys: jax.vmap(lambda key: played(box, excitation, steps, coast, key))(keys)
+        lambda keys: jax.vmap(lambda key: played(box, num_own, excitation, steps, coast, key))(keys)
     )
     parts = [batch(keys[i : i + 50]) for i in range(0, asked.plants, 50)]
     infos, sizes, after = (np.concatenate([np.asarray(p[i]) for p in parts]) for i in range(3))

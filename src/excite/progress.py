@@ -21,7 +21,7 @@ def seconds_between() -> float:
     except ValueError:
         seconds = math.nan
     if not 0 <= seconds < 1e6:
-        raise ValueError(f"EXCITE_PROGRESS must be a number of seconds, not below 0: got {text!r}")
+        raise ValueError(f"EXCITE_PROGRESS must be a number of seconds from 0 to 1e6: got {text!r}")
     return seconds
 
 

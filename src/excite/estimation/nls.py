@@ -41,7 +41,8 @@ from .prior import Prior
 
 FAR = 30.0  # largest logarithm of a positive parameter over its nominal value
 _POOR = 4.0  # mean square of the residual over the assumed noise, beyond which a search is repeated
-_LITTLE, _ASIDE = 0.02, 0.2  # part of the outputs' variation left, beyond which it begins elsewhere
+_LITTLE = 0.02  # part of an output's variation left, beyond which a search begins elsewhere
+_ASIDE = 0.2  # how far, in search coordinates
 _ROUNDS, _SCALE_STEPS = 3, 20  # searches with the noise found by the one before; of its scale
 Noise = Literal["declared", "known", "estimated"]
 Likelihood = Literal["normal", "student"]
@@ -51,8 +52,8 @@ class NLS(AbstractSearch):
     """Output-error nonlinear least squares by multiple shooting.
 
     A search that leaves much more than the declared noise is repeated without the first phase of
-    multiple shooting, and where a fiftieth of the outputs' variation is left, from two other
-    starts; the best end counts.
+    multiple shooting, and where more than a fiftieth of an output's variation is left, from two
+    other starts; the best end counts.
 
     Attributes:
         tolerance: the search ends before a step that would change the estimate by less than
@@ -249,25 +250,30 @@ class NLS(AbstractSearch):
             prior = problem.prior_residual(found.point.z)
             return jnp.sum((found.residual / sd[None, None]) ** 2) + jnp.sum(prior**2)
 
-        measured = jnp.where(experiments.valid, experiments.measured, jnp.nan) / sd[None, None]
-        variation = jnp.nansum((measured - jnp.nanmean(measured, axis=(0, 1))[None, None]) ** 2)
+        counts = jnp.sum(experiments.valid, axis=(0, 1))
+        measured = jnp.where(experiments.valid, experiments.measured, 0.0)
+        mean = jnp.sum(measured, axis=(0, 1)) / jnp.maximum(counts, 1)
+        away = jnp.where(experiments.valid, experiments.measured - mean[None, None], 0.0)
+        variation = jnp.sum((away / sd[None, None]) ** 2, axis=(0, 1))
+        can_move = (variation > _POOR * counts) & jnp.any(problem.free)
         aside = jnp.resize(jnp.array([_ASIDE, -_ASIDE]), begin.z.shape)
         sides = jnp.array([0.0, 0.0, 1.0, -1.0])
 
         def attempt(state: tuple[_Found, Array]) -> tuple[_Found, Array]:
             best, tries = state
             start = begin._replace(z=begin.z + sides[tries] * aside)
-            matched = shooting().matched(start, sd)
-            found = search(where_tree(tries == 1, start, matched), sd)
+            matched = jax.lax.cond(tries == 1, lambda: start, lambda: shooting().matched(start, sd))
+            found = search(matched, sd)
             return where_tree(squares(found) < squares(best), found, best), tries + 1
 
         # Where segments that fit and gaps that close have led astray: again, without their phase.
+        # Where an output is hardly explained even so: from other starts.
         def goes_on(state: tuple[_Found, Array]) -> Array:
             best, tries = state
-            left = squares(best)
-            is_poor, is_lost = ~(left < _POOR * count), ~(left < _LITTLE * variation)
-            again = is_poor & ((tries == 1) | is_lost & (tries < len(sides)))
-            return (tries == 0) | again
+            is_poor = ~(squares(best) < _POOR * count)
+            left = jnp.sum((best.residual / sd[None, None]) ** 2, axis=(0, 1))
+            is_lost = jnp.any(can_move & ~(left < _LITTLE * variation))
+            return (tries == 0) | is_poor & ((tries == 1) | is_lost & (tries < len(sides)))
 
         width = begin.starts.shape[2] + len(begin.z) + 1
         nothing = _Found(

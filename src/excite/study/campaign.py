@@ -312,7 +312,8 @@ class Campaign:
             return None
         if is_other and not self.redesign:
             made_for, own = self.declared.description.name, self.plant.description.name
-            self.reason = f"the {self._opening_name} is for {made_for}, not for {own}"
+            opening = "policy" if self.policy else "robust signal"
+            self.reason = f"the {opening} is for {made_for}, not for {own}"
             return None
         self.playing = self._opening_name if chosen is None else chosen.name
         return self.opening if chosen is None else chosen.excitation

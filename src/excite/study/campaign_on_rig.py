@@ -105,10 +105,11 @@ def campaign(
     )  # fmt: skip
     if guard and made.policy is None:
         raise ValueError("a guard knows a policy: it does not go without one")
-    if guard and made.policy is not None and made.policy.guard is None:
+    own = made.declared.description
+    if guard and made.policy and (made.policy.guard is None or made.policy.plant.hash != own.hash):
         raise ValueError(
-            f"the policy of the {made.declared.description.name} campaign has no guard ('excite "
-            "falsify POLICY --guard --certify FILE' makes one)"
+            f"the policy has no guard for {own.name!r} ('excite falsify POLICY --guard --certify "
+            "FILE' makes one)"
         )
     require_whole("seed", seed, 0, LARGEST_SEED)
     if not 0 <= as_number("pause", pause) < 1e5:
@@ -137,6 +138,8 @@ def campaign(
         first = "designing the first signal, and " * (made.policy is None)
         progress(f"{first}predicting what can be reached", 0, rounds)
         made.require_reachable()
+    if rivals and (guard or filter):
+        on_warning("rounds that tell rivals apart are played without guard and filter")
     for sentence in made.warnings:
         on_warning(sentence)
     with locked_folder(root, "this campaign", ["run.json", "campaign.json"]):
