@@ -48,6 +48,22 @@ def test_the_page_says_what_a_policy_does_whose_plants_also_have_delay_lag_and_a
     assert f"a median of {median:.0f} samples, and {row['missed']} of the 1000" in told
 
 
+def test_the_page_says_what_campaigns_with_guard_on_the_detailed_rig_did():
+    found = json.loads((FOLDER / "detailed_rig.json").read_text())
+    count, rows = found["campaigns"], found["rows"]
+    assert found["policy_hash"] == read_policy("aero2_detailed").hash
+    assert found["violations"] == 0
+    inside = sum(abs(r["errors"][n]) <= r["ci95_half"][n] for r in rows for n in r["errors"])
+    told = PAGE[PAGE.index("**On the simulated rig, with the guard.**") :].partition("\n\n")[0]
+    for words in (
+        f"--campaigns {count} ", f"chosen in {found['right_plant']}, ",
+        f"reached in {found['reached']}, ", f"of {found['samples']['median']:.0f} samples",
+        f"{inside} of {3 * count} intervals", f"(largest {found['largest']:.3f})",
+    ):  # fmt: skip
+        assert words in told.replace("\n", " ")
+    assert found["same_decisions"] == count
+
+
 def test_the_page_says_how_often_the_true_rival_is_found_with_much_noise():
     found = json.loads((FOLDER / "structure_noisy.json").read_text())
     designed = found["designed"].values()
