@@ -393,8 +393,13 @@ def test_where_no_signal_is_redesigned_a_policy_is_not_played_on_another_plant()
     assert campaign.reason == "the policy is for aero2, not for aero2_lag"
 
 
-@pytest.mark.parametrize("policy", ["aero2_lag", "aero2"])  # none, and one for another plant
-def test_a_guard_that_the_policy_does_not_have_is_refused_before_the_first_round(tmp_path, policy):
-    with pytest.raises(ValueError, match="the policy has no guard for 'aero2_lag'"):
+@pytest.mark.parametrize(("policy", "sentence"), [
+    ("aero2_lag", "the policy has no guard ('excite falsify --guard --certify FILE' makes one)"),
+    ("aero2", "the policy's guard is not for this 'aero2_lag'"),
+])  # fmt: skip
+def test_a_guard_that_the_policy_does_not_have_is_refused_before_the_first_round(
+    tmp_path, policy, sentence
+):
+    with pytest.raises(ValueError, match=f"^{re.escape(sentence)}$"):
         ex.campaign("aero2_lag", {"J_p": "1%"}, policy=policy, guard=True, out=tmp_path / "none")
     assert not (tmp_path / "none").exists()

@@ -294,6 +294,7 @@ def test_a_policy_without_a_checksum_is_played_with_a_warning(call, tmp_path):
     content = POLICIES["aero2_detailed"].read_bytes()
     (entry,) = re.findall(rb',"sha256":"[0-9a-f]{64}"', content)
     old = content.replace(entry, b" " * len(entry))
+    assert len(old) == len(content) > len(entry)
     (tmp_path / "old.safetensors").write_bytes(old)
     done = bare(tmp_path, "--rig", "quanser", "--policy", "old.safetensors", "--dry-run", "--json")
     assert done.returncode == 0, done.stderr

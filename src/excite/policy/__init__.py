@@ -10,6 +10,7 @@ from .contract import Window as Window
 from .contract import act as act
 from .contract import empty_window as empty_window
 from .contract import forward as forward
+from .contract import guard_of as guard_of
 from .contract import mismatch as mismatch
 from .contract import network as network
 from .contract import observe as observe

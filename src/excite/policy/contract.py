@@ -623,6 +623,21 @@ def mismatch(policy: Policy, plant: PlantDescription) -> str | None:
     )
 
 
+def guard_of(policy: Policy, plant: PlantDescription) -> Mapping[str, Any]:
+    """The guard in a policy's file, for `excite.rig.guard`.
+
+    Raises:
+        ValueError: where there is none for this plant.
+    """
+    if policy.guard is None:
+        raise ValueError(
+            "the policy has no guard ('excite falsify --guard --certify FILE' makes one)"
+        )
+    if policy.plant.hash != plant.hash:
+        raise ValueError(f"the policy's guard is not for this {plant.name!r}")
+    return policy.guard
+
+
 def require_certified(
     policy: Policy, plant: PlantDescription, spread: SpreadLike, filtered: bool = False
 ) -> None:

@@ -28,7 +28,7 @@ from ..description import (
     require_whole,
     wrong_type,
 )
-from ..policy import Policy, mismatch, policy_path, read_policy, require_certified
+from ..policy import Policy, guard_of, mismatch, policy_path, read_policy, require_certified
 from ..record import Record, read_record, read_signal, require_record_path
 from ..record.read import SIGNAL_ENDINGS
 from ..report.tables import html_table, text_table
@@ -385,14 +385,11 @@ class _Source:
         """The guard in the policy's file; ValueError where there is none for this plant."""
         if self.policy is None:
             raise ValueError(f"{self.name} is no policy: only policies have a guard")
-        if self.policy.guard is None:
-            raise ValueError(
-                f"{self.name}: the policy has no guard ('excite falsify --guard --certify FILE' "
-                "makes one)"
-            )
-        if self.policy.plant.hash != plant.hash:
-            raise ValueError(f"{self.name}: the policy's guard is not for this {plant.name!r}")
-        return Guard.from_dict(self.policy.guard)
+        try:
+            found = guard_of(self.policy, plant)
+        except ValueError as error:
+            raise ValueError(f"{self.name}: {error}") from None
+        return Guard.from_dict(found)
 
     def maker(
         self,

@@ -22,7 +22,7 @@ from ..description import (
 from ..excitation import Replay
 from ..files import csv_text, locked_folder, read_json, write_bytes, write_json
 from ..plant.catalogue import PlantLike
-from ..policy import Policy
+from ..policy import Policy, guard_of
 from ..progress import SHOWN, Progress
 from ..record import read_record
 from ..rig.catalogue import RigOptions, rig_named
@@ -105,12 +105,8 @@ def campaign(
     )  # fmt: skip
     if guard and made.policy is None:
         raise ValueError("a guard knows a policy: it does not go without one")
-    own = made.declared.description
-    if guard and made.policy and (made.policy.guard is None or made.policy.plant.hash != own.hash):
-        raise ValueError(
-            f"the policy has no guard for {own.name!r} ('excite falsify POLICY --guard --certify "
-            "FILE' makes one)"
-        )
+    if guard and made.policy is not None:
+        guard_of(made.policy, made.declared.description)  # before the first round
     require_whole("seed", seed, 0, LARGEST_SEED)
     if not 0 <= as_number("pause", pause) < 1e5:
         raise ValueError(f"pause must be a number of seconds, not below 0: got {pause!r}")
