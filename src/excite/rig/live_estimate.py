@@ -17,7 +17,7 @@ import numpy as np
 from ..description import names_of
 from ..estimation import NLS, Estimate, Experiments, Status
 from ..estimation.diagnosis import half_95
-from ..plant import AbstractPlant
+from ..plant import AbstractPlant, Params
 from .contract import Interval, Sample
 
 _FIRST = 40  # samples before the first estimate
@@ -32,6 +32,7 @@ class LiveEstimate:
         num_steps: int,
         starts_at_rest: bool,
         estimator: NLS | None = None,
+        start: Params | None = None,
         first: int = _FIRST,
         waits: bool = False,
     ) -> None:
@@ -43,11 +44,13 @@ class LiveEstimate:
             starts_at_rest: whether the initial state is the plant's; otherwise it is
                 estimated too.
             estimator: default nonlinear least squares without a prior.
+            start: parameters where every search begins, default the nominal ones.
             first: samples before the first estimate.
             waits: whether a call waits for the estimate from its sample.
         """
         self._estimator, self._first, self._waits = estimator or NLS(), first, waits
-        self._plant, self._starts_at_rest, self._count = plant, starts_at_rest, 0
+        self._plant, self._start = plant, plant.nominal if start is None else start
+        self._starts_at_rest, self._count = starts_at_rest, 0
         self._inputs = np.zeros((num_steps, len(plant.definition.inputs)))
         self._measured = np.zeros((num_steps + 1, len(plant.definition.outputs)))
         self._pool, self._fit = ThreadPoolExecutor(1), Future[Estimate]()
@@ -104,4 +107,4 @@ class LiveEstimate:
             initial_state_known=self._starts_at_rest,
         )
         # Otherwise the loop would wait for the result when it reads it.
-        return jax.block_until_ready(self._estimator(self._plant, experiments))
+        return jax.block_until_ready(self._estimator(self._plant, experiments, self._start))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Sequence
 
@@ -18,7 +17,6 @@ from ..estimation.prior_knowledge import with_prior
 from ..estimation.result import Identification
 from ..information.identifiability import worst_seen
 from ..plant import AbstractPlant, Params
-from ..plant.contract import with_nominal
 from ..rig.contract import Interval, Sample
 from ..rig.live_estimate import LiveEstimate
 from ..safety import safe_input
@@ -58,19 +56,18 @@ class Monitor:
                 experiment, and the judgement follows some samples later.
             enough: largest share of the allowed intervals that ends the round.
         """
-        own, estimator = plant, NLS()
+        start, prior = plant.nominal, None
         if before is not None:
-            _, prior, _ = with_prior(plant, before, plant.nominal, {}, {})
-            estimator = dataclasses.replace(estimator, prior=prior)
-            own = with_nominal(plant, dict(before.params))
+            _, prior, start = with_prior(plant, before, start, {}, {})
         self._plant, self._targets, self._share = plant, targets, enough
         self._others = others_of(plant, targets)
         self._is_later, self._num_outputs = before is not None, len(plant.definition.outputs)
-        self._live = LiveEstimate(own, num_steps, True, estimator, first=_FIRST, waits=waits)
+        own = NLS(prior=prior)
+        self._live = LiveEstimate(plant, num_steps, True, own, start, first=_FIRST, waits=waits)
         self._inputs = np.tile(safe_input(plant.definition), (num_steps + coast, 1))
-        self._after(own.nominal)  # compiles, before the first sample
+        self._after(start)  # compiles, before the first sample
         if self._others:
-            slopes(self._others, plant, own.nominal)
+            slopes(self._others, plant, start)
 
     def __call__(self, sample: Sample) -> bool:
         """Takes one more sample; whether every target is reached and ending now is safe."""
