@@ -17,6 +17,7 @@ estimates of noisy records.
 """
 
 import argparse
+import itertools
 from pathlib import Path
 
 import equinox as eqx
@@ -200,6 +201,7 @@ def main():
     parser.add_argument("--sd", type=float, help="noise of every output, in its unit")
     parser.add_argument("--targets", default="0.005,0.001", help="relative standard errors")
     parser.add_argument("--signals", default="robust,multisine,chirp,prbs", help="to be repeated")
+    parser.add_argument("--lengths", help="of the repeated signals; default that of the policy")
     parser.add_argument("--plants", type=int, default=200)
     parser.add_argument("--out", type=Path, required=True)
     asked = parser.parse_args()
@@ -227,14 +229,16 @@ def main():
     def signal(kind, steps):
         return repeated(begin, plant, inputs_of(plant, design(kind, steps), steps), coast)
 
+    lengths = [int(n) for n in asked.lengths.split(",")] if asked.lengths else [steps]
     kinds = asked.signals.split(",")
     methods = {"campaign": lambda: by_campaign(begin, plant, policy, coast)}
     if "robust" in kinds:
         methods["redesign alone"] = lambda: by_redesign(
             begin, plant, design("robust", SHORT).inputs, coast
         )
-    for kind in kinds:
-        methods[f"{kind} of {steps} samples, repeated"] = lambda kind=kind: signal(kind, steps)
+    for kind, length in itertools.product(kinds, lengths):
+        name = f"{kind} of {length} samples, repeated"
+        methods[name] = lambda kind=kind, length=length: signal(kind, length)
     table = {"policy_hash": policy.hash, "noise": noise, "spread": spread, "plants": asked.plants,
              "seed": SEED, "rows": {}}  # fmt: skip
     for name, method in methods.items():
