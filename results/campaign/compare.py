@@ -26,8 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import excite as ex
-from excite.description import HALF_95
-from excite.environment import prior_sd_of
+from excite.description import HALF_95, prior_sd_of
 from excite.environment.falsification import nearness
 from excite.estimation import NLS, Experiments, Status
 from excite.excitation import PolicyExcitation, Replay

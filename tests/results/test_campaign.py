@@ -64,6 +64,17 @@ def test_the_page_says_what_campaigns_with_guard_on_the_detailed_rig_did():
     assert found["same_decisions"] == count
 
 
+def test_campaigns_that_were_killed_went_on_where_they_were():
+    found = json.loads((FOLDER / "killed.json").read_text())
+    count, ended = len(found["kills"]), found["campaigns"]
+    told = PAGE[PAGE.index("**Killed.**") :].partition("\n\n")[0].replace("\n", " ")
+    assert f"{len(ended)} campaigns were killed {count} times" in told
+    assert {c["reason"] for c in ended} == {"every target is reached"}
+    for kill in found["kills"]:  # what was recorded before it is at the end as it was
+        rounds = ended[kill["campaign"]]["rounds"]
+        assert list(kill["samples"].values()) == rounds[: len(kill["samples"])]
+
+
 def test_the_page_says_how_often_the_true_rival_is_found_with_much_noise():
     found = json.loads((FOLDER / "structure_noisy.json").read_text())
     designed = found["designed"].values()

@@ -4,6 +4,7 @@ import itertools
 import json
 import math
 import re
+import runpy
 import tomllib
 from typing import Any
 
@@ -16,6 +17,14 @@ from excite.study.table import finished_table
 RESULTS = ROOT / "results"
 PROMISED = ("aero2", "aero2-ideal", "aero2-goals", "aero2-damping")
 """Policies of which 10,000 experiments are promised."""
+
+
+@pytest.mark.parametrize(
+    "path", sorted(p.relative_to(ROOT).as_posix() for p in RESULTS.rglob("*.py"))
+)
+def test_a_command_that_makes_results_can_be_imported(path, monkeypatch):
+    monkeypatch.syspath_prepend(str((ROOT / path).parent))
+    runpy.run_path(str(ROOT / path), run_name="imported")
 
 
 def test_the_committed_efficiency_is_near_the_best_that_could_be_had():
