@@ -452,6 +452,16 @@ def test_differences_are_those_of_the_table():
     assert page_of(folder).table_with("method", "minus") == [header, *cells]
 
 
+def test_a_p_value_too_small_for_the_computer_is_not_zero(made):
+    result = estimate(made / "one")
+    (output,) = result.whiteness_p_value
+    p = {"whiteness_p_value": {output: 0.0}, "structure_p_value": {output: 1e-20}}
+    tiny = result.model_copy(update=p)
+    assert residual_cells(tiny, output) == ["no", "< 1e-300", "yes", "1.00e-20"]
+    shown = "not white (p < 1e-300), follows the input (p = 1.00e-20)"
+    assert residual_in_words(tiny, output).endswith(shown)
+
+
 @pytest.mark.parametrize("name", ["one", "both"])
 def test_parameters_are_those_of_the_command_line(name, made, capsys, monkeypatch):
     monkeypatch.chdir(made)

@@ -12,6 +12,8 @@ from .numbers import digits_for, number
 from .rows import EstimatedParameter, EstimateSummary
 from .tables import Table
 
+_SMALLEST = 1e-300  # p-value that is written as a number
+
 
 def parameter_header() -> list[str]:
     """Column titles of a table of estimates."""
@@ -49,7 +51,9 @@ def residual_cells(result: EstimateSummary, output: str) -> list[str]:
     white, follows = result.whiteness_p_value[output], result.structure_p_value[output]
     cells = []
     for p, words in ((white, ("yes", "no")), (follows, ("no", "yes"))):
-        cells += [words[p < RARE], number(p)] if math.isfinite(p) else ["–", "–"]
+        # One too small for the computer is not zero.
+        shown = number(p) if p > _SMALLEST else f"< {_SMALLEST:g}"
+        cells += [words[p < RARE], shown] if math.isfinite(p) else ["–", "–"]
     return cells
 
 
@@ -62,15 +66,19 @@ def residual_size(result: EstimateSummary, output: str) -> str:
     return f"{number(factor * size.rms)} {unit}".rstrip()
 
 
+def _equal(p: str) -> str:
+    return p if p.startswith("<") else f"= {p}"
+
+
 def residual_in_words(result: EstimateSummary, output: str) -> str:
     """The size of the residual and the same tests as part of a sentence."""
     white, p_white, follows, p_follows = residual_cells(result, output)
     parts = [f"{residual_size(result, output)} RMS"] if output in result.residual else []
     if white != "–":
-        parts.append(f"{'white' if white == 'yes' else 'not white'} (p = {p_white})")
+        parts.append(f"{'white' if white == 'yes' else 'not white'} (p {_equal(p_white)})")
     if follows != "–":
         word = "follows" if follows == "yes" else "does not follow"
-        parts.append(f"{word} the input (p = {p_follows})")
+        parts.append(f"{word} the input (p {_equal(p_follows)})")
     if white == follows == "–":
         parts.append("too small or too short to be tested")
     return f"residual {', '.join(parts)}"
