@@ -206,6 +206,15 @@ def test_a_quantity_of_a_parameter_that_is_not_known_is_not_known():
         ({"plant": "aero3"}, "unknown plant 'aero3'"),
         ({"steps": 50}, "steps are for rounds without a policy: a policy has its own"),
         ({"policy": "none", "steps": 3}, "steps must be a whole number from 4 to 10000000: got 3"),
+        (
+            {"policy": steady(), "samples": 59},
+            "a budget of 59 samples is shorter than a round of 60",
+        ),
+        ({"samples": 0}, "samples must be a whole number from 1 to 10000000: got 0"),
+        (
+            {"rivals": ["aero2_lag,d_S=10%"]},
+            "a campaign identifies parameters, and 'd_S' of rival aero2_lag,d_S=10% is none",
+        ),
     ],
 )
 def test_a_campaign_that_cannot_be_played_is_one_sentence(options, words):
@@ -357,6 +366,32 @@ def test_a_round_that_was_interrupted_does_not_count_in_the_budget():
     assert campaign.reason == "all rounds are played"
 
 
+def test_no_round_begins_that_could_pass_the_budget_of_samples():
+    campaign = ex.Campaign("aero2", {"D_p": "0.001%"}, policy=steady(), samples=130, redesign=False)
+    record = ex.simulate("aero2", steady(), params=TRUE, seed=1)
+    assert campaign.tell(record).decision.startswith("go on")
+    campaign.tell(record)
+    assert campaign.reason == "the budget of 130 samples is used up"
+    assert campaign.ask() is None
+    assert campaign.to_dict()["most_samples"] == 130
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"metadata": {"starts_at_initial_state": False}}, "and this record says that it does not"),
+        ({"time": 0.2 * np.arange(61)}, "a round is sampled every 0.1 s: got one of 0.2 s"),
+    ],
+)
+def test_a_record_that_is_no_round_is_refused_and_spoils_nothing(changed, words):
+    campaign = ex.Campaign("aero2", EASY, policy=steady())
+    record = ex.simulate("aero2", steady(), params=TRUE, seed=1)
+    with pytest.raises(ValueError, match=words):
+        campaign.tell(dataclasses.replace(record, **changed))
+    assert not campaign.records
+    assert campaign.tell(record).known
+
+
 @pytest.mark.slow
 def test_a_round_that_tells_nothing_does_not_make_later_ones_longer():
     campaign = ex.Campaign("aero2", {"D_p": "1%"}, policy=steady(), redesign=False)
@@ -400,6 +435,15 @@ def test_records_that_the_plant_does_not_explain_are_a_warning():
     assert f"warning: {sentence}"[:60] in repr(campaign)
     assert campaign.ask() is campaign.policy  # a signal redesigned for this plant may be unsafe
     assert campaign.tell(record).played == "policy"
+
+
+@pytest.mark.slow
+def test_a_spread_that_excludes_the_estimate_is_a_warning():
+    campaign = ex.Campaign("aero2", {"D_p": "0.1%"}, policy=steady(), spread=0.3)
+    record = ex.simulate("aero2", steady(), params={**TRUE, "J_p": 0.06}, seed=1)
+    campaign.tell(record)
+    (sentence,) = campaign.warnings
+    assert sentence.startswith("the spread 0.3 excludes the estimate of J_p, 0.0")
 
 
 def test_a_share_of_nothing_is_infinite():
@@ -471,6 +515,8 @@ def test_a_round_ends_only_where_the_free_motion_after_it_is_safe(monkeypatch):
         monitor._live._latest, monitor._live._kept = known, sure
         monitor._live._first = 1000  # no estimate but this one
         verdicts.append(monitor(sample))
+        surely, perhaps = (monitor._after(params, x * np.eye(3)) for x in (1e9, 0.0))
+        assert perhaps >= surely - 1e-3  # also on the other plants of the spread
         rest = jnp.concatenate([fast[:k], jnp.zeros((160 - k, 1))])
         largest = float(np.abs(response(plant, params, rest)).max()) / level
         assert verdicts[-1] == (largest < 0.97)
@@ -495,7 +541,7 @@ def test_a_later_round_leaves_room_for_the_error_of_the_noise(monkeypatch):
         (one, 0.99, False),
         (two, 0.8, True),
     ):
-        monitor = Monitor(plant, earlier, targets, 60, 20, waits=True)
+        monitor = Monitor(plant, earlier, targets, 60, 20, waits=True, spread="factor:3")
         half = 0.01 * share * TRUE["J_p"]
         known = {name: Interval(value, half) for name, value in TRUE.items()}
         sure = dataclasses.replace(monitor._live._estimate(0), information=1e9 * jnp.eye(3))
@@ -630,6 +676,13 @@ def test_a_campaign_that_was_interrupted_is_resumed_and_nothing_is_played_twice(
     content = (again / "round-01.csv").read_bytes()
     eased = repeated(again, {"D_p": "50%"}, rounds=3)
     assert eased.reason == REACHED
+    assert eased.prediction == ""  # that was about another target
+    file = again / "round-02.json"  # as if the last round had ended at an easier target
+    sidecar = json.loads(file.read_text())
+    sidecar["ended"]["reason"] = REACHED
+    file.write_text(json.dumps(sidecar))
+    other = repeated(again, {"D_p": "0.001%"}, rounds=2)
+    assert other.haste == 1.0
     assert len(eased.rounds) == 2  # all that was recorded is used
     assert (again / "round-01.csv").read_bytes() == content
     with pytest.raises(ValueError, match=r"is another campaign, with seed 3 and not 4"):

@@ -18,7 +18,7 @@ from excite.plant import Aero2, DCMotor
 from excite.rig.contract import Interval
 from excite.simulation import response
 from excite.study.knowledge import region_of
-from excite.study.next_experiment import Candidate, best_of
+from excite.study.next_experiment import Candidate, NextExperiment, best_of
 from excite.study.targets import targets_from
 from excite.training.redesign import POINTS, SAFE, Region, first_signals, redesigned
 
@@ -162,6 +162,19 @@ def test_the_command_writes_a_signal_that_can_be_played(tmp_path):
     refused = excite("next", record, *asked, "--out", out)
     assert refused.returncode == 2
     assert "exists" in refused.stderr
+
+
+def test_the_inputs_of_a_policy_that_is_safe_only_because_it_reacts_are_not_written(tmp_path):
+    targets = targets_from(Aero2(), {"D_p": "1%"})
+    own = candidate("policy", 5, 1e-6, 0.9)
+    usual = Aero2().nominal._asdict()
+    known = {name: Interval(float(value), 0.1 * float(value)) for name, value in usual.items()}
+    made = NextExperiment(Aero2(), known, targets, (own,), own, nearness=1.04)
+    with pytest.raises(ValueError, match=r"does not react, reach 1\.04 of a critical level"):
+        made.save(tmp_path / "next.csv")
+    assert not (tmp_path / "next.csv").exists()
+    dataclasses.replace(made, nearness=0.9).save(tmp_path / "next.csv")
+    assert (tmp_path / "next.csv").exists()
 
 
 @pytest.mark.parametrize(

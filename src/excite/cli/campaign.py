@@ -69,6 +69,12 @@ from .options import (
 )
 @click.option("--rounds", type=WholeNumber(1, 1000), default=10, show_default=True, help="At most.")
 @click.option(
+    "--samples",
+    type=WholeNumber(1),
+    metavar="N",
+    help="Of all rounds together, at most: a round that could take more does not begin.",
+)
+@click.option(
     "--coast",
     type=COAST,
     metavar="N",

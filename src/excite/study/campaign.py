@@ -55,7 +55,7 @@ from ..training.design import design
 from ..training.redesign import Region
 from .discrimination import Discrimination, RivalLike, judged, rivals_from, with_experiment
 from .falsify import trained_in
-from .knowledge import region_of, unexplained
+from .knowledge import excluded, region_of, unexplained
 from .monitor import Monitor
 from .next_experiment import COAST, NextExperiment, best_of, candidates
 from .quantities import (
@@ -170,7 +170,7 @@ class Campaign:
         steps: samples of a round; a robust signal has half as many.
         redesign: whether signals are redesigned for later rounds.
         spread: of the parameters before the campaign.
-        most_rounds: the budget.
+        most_rounds, most_samples: the budget; samples are not limited where that is None.
         coast: samples of free motion after an end that must be safe.
         records: of all rounds.
         rounds: what each of them brought.
@@ -179,6 +179,8 @@ class Campaign:
         playing: what `ask` returned last, as `Round` names it; empty after the round.
         next: how the coming round was chosen, after the first estimate.
         interrupted: what interrupted `campaign`, such as a signal; empty if nothing did.
+        haste: by how much smaller than asked the running intervals must be to end a round, because
+            one ended too early.
         prediction: what was expected before the first round, as a sentence; empty if that was not
             computed.
     """
@@ -192,6 +194,7 @@ class Campaign:
         steps: int | None = None,
         spread: SpreadLike | None = None,
         rounds: int = 10,
+        samples: int | None = None,
         coast: int | None = None,
         redesign: bool = True,
         rivals: Sequence[RivalLike] = (),
@@ -212,6 +215,8 @@ class Campaign:
                 because little is known of the plant.
             spread: of the parameters; default that of the policy's training, or 0.3.
             rounds: that are played at most.
+            samples: of all rounds together at most, and so the time on the plant; a round that
+                could take more does not begin.
             coast: samples after a round's end in which the plant must be safe; default that of the
                 policy's training, or 100.
             redesign: whether signals are redesigned for later rounds, and played where they reach
@@ -229,12 +234,18 @@ class Campaign:
         description = self.plant.description
         self.targets = targets_from(self.plant, target)
         require_whole("rounds", rounds, 1, 1000)
-        self.most_rounds = rounds
+        self.most_rounds, self.most_samples = rounds, samples
         self.policy = _policy(policy, description)
         if steps is not None and self.policy is not None:
             raise ValueError("steps are for rounds without a policy: a policy has its own")
         self.steps = self.policy.layout.num_steps if self.policy else steps or DESIGNED
         require_whole("steps", self.steps if steps is None else steps, 4)
+        if samples is not None:
+            require_whole("samples", samples, 1)
+            if samples < self.steps:
+                raise ValueError(
+                    f"a budget of {samples} samples is shorter than a round of {self.steps}"
+                )
         usual, _, usual_coast = trained_in(self.policy, self.plant)
         self.spread = Spread.of(usual if spread is None else spread)
         self.coast = coast if coast is not None else usual_coast or COAST
@@ -244,7 +255,15 @@ class Campaign:
         if isinstance(rivals, str) or not isinstance(rivals, Sequence):
             raise wrong_type("rivals", rivals, "a list of plants")
         if rivals:
-            self.discrimination = judged(rivals_from([self.plant, *rivals], self.spread), [])
+            given = rivals_from([self.plant, *rivals], self.spread)
+            for rival in given:
+                names = names_of(rival.box.plant.definition.parameters)
+                if other := [name for name in rival.box.names if name not in names]:
+                    raise ValueError(
+                        f"a campaign identifies parameters, and {other[0]!r} of rival {rival.name} "
+                        "is none: leave out its range"
+                    )
+            self.discrimination = judged(given, [])
             for rival in self.discrimination.rivals:
                 for name in [t.name for t in self.targets if isinstance(t.quantity, OneParameter)]:
                     if name not in rival.estimate:
@@ -257,12 +276,17 @@ class Campaign:
         self.result: Identification | None = None
         self.next: NextExperiment | None = None
         self.reason, self.interrupted, self.prediction = "", "", ""
-        self._haste, self.playing = 1.0, ""
+        self.haste, self.playing = 1.0, ""
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """Sentences about policy and plant, and where the plant does not explain the records."""
-        return *_about_policy(self.policy, self.plant, self.spread), *unexplained(self.result)
+        told = [*_about_policy(self.policy, self.plant, self.spread), *unexplained(self.result)]
+        is_declared = self.plant.description.hash == self.declared.description.hash
+        if self.result is not None and is_declared:
+            region = region_of(self.plant, self.result, self.spread)
+            told += [sentence] if (sentence := excluded(self.plant, region, self.spread)) else []
+        return tuple(told)
 
     @cached_property
     def opening(self) -> Policy | Replay:
@@ -318,6 +342,17 @@ class Campaign:
         self.playing = self._opening_name if chosen is None else chosen.name
         return self.opening if chosen is None else chosen.excitation
 
+    def _fits(self, played: int) -> bool:
+        """Whether the budget has samples for another round after so many."""
+        longest = _SHORT if self.is_undecided else self.steps
+        return self.most_samples is None or played + longest <= self.most_samples
+
+    @property
+    def _whole_rounds(self) -> int:
+        """Rounds of full length in the budget."""
+        most = self.most_rounds
+        return most if self.most_samples is None else min(most, self.most_samples // self.steps)
+
     @property
     def is_undecided(self) -> bool:
         """Whether several rivals are still possible."""
@@ -361,6 +396,11 @@ class Campaign:
         record = record_for(d, record)
         if len(record.time) < 2:
             raise ValueError("the record of a round needs at least two samples: got one")
+        if record.metadata.get("starts_at_initial_state") is False:
+            raise ValueError("a round begins at rest, and this record says that it does not")
+        interval, dt = float(np.median(np.diff(record.time))), float(self.plant.dt)
+        if not 0.9 < interval / dt < 1.1:
+            raise ValueError(f"a round is sampled every {dt:g} s: got one of {interval:g} s")
         self.records.append(record)
         played, structure = played or self.playing or self._opening_name, ""
         if self.is_undecided:
@@ -377,7 +417,7 @@ class Campaign:
         known = self.known
         shares = shares_of(self.targets, known)
         if ended == REACHED:  # says the running estimate; the intervals of all records may be wider
-            self._haste = max([self._haste, *(s for s in shares.values() if math.isfinite(s))])
+            self.haste = max([self.haste, *(s for s in shares.values() if math.isfinite(s))])
         if goes_on:
             self.reason = ""
         elif unsafe or near >= 1:
@@ -388,6 +428,8 @@ class Campaign:
             self.reason = structure
         elif sum(e in WHOLE for e in [*(r.ended for r in self.rounds), ended]) >= self.most_rounds:
             self.reason = "all rounds are played" + f"; {structure}" * self.is_undecided
+        elif self.most_samples is not None and not self._fits(self.num_samples + count):
+            self.reason = f"the budget of {self.most_samples} samples is used up"
         missing = farthest(shares) if shares else f"there is no estimate yet ({status})"
         decision = f"end: {self.reason}" if self.reason else f"go on: {missing}"
         if structure and not self.is_undecided:
@@ -452,8 +494,10 @@ class Campaign:
 
     def monitor(self, waits: bool = False) -> Monitor:
         """A judge of the next round while it runs; see `Monitor`."""
-        room = 1 / self._haste
-        return Monitor(self.plant, self.result, self.targets, self.steps, self.coast, waits, room)
+        room = 1 / self.haste
+        return Monitor(
+            self.plant, self.result, self.targets, self.steps, self.coast, waits, self.spread, room
+        )
 
     @cached_property
     def expected(self) -> Expected:
@@ -470,13 +514,13 @@ class Campaign:
         keys = jax.random.split(jax.random.key(0), count)
         episodes = run_episodes(self.plant, excitation, steps, self.spread, keys)
         first = later = episodes.trajectory.inputs
-        if self.redesign and self.policy is None and self.most_rounds > 1:
+        if self.redesign and self.policy is None and self._whole_rounds > 1:
             later = jnp.stack([
                 self._redesigned(jax.tree.map(lambda x, i=i: x[i], episodes.params), first[i])
                 for i in range(count)
             ])  # fmt: skip
         asked = [t.quantity for t in self.targets]
-        outlook = _halves(self.plant, episodes.params, first, later, self.most_rounds, asked)
+        outlook = _halves(self.plant, episodes.params, first, later, self._whole_rounds, asked)
         values, halves = map(np.asarray, outlook)
         shares = {
             t.name: t.share(values[:, None, i], halves[..., i]) for i, t in enumerate(self.targets)
@@ -507,7 +551,7 @@ class Campaign:
             best = target.half * share
             told = f"{100 * best:.2g} %" if target.is_relative else f"{best:.2g}"
             raise ValueError(
-                f"no campaign of at most {self.most_rounds} rounds of {self.steps} samples "
+                f"no campaign of at most {self._whole_rounds} rounds of {self.steps} samples "
                 f"reaches {name} to {target}: at best {told}; ask for less, or for more "
                 + ("rounds" if self.policy else "rounds or steps")
             )
@@ -530,6 +574,7 @@ class Campaign:
             "units": {q.name: q.unit for q in quantities_of(self.plant, self.targets)},
             "spread": self.spread.setting,
             "most_rounds": self.most_rounds,
+            **({} if self.most_samples is None else {"most_samples": self.most_samples}),
             "coast": self.coast,
             "redesign": self.redesign,
             "rivals": {} if self.discrimination is None else self.discrimination.plants,

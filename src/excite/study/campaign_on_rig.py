@@ -48,6 +48,7 @@ def campaign(
     steps: int | None = None,
     spread: SpreadLike | None = None,
     rounds: int = 10,
+    samples: int | None = None,
     coast: int | None = None,
     redesign: bool = True,
     rivals: Sequence[RivalLike] = (),
@@ -77,7 +78,7 @@ def campaign(
 
     Args:
         plant: as for `Campaign`, and so are `target`, `policy`, `steps`, `spread`, `rounds`,
-            `coast`, `redesign` and `rivals`.
+            `samples`, `coast`, `redesign` and `rivals`.
         rig: a name, `FILE.fmu`, `FILE.json`, `path/to/file.py:ClassName` or a rig, as for `run`.
         out: folder of the campaign.
         address: board identifier of the Quanser rig.
@@ -99,7 +100,8 @@ def campaign(
         TypeError: for an argument of another type.
     """
     made = Campaign(
-        plant, target, policy=policy, steps=steps, spread=spread, rounds=rounds, coast=coast,
+        plant, target, policy=policy, steps=steps, spread=spread, rounds=rounds, samples=samples,
+        coast=coast,
         redesign=redesign and not guard,  # a guard knows its policy
         rivals=rivals,
     )  # fmt: skip
@@ -216,6 +218,11 @@ def _played(
     return cast("RunResult", played), signals  # without dry_run
 
 
+def _names_in(folder: Path) -> set[str]:
+    """Names of files, without those that were being written when a process was killed."""
+    return {p.name for p in folder.iterdir() if not p.name.startswith(".campaign.json.")}
+
+
 def _has_samples(path: Path) -> bool:
     """Whether a record has more than its header and one sample."""
     return path.is_file() and len(path.read_bytes().splitlines()) > 2
@@ -247,7 +254,7 @@ class _Folder:
                     f"{root} is another campaign, with {other[0]} {before.get(other[0])!r} and not "
                     f"{settings[other[0]]!r}: choose another folder"
                 )
-        elif root.exists() and not (root.is_dir() and {p.name for p in root.iterdir()} <= _OWN):
+        elif root.exists() and not (root.is_dir() and _names_in(root) <= _OWN):
             raise ValueError(f"{root} exists and is no campaign: choose another folder")
         return cls(root, settings, command)
 
@@ -275,9 +282,11 @@ class _Folder:
     def resume(self, made: Campaign, on_round: Callable[[Round], None]) -> None:
         """Takes the rounds that were played before; one that was hardly begun is played again."""
         names: list[str] = []
+        is_same = True
         if self.has_rounds:
-            before = read_json(self.root / "campaign.json", "expected", "rounds")
-            made.prediction = str(before["expected"])
+            before = read_json(self.root / "campaign.json", "expected", "rounds", "targets")
+            is_same = before["targets"] == made.to_dict()["targets"]
+            made.prediction = str(before["expected"]) if is_same else ""
             names = [*(str(r["played"]) for r in before["rounds"]), str(before.get("playing", ""))]
         while _has_samples(path := self.path(len(made.rounds))):
             record = read_record(path, made.declared.description)
@@ -286,4 +295,6 @@ class _Folder:
             count = len(made.rounds)
             goes_on, name = _has_samples(self.path(count + 1)), "".join(names[count : count + 1])
             on_round(made.tell(record, str(ended["reason"]), trip in _UNSAFE, goes_on, name))
+            if not is_same:  # rounds that ended at other targets did not end too early
+                made.haste = 1.0
         self.write(made)

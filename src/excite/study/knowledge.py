@@ -128,9 +128,9 @@ def known_from(
     if result is not None and result.basis is not None:  # sampled as the records are
         own = result.basis.plant if plant is None else own.changed(dt=result.basis.plant.dt)
     region = region_of(own, result or before or {}, reach)
-    found = Knowledge(own, region, result, unexplained(result))
-    _require_within(found, reach)
-    return found
+    if told := excluded(own, region, reach):
+        raise ValueError(told)
+    return Knowledge(own, region, result, unexplained(result))
 
 
 def unexplained(result: Identification | None) -> tuple[str, ...]:
@@ -193,16 +193,16 @@ def _is_result(part: object) -> bool:
     return is_folder or isinstance(part, Identification)
 
 
-def _require_within(known: Knowledge, spread: Spread) -> None:
-    """Raises ValueError where the spread excludes an estimate."""
-    plant, region = known.plant, known.region
+def excluded(plant: AbstractPlant, region: Region, spread: Spread) -> str:
+    """A sentence where the spread excludes an estimate; else nothing."""
     sd = 1 / np.sqrt(np.diag(np.asarray(region.information)))
     for i, parameter in enumerate(plant.definition.parameters):
         value, nominal = float(region.center[i]), float(plant.nominal[i])
         lower, upper = (spread.value(parameter, nominal, unit) for unit in (-1.0, 1.0))
         slack = 4 * sd[i] * (value if parameter.positive else parameter.scale)
         if not lower - slack <= value <= upper + slack:
-            raise ValueError(
+            return (
                 f"the spread {spread} excludes the estimate of {parameter.name}, {value:.4g} "
                 f"{parameter.unit}: it allows {lower:.4g} to {upper:.4g}; give a wider spread"
             )
+    return ""

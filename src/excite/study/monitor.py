@@ -6,11 +6,12 @@ import math
 from collections.abc import Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..description import names_of
+from ..description import Spread, SpreadLike, names_of, prior_sd_of
 from ..environment.falsification import nearness
 from ..estimation import NLS, Estimate
 from ..estimation.prior_knowledge import with_prior
@@ -21,7 +22,7 @@ from ..rig.contract import Interval, Sample
 from ..rig.live_estimate import LiveEstimate
 from ..safety import safe_input
 from ..simulation import response
-from ..training.redesign import SAFE
+from ..training.redesign import JUDGES, SAFE, Region
 from .quantities import estimates, propagated, slopes
 from .targets import Target, others_of, shares_of
 
@@ -42,6 +43,7 @@ class Monitor:
         num_steps: int,
         coast: int,
         waits: bool,
+        spread: SpreadLike,
         enough: float = 1.0,
     ) -> None:
         """Compiles the estimator; this takes seconds.
@@ -54,6 +56,7 @@ class Monitor:
             coast: samples of free motion after its end that must be safe.
             waits: whether a call waits for its estimate; otherwise it is computed beside the
                 experiment, and the judgement follows some samples later.
+            spread: of the parameters before the first round.
             enough: largest share of the allowed intervals that ends the round.
         """
         start, prior = plant.nominal, None
@@ -65,7 +68,8 @@ class Monitor:
         own = NLS(prior=prior)
         self._live = LiveEstimate(plant, num_steps, True, own, start, first=_FIRST, waits=waits)
         self._inputs = np.tile(safe_input(plant.definition), (num_steps + coast, 1))
-        self._after(start)  # compiles, before the first sample
+        self._bounds, self._prior = _bounds(plant, spread), 1 / prior_sd_of(spread) ** 2
+        self._after(start, np.zeros((len(start), len(start))))  # compiles, before the first sample
         if self._others:
             slopes(self._others, plant, start)
 
@@ -76,7 +80,9 @@ class Monitor:
         if (estimate := self._live.estimate) is not None:
             known = self._known(estimate)
             is_enough = max(shares_of(self._targets, known).values()) <= self._enough(sample.k + 1)
-            is_enough = is_enough and self._after(estimates(known, self._plant)) < SAFE
+            if is_enough:
+                found = estimates(known, self._plant)
+                is_enough = self._after(found, np.asarray(estimate.information)) < SAFE
         self._inputs[sample.k] = sample.input
         return is_enough
 
@@ -106,18 +112,44 @@ class Monitor:
             known |= propagated(self._others, self._plant, params, covariance, halves)
         return known
 
-    def _after(self, params: Params) -> float:
-        """Largest output over its critical level if the round ended now."""
-        return float(_free_motion(self._plant, params, jnp.asarray(self._inputs)))
+    def _after(self, params: Params, information: np.ndarray) -> float:
+        """Largest output over its critical level on all possible plants if the round ended now."""
+        whole = jnp.asarray(information + self._prior * np.eye(len(params)))
+        region = Region(jnp.stack([jnp.asarray(value, float) for value in params]), whole)
+        inputs = jnp.asarray(self._inputs)
+        return float(_free_motion(self._plant, region, *self._bounds, inputs))
 
     def close(self) -> None:
         """Waits for the running estimate."""
         self._live.close()
 
 
+def _bounds(
+    plant: AbstractPlant, spread: SpreadLike
+) -> tuple[Float[Array, " param"], Float[Array, " param"]]:
+    """Lowest and highest value of each parameter."""
+    given, usual = Spread.of(spread), zip(plant.definition.parameters, plant.nominal, strict=True)
+    ends = [[given.value(p, float(nominal), unit) for unit in (-1.0, 1.0)] for p, nominal in usual]
+    lower, upper = jnp.asarray(ends, float).T
+    return lower, upper
+
+
 @eqx.filter_jit
 def _free_motion(
-    plant: AbstractPlant, params: Params, inputs: Float[Array, "time input"]
+    plant: AbstractPlant,
+    region: Region,
+    lower: Float[Array, " param"],
+    upper: Float[Array, " param"],
+    inputs: Float[Array, "time input"],
 ) -> Float[Array, ""]:
-    """Largest output over its critical level under these inputs."""
-    return nearness(plant, response(plant, params, inputs))
+    """Largest output over its critical level under these inputs, on the possible plants.
+
+    These are within the bounds, or as far beyond them as the estimate is.
+    """
+    lower, upper = jnp.minimum(lower, region.center), jnp.maximum(upper, region.center)
+    points = jnp.stack(list(region.plants(plant, JUDGES)), axis=1)
+    points = jnp.clip(points, lower[None], upper[None])
+    sizes = jax.vmap(lambda own: nearness(plant, response(plant, plant.Params(*own), inputs)))(
+        points
+    )
+    return jnp.max(jnp.where(jnp.isfinite(sizes), sizes, jnp.inf))

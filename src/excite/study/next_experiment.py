@@ -225,6 +225,8 @@ class NextExperiment:
         candidates: that were compared.
         chosen: the best safe one; None where none is safe.
         warnings: sentences, where the plant does not explain the records.
+        nearness: largest output over its critical level on the possible plants, where the inputs
+            of the chosen one are played as a signal: of a policy, without its reactions.
     """
 
     plant: AbstractPlant
@@ -233,6 +235,7 @@ class NextExperiment:
     candidates: tuple[Candidate, ...]
     chosen: Candidate | None
     warnings: tuple[str, ...] = ()
+    nearness: float = 0.0
 
     @property
     def decision(self) -> str:
@@ -270,10 +273,16 @@ class NextExperiment:
         Of a policy these are the inputs on the estimated plant; played as a policy, it reacts.
 
         Raises:
-            ValueError: for another ending, a file that exists, unless `overwrite`, or where no
-                candidate is safe.
+            ValueError: for another ending, a file that exists, unless `overwrite`, where no
+                candidate is safe, or where a policy is safe only because it reacts.
         """
         require_record_path(Path(path), overwrite)
+        if self.chosen is not None and self.nearness >= LARGEST:
+            raise ValueError(
+                f"the inputs of {self.chosen.name}, as a signal that does not react, reach "
+                f"{self.nearness:.2f} of a critical level on a possible plant, and are not "
+                "written: play the policy itself (excite run --policy)"
+            )
         write_record(path, self.record, self.plant.description)
 
     def plot(self) -> Figure:
@@ -437,7 +446,12 @@ def next_experiment(
     )
     progress("done", 2, 2)
     best = best_of(made, targets)
-    result = NextExperiment(own, now, targets, tuple(made), best, given.warnings)
+    nearness = 0.0 if best is None else best.nearness
+    if best is not None and isinstance(best.excitation, Policy):
+        replay = Replay(jnp.asarray(best.inputs))
+        as_signal = _candidate(own, region, targets, best.name, replay, length, coast, seed)
+        nearness = as_signal.nearness
+    result = NextExperiment(own, now, targets, tuple(made), best, given.warnings, nearness)
     if out is not None:
         result.save(out, overwrite)
     return result
