@@ -61,7 +61,8 @@ def test_the_page_says_what_campaigns_with_guard_on_the_detailed_rig_did():
         f"{inside} of {3 * count} intervals", f"(largest {found['largest']:.3f})",
     ):  # fmt: skip
         assert words in told.replace("\n", " ")
-    assert found["same_decisions"] == count
+    assert f"records of {found['told_again']} of" in told.replace("\n", " ")
+    assert found["same_decisions"] == found["told_again"] > 0
 
 
 def test_campaigns_that_were_killed_went_on_where_they_were():
