@@ -438,6 +438,19 @@ def test_records_that_the_plant_does_not_explain_are_a_warning():
 
 
 @pytest.mark.slow
+def test_a_policy_that_is_played_although_no_candidate_is_safe_is_a_warning(monkeypatch):
+    campaign = ex.Campaign("aero2", {"D_p": "0.1%"}, policy=steady())
+    campaign.tell(ex.simulate("aero2", steady(), params=TRUE, seed=1))
+    monkeypatch.setattr("excite.study.campaign.candidates", lambda *_, **__: [])
+    assert campaign.warnings == ()
+    assert campaign.ask() is campaign.policy
+    (sentence,) = campaign.warnings
+    assert sentence.endswith(
+        "no candidate is safe on all plants that are possible; the policy is played all the same"
+    )
+
+
+@pytest.mark.slow
 def test_a_spread_that_excludes_the_estimate_is_a_warning():
     campaign = ex.Campaign("aero2", {"D_p": "0.1%"}, policy=steady(), spread=0.3)
     record = ex.simulate("aero2", steady(), params={**TRUE, "J_p": 0.06}, seed=1)

@@ -286,6 +286,9 @@ class Campaign:
         if self.result is not None and is_declared:
             region = region_of(self.plant, self.result, self.spread)
             told += [sentence] if (sentence := excluded(self.plant, region, self.spread)) else []
+        if self.next is not None and self.next.chosen is None:
+            opening = "policy" if self.policy else "robust signal"
+            told.append(f"{self.next.decision}; the {opening} is played all the same")
         return tuple(told)
 
     @cached_property

@@ -149,10 +149,14 @@ def campaign(
                 if made.interrupted:
                     break
             progress(f"preparing round {count + 1}", count, rounds)
+            warned = made.warnings
             if (asked := made.ask()) is None:
                 folder.write(made)
                 break
             folder.write(made)  # what is played, should the round be the last of this process
+            for sentence in made.warnings:
+                if sentence not in warned:
+                    on_warning(sentence)
             played, signals = _played(
                 made, asked, opened(count), folder.path(count), filter, guard,
                 lambda count=count: progress(f"round {count + 1}", count, rounds),
