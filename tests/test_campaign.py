@@ -211,10 +211,6 @@ def test_a_quantity_of_a_parameter_that_is_not_known_is_not_known():
             "a budget of 59 samples is shorter than a round of 60",
         ),
         ({"samples": 0}, "samples must be a whole number from 1 to 10000000: got 0"),
-        (
-            {"rivals": ["aero2_lag,d_S=10%"]},
-            "a campaign identifies parameters, and 'd_S' of rival aero2_lag,d_S=10% is none",
-        ),
     ],
 )
 def test_a_campaign_that_cannot_be_played_is_one_sentence(options, words):

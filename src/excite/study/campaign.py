@@ -255,15 +255,7 @@ class Campaign:
         if isinstance(rivals, str) or not isinstance(rivals, Sequence):
             raise wrong_type("rivals", rivals, "a list of plants")
         if rivals:
-            given = rivals_from([self.plant, *rivals], self.spread)
-            for rival in given:
-                names = names_of(rival.box.plant.definition.parameters)
-                if other := [name for name in rival.box.names if name not in names]:
-                    raise ValueError(
-                        f"a campaign identifies parameters, and {other[0]!r} of rival {rival.name} "
-                        "is none: leave out its range"
-                    )
-            self.discrimination = judged(given, [])
+            self.discrimination = judged(rivals_from([self.plant, *rivals], self.spread), [])
             for rival in self.discrimination.rivals:
                 for name in [t.name for t in self.targets if isinstance(t.quantity, OneParameter)]:
                     if name not in rival.estimate:
