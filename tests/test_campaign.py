@@ -26,7 +26,7 @@ from excite.policy import Layout
 from excite.rig.contract import Interval, Sample
 from excite.simulation import response, run_episode
 from excite.study.campaign import REACHED
-from excite.study.campaign_on_rig import _paused
+from excite.study.campaign_on_rig import _Folder, _paused
 from excite.study.monitor import Monitor
 from excite.study.quantities import known_of, propagated
 from excite.study.targets import others_of, targets_from
@@ -570,6 +570,16 @@ def test_one_process_at_a_time_works_in_a_folder(tmp_path):
         pass
     with locked_folder(tmp_path / "a", "this campaign"):
         pass
+
+
+def test_a_folder_in_which_a_file_was_being_written_is_that_of_a_campaign(tmp_path):
+    campaign = ex.Campaign("aero2", EASY, policy=steady())
+    for name in (".campaign.json.x1", ".run.json.x2", "run.json"):
+        (tmp_path / name).write_text("{")
+    assert not _Folder.checked(tmp_path, campaign, {}, "").has_rounds
+    (tmp_path / ".thesis").write_text("mine")
+    with pytest.raises(ValueError, match="exists and is no campaign"):
+        _Folder.checked(tmp_path, campaign, {}, "")
 
 
 def test_a_signal_ends_the_pause_between_rounds(monkeypatch):

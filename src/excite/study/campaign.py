@@ -279,8 +279,7 @@ class Campaign:
             region = region_of(self.plant, self.result, self.spread)
             told += [sentence] if (sentence := excluded(self.plant, region, self.spread)) else []
         if self.next is not None and self.next.chosen is None:
-            opening = "policy" if self.policy else "robust signal"
-            told.append(f"{self.next.decision}; the {opening} is played all the same")
+            told.append(f"{self.next.decision}; the {self._opening_told} is played all the same")
         return tuple(told)
 
     @cached_property
@@ -331,8 +330,7 @@ class Campaign:
             return None
         if is_other and not self.redesign:
             made_for, own = self.declared.description.name, self.plant.description.name
-            opening = "policy" if self.policy else "robust signal"
-            self.reason = f"the {opening} is for {made_for}, not for {own}"
+            self.reason = f"the {self._opening_told} is for {made_for}, not for {own}"
             return None
         self.playing = self._opening_name if chosen is None else chosen.name
         return self.opening if chosen is None else chosen.excitation
@@ -469,6 +467,10 @@ class Campaign:
     @property
     def _opening_name(self) -> str:
         return ROBUST if self.policy is None else "policy"
+
+    @property
+    def _opening_told(self) -> str:
+        return "robust signal" if self.policy is None else "policy"
 
     @property
     def known(self) -> dict[str, Interval]:

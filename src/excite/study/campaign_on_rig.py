@@ -224,7 +224,8 @@ def _played(
 
 def _names_in(folder: Path) -> set[str]:
     """Names of files, without those that were being written when a process was killed."""
-    return {p.name for p in folder.iterdir() if not p.name.startswith(".campaign.json.")}
+    begun = (".campaign.json.", ".run.json.")
+    return {p.name for p in folder.iterdir() if not p.name.startswith(begun)}
 
 
 def _has_samples(path: Path) -> bool:
