@@ -455,6 +455,94 @@ def test_a_spread_that_excludes_the_estimate_is_a_warning():
     assert sentence.startswith("the spread 0.3 excludes the estimate of J_p, 0.0")
 
 
+KNOWN = {"J_p": "lognormal:0.024:5%", "K_pu": "lognormal:0.0112:5%"}
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"prior": {"c": "normal:1:2"}}, "'c'"),
+        ({"prior": {"J_p": "normal:1:0.001"}}, "excludes the estimate of J_p, 1 kg m^2"),
+        ({"prior": KNOWN, "target": {"J_p": "50%"}}, "every target is reached by the prior"),
+        ({"prior": KNOWN, "rivals": ["aero2_lag"]}, "it does not go with rivals"),
+    ],
+)
+def test_a_prior_that_cannot_be_used_is_one_sentence(options, words):
+    given = {"plant": "aero2", "target": EASY, "policy": steady(), **options}
+    with pytest.raises(ValueError, match=re.escape(words)):
+        ex.Campaign(**given)
+
+
+def test_what_was_known_before_counts_in_every_estimate_and_prediction():
+    options: Any = {"policy": steady(), "redesign": False, "rounds": 2}
+    campaign = ex.Campaign("aero2", {"D_p": "0.001%"}, prior=KNOWN, **options)
+    half = campaign.known["J_p"].ci95_half / campaign.known["J_p"].estimate
+    assert half == pytest.approx(HALF_95 * 0.05, rel=0.01)  # the spread tells a little more
+    record = ex.simulate("aero2", campaign.ask(), params=TRUE, seed=1)
+    campaign.tell(record)
+    result = ex.identify(record, "aero2", prior=KNOWN, initial_state="known")
+    for name, interval in campaign.known.items():
+        assert interval.estimate == pytest.approx(result.params[name], rel=1e-6)
+        low, high = result.ci95(name)
+        assert interval.ci95_half == pytest.approx((high - low) / 2, rel=1e-4)
+    without = ex.Campaign("aero2", {"D_p": "0.001%"}, **options)
+    assert campaign.expected.shares["D_p"] < without.expected.shares["D_p"]
+    assert "of the prior" in str(dataclasses.replace(campaign.expected, samples=np.ones(32)))
+
+
+def test_records_that_contradict_the_prior_end_the_campaign():
+    prior = {"J_p": "lognormal:0.05:2%"}
+    campaign = ex.Campaign("aero2", EASY, policy=steady(), prior=prior, redesign=False)
+    campaign.tell(ex.simulate("aero2", campaign.ask(), params=TRUE, seed=1))
+    assert campaign.reason == "the records contradict the prior of J_p"
+
+
+@pytest.mark.science  # compiles the redesign
+def test_with_a_prior_and_without_a_policy_the_first_signal_is_designed_for_the_prior():
+    prior = {**KNOWN, "D_p": "lognormal:0.0011:10%"}
+    campaign = ex.Campaign("aero2", {"D_p": "1%"}, policy="none", prior=prior, steps=60, coast=20)
+    told = campaign.tell(ex.simulate("aero2", campaign.ask(), params=TRUE, seed=1))
+    assert (told.num_samples, told.played) == (60, "redesigned")
+    assert told.nearness < 1
+
+
+def test_a_campaign_ends_where_nothing_more_can_be_had():
+    still = dataclasses.replace(
+        steady(), weights=tuple((0 * W, 0 * b) for W, b in steady().weights)
+    )
+    record = ex.simulate("aero2", steady(), params=TRUE, seed=1)
+    campaign = ex.Campaign("aero2", {"D_p": "0.01%"}, policy=still, redesign=False)
+    campaign.tell(record)
+    assert campaign.ask() is not None  # this round told something
+    campaign.records.append(dataclasses.replace(record, inputs=0 * record.inputs))
+    assert campaign.ask() is None
+    assert campaign.reason.startswith(
+        "nothing more can be had: 9 more rounds would hardly tell more of D_p, known to "
+    )
+
+
+def test_later_rounds_compile_nothing():
+    campaign = ex.Campaign("aero2", {"D_p": "0.001%"}, policy=steady(), redesign=False)
+    records = [ex.simulate("aero2", steady(), params=TRUE, seed=seed) for seed in range(4)]
+    short = dataclasses.replace(
+        records[3], time=records[3].time[:-7], inputs=records[3].inputs[:-7],
+        outputs=records[3].outputs[:-7],
+    )  # fmt: skip
+    compiled = []
+    campaign.tell(records[0])
+    campaign.ask()
+    jax.monitoring.register_event_duration_secs_listener(
+        lambda event, *_, **__: compiled.append(event) if "backend_compile" in event else None
+    )
+    try:
+        for record in (*records[1:3], short):
+            campaign.tell(record)
+            assert campaign.ask() is not None
+    finally:
+        jax.monitoring.clear_event_listeners()
+    assert compiled == []
+
+
 def test_a_share_of_nothing_is_infinite():
     assert targets_from(Aero2(), {"D_p": "1%"})[0].share(0.0, 1e-3) == math.inf
 
@@ -658,6 +746,11 @@ def test_every_round_has_its_own_noise_and_the_same_plant(played):
 @pytest.mark.science
 def test_a_campaign_is_reported_and_its_estimate_is_a_run(played):
     folder, made = played
+    after = [ex.next_experiment(folder / f"round-0{i}", spread="factor:3", steps=30, coast=20,
+                                target=EASY).known for i in (1, 2)]  # fmt: skip
+    for name, interval in made.rounds[0].known.items():
+        assert after[0][name].estimate == pytest.approx(interval.estimate, rel=1e-6)
+    assert after[1]["D_p"].ci95_half < after[0]["D_p"].ci95_half
     page = ex.report(folder)
     for words in ("aero2: all rounds are played", "0.3 %", "missed", "Round 2: inputs", "factor:3"):
         assert words in page

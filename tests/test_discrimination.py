@@ -324,6 +324,27 @@ def test_a_campaign_ends_where_no_signal_is_safe():
     assert campaign.reason == "undecided; no safe signal was found"
 
 
+@pytest.mark.science
+def test_the_constants_of_the_chosen_rival_are_those_of_its_fit():
+    true = Aero2().changed(d_S=1.1 * 0.0019435)
+    rivals = [("aero2", {"d_S": "20%"})]
+    campaign = ex.Campaign("aero2_lag", {"J_p": "1%"}, policy="none", rivals=rivals)
+    records = [ex.simulate(true, "prbs", steps=60, seed=seed) for seed in (1, 2)]
+    for record in records:
+        campaign.tell(record)
+    assert campaign.discrimination.chosen.name == "aero2,d_S=20%"
+    found = campaign.plant.constants.d_S
+    sd = campaign.discrimination.fitted_beside[0]["d_S"]
+    assert abs(float(found) - true.constants.d_S) < 4 * sd
+    # The parameters have the intervals of a fit in which the constant is uncertain.
+    result = ex.identify(records, campaign.plant, uncertain={"d_S": sd}, initial_state="known")
+    sure = ex.identify(records, campaign.plant, initial_state="known")
+    half = campaign.known["J_p"].ci95_half
+    assert half == pytest.approx(np.ptp(result.ci95("J_p")) / 2, rel=1e-3)
+    assert half > 1.5 * np.ptp(sure.ci95("J_p")) / 2
+    assert abs(campaign.known["J_p"].estimate - true.nominal.J_p) < 2 * half
+
+
 def test_targets_are_parameters_of_every_rival():
     with pytest.raises(ValueError, match="rival aero2 has no parameter 'tau', a target"):
         ex.Campaign("aero2_lag", {"tau": "2%"}, rivals=["aero2"], policy="aero2_lag")

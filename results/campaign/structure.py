@@ -23,8 +23,8 @@ from excite.estimation.evidence import fitted, probabilities, unplayed
 from excite.excitation.catalogue import excitation_named
 from excite.plant.catalogue import plant_from, with_sensor
 from excite.study.discrimination import DECIDED, rivals_from
-from excite.training.discrimination import discriminating
-from excite.training.redesign import SAFE, first_signals
+from excite.training.discrimination import discriminating, first_signals
+from excite.training.redesign import SAFE
 
 HERE = Path(__file__).parent
 RIVALS = (
@@ -57,7 +57,7 @@ def designed(rivals, count, seed):
 
     Yields all rows so far after each truth.
     """
-    starts = first_signals(rivals[0].box.plant, 1, STEPS)[:, 0]
+    starts = first_signals(rivals[0].box.plant, STEPS)
     prior = [unplayed(rival) for rival in rivals]
     begin = discriminating(rivals, prior, starts, COAST)
     rows = []

@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+from .identify import given_priors
 from .next import OF_TARGETS, TARGETS
 from .options import (
     COAST,
@@ -96,11 +97,17 @@ from .options import (
     "tell them apart first, in rounds without --guard and --filter.",
 )
 @click.option(
+    "--prior",
+    multiple=True,
+    metavar="NAME=DISTRIBUTION|PATH",
+    help="What is known before the first round, as for excite identify: an earlier run, too.",
+)
+@click.option(
     "--pause",
     type=Number(0),
-    default=0.0,
     metavar="SECONDS",
-    help="Wait before every round but the first, so that the plant comes to rest.",
+    help="Wait before every round but the first, so that the plant comes to rest; needed but for "
+    "a simulated rig or an FMU.",
 )
 @click.option("--filter", is_flag=True, help="Predictive safety filter for this spread.")
 @click.option("--guard", is_flag=True, help="Brake where no declared plant explains a round.")
@@ -123,6 +130,7 @@ def campaign(
     plant: str,
     targets: tuple[dict[str, str], ...],
     faults: tuple[dict[str, float], ...],
+    prior: tuple[str, ...],
     plot: Path | None,
     as_json: bool,
     **options: Any,
@@ -141,6 +149,7 @@ def campaign(
             plant,
             merged(targets),
             fault=merged(faults),
+            prior=given_priors(prior),
             command=command_line(),
             progress=progress,
             on_warning=lambda sentence: click.echo(f"warning: {sentence}", err=True),

@@ -72,6 +72,22 @@ class Experiments(eqx.Module):
     dt: Float[Array, "experiment time"] | None = None
     next_inputs: Float[Array, "experiment time input"] | None = None
 
+    def padded(self, count: int, num_samples: int) -> Experiments:
+        """With samples and experiments in which nothing was measured, up to these numbers.
+
+        Programs that were compiled for them serve all smaller sets of experiments.
+        """
+        more, longer = max(0, count - len(self.valid)), max(0, num_samples - self.valid.shape[1])
+        if not (more or longer):
+            return self
+
+        def wider(rows: Array) -> np.ndarray:
+            if rows is self.initial_state:
+                return np.pad(rows, [(0, more), (0, 0)], mode="edge")
+            return np.pad(rows, [(0, more), (0, longer), *[(0, 0)] * (rows.ndim - 2)])
+
+        return jax.device_put(jax.tree.map(wider, self))
+
 
 def stack_experiments(
     plant: AbstractPlant,

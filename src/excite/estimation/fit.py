@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
+import equinox as eqx
 import jax
 import numpy as np
 
@@ -104,16 +105,26 @@ def fit_of(
     estimator: AbstractEstimator,
     start: Params,
     progress: Progress,
+    room: tuple[int, int] = (0, 0),
 ) -> Fit:
     """Fits; parameters that were held are tested once more, from the estimate.
 
     Far from the true values a search can end at an estimate where the outputs hardly depend
     on a parameter, although the data determine it.
+
+    Args:
+        plant: with the sampling time of the experiments.
+        experiments: the data.
+        estimator: that fits.
+        start: of its search.
+        progress: called with a text, how much is done, and the total.
+        room: number and length of the experiments for which the search is compiled, if that is
+            more than there are.
     """
-    fit = _fit_seen(plant, experiments, estimator, start, progress)
+    fit = _fit_seen(plant, experiments, estimator, start, progress, room)
     if not (fit.reasons and fit.is_successful):
         return fit
-    again = _fit_seen(plant, experiments, estimator, fit.estimate.params, progress)
+    again = _fit_seen(plant, experiments, estimator, fit.estimate.params, progress, room)
     return again if again.is_successful and again.free.sum() > fit.free.sum() else fit
 
 
@@ -123,12 +134,13 @@ def _fit_seen(
     estimator: AbstractEstimator,
     start: Params,
     progress: Progress,
+    room: tuple[int, int],
 ) -> Fit:
     """Fits; holds a parameter that ends at a bound or is not identifiable, and fits again."""
     names = names_of(plant.definition.parameters)
     known = known_parameters(plant, estimator)
     begin, free, reasons = start, ~known, {}
-    found = _estimate(plant, experiments, estimator, start, free, progress)
+    found = _estimate(plant, experiments, estimator, start, free, progress, room)
     first = Fit(found[0], free, known, reasons, found[1:])
     while True:
         fit = Fit(found[0], free, known, reasons, found[1:])
@@ -151,13 +163,13 @@ def _fit_seen(
             groups = tested.not_identifiable if tested else ()
             lost = [f"{STRUCTURALLY_NOT}: {group.sentence}" for group in groups]
             raise NothingLeftError("; ".join([*lost, nothing_seen(plant)]), first)
-        found = _estimate(plant, experiments, estimator, start, free, progress, [last])
+        found = _estimate(plant, experiments, estimator, start, free, progress, room, [last])
         contradicts = ""
         if bound is None and _fits_worse(plant, found[0], ended):
             contradicts = ", which contradicts the data (--start)"
             if _is_near(plant, chosen, value, ended):
                 start, value, contradicts = ended.params, float(ended.params[chosen]), ""
-                found = _estimate(plant, experiments, estimator, start, free, progress, [])
+                found = _estimate(plant, experiments, estimator, start, free, progress, room, [])
         held_at = "" if bound is not None else f"; {name} was held at {value:g}{contradicts}"
         reasons = {**reasons, name: why + held_at}
 
@@ -169,6 +181,7 @@ def _estimate(
     start: Params,
     free: np.ndarray,
     progress: Progress,
+    room: tuple[int, int],
     others: Sequence[Params] | None = None,
 ) -> list[Estimate]:
     """Estimates, the best first; the search is repeated where it may have missed the best one.
@@ -177,19 +190,22 @@ def _estimate(
     because segments in which little is measured lead astray, and from other starts, default random
     ones; where it does not converge, it has longer segments.
     """
+    padded, (count, num_measured) = experiments.padded(*room), experiments.valid.shape[:2]
 
     def search(estimator: AbstractEstimator, start: Params) -> Estimate:
-        return jax.device_get(estimator(plant, experiments, *jax.device_put((start, free))))
+        found = jax.device_get(estimator(plant, padded, *jax.device_put((start, free))))
+        own = found.initial_state[:count], found.residual[:count, :num_measured]
+        return eqx.tree_at(lambda e: (e.initial_state, e.residual), found, own)
 
     if isinstance(estimator, PEM):  # it begins where least squares ends
         least_squares = NLS(known=estimator.known)
-        first = _estimate(plant, experiments, least_squares, start, free, progress, others)
+        first = _estimate(plant, experiments, least_squares, start, free, progress, room, others)
         start = first[0].params
         progress("prediction error", np.nan, 1.0)  # how long it takes is not known
     found = [search(estimator, start)]
     if not isinstance(estimator, NLS):
         return found
-    size, num_samples = experiments.valid.size, experiments.valid.shape[1]
+    size, num_samples = experiments.valid.size, padded.valid.shape[1]
     length, is_short = estimator.length_of_segments(plant, num_samples), size < _TELLING
     few = size <= _SIZE_OF_MANY_STARTS
     is_in_doubt = is_short or not is_noise(plant, experiments, found[0])

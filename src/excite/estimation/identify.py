@@ -21,6 +21,7 @@ from ..description import (
     by_name,
     listed,
     names_of,
+    require_whole,
     unknown,
     wrong_type,
 )
@@ -140,6 +141,7 @@ def identify(
     set_inputs: Mapping[str, float] | None = None,
     dt: float | None = None,
     rows: slice | str | None = None,
+    room: tuple[int, int] = (0, 0),
     progress: Progress = SHOWN,
 ) -> Identification:
     """Parameters of one plant from one or several records.
@@ -187,6 +189,8 @@ def identify(
         set_inputs: values of constant inputs that the files do not have: {"voltage": 5.0}.
         dt: sampling time of files without time [s].
         rows: rows of the files to use, counted from 0: slice(100, 1000, 5) or "100:1000:5".
+        room: number of records, and of samples in each, for which the estimator nls is compiled:
+            after the first of many fits, those of no more records and samples take no time for it.
 
     Raises:
         ValueError: for records too short, or in which no parameter can be identified, for a
@@ -196,6 +200,8 @@ def identify(
     given = records_in(records, "records")
     if not given:
         raise ValueError("no record is given")
+    for number in room:
+        require_whole("room", number, 0)
     held_out = records_in(validate, "validate")
     if validate_columns and not held_out:
         raise ValueError("validate_columns need a held-out record (--validate)")
@@ -252,7 +258,8 @@ def identify(
     find = partial(_suspects, seen, records, experiments, estimator, begin, linear, progress)
     too = PRIOR_TOO * bool(num_priors)
     try:
-        fit = fit_of(seen, experiments, estimator, begin, progress)
+        has_room = isinstance(estimator, NLS) and not by_steps
+        fit = fit_of(seen, experiments, estimator, begin, progress, room if has_room else (0, 0))
     except NothingLeftError as refusal:
         raise _with_causes(str(refusal) + too, find(refusal.fit, False, False)[0]) from None
     params, prediction = fit.estimate.params, fit.estimate.prediction
@@ -299,7 +306,7 @@ def identify(
     sd = np.where(fit.free, np.sqrt(np.maximum(np.diag(covariance), 0.0)), np.nan)
     half = np.where(fit.free, half_95(covariance, degrees), np.nan)
     if isinstance(estimator, NLS) and fit.is_successful and not by_steps:
-        coarse = too_coarse(plant, experiments, fit.estimate, fit.free, sd)
+        coarse = too_coarse(plant, experiments, fit.estimate, fit.free, sd, room)
         verdict = (*coarse, *verdict)
     ends = np.stack([values - half, values + half], axis=1)
     ends = within_support(plant, ends) if fit.is_successful else ends

@@ -31,7 +31,6 @@ from ..description import (
     Spread,
     SpreadLike,
     names_of,
-    prior_sd_of,
     require_whole,
     wrong_type,
 )
@@ -39,6 +38,7 @@ from ..environment import run_episodes
 from ..estimation import Status
 from ..estimation.diagnosis import chi2_tail
 from ..estimation.identify import RecordLike, identify, record_for
+from ..estimation.prior_knowledge import PriorLike, plants_of, with_prior
 from ..estimation.result import Identification
 from ..excitation import PolicyExcitation, Replay
 from ..information import require_noise, running_information
@@ -55,9 +55,9 @@ from ..training.design import design
 from ..training.redesign import Region
 from .discrimination import Discrimination, RivalLike, judged, rivals_from, with_experiment
 from .falsify import trained_in
-from .knowledge import excluded, region_of, unexplained
+from .knowledge import excluded, intervals_in, region_of, unexplained
 from .monitor import Monitor
-from .next_experiment import COAST, NextExperiment, best_of, candidates
+from .next_experiment import COAST, Candidate, NextExperiment, best_of, candidates
 from .quantities import (
     AbstractQuantity,
     OneParameter,
@@ -88,9 +88,10 @@ NO_POLICY = "none"  # instead of a policy's name
 DESIGNED = 50  # samples of a round without a policy, unless another number is given
 
 _SHORT = 20  # samples of a round that tells rivals apart
-_PADDED = 8  # rounds for which the fits of rivals are compiled
+_PADDED = 8  # rounds for which identification and the fits of rivals are compiled
 _PLANTS = 32  # drawn to predict what a campaign reaches
 _FEWER = 8  # where a signal is redesigned for each of them
+_HARDLY = 0.98  # what all rounds that are left must make of an interval, or none is played
 
 
 @dataclass(frozen=True)
@@ -124,28 +125,35 @@ class Round:
 
 @dataclass(frozen=True)
 class Expected:
-    """What a campaign reaches on plants drawn from its spread, by the Cramér-Rao bound.
+    """What a campaign reaches on plants drawn from its spread or prior, by the Cramér-Rao bound.
 
     Attributes:
         samples: of each plant, until every target is reached; infinite where that takes more
             rounds than there are.
         shares: of each target, half of the interval over that allowed after all rounds, of the
             plant on which it is smallest.
+        drawn_from: spread or prior.
     """
 
     samples: Float[np.ndarray, " plant"]
     shares: Mapping[str, float]
+    drawn_from: str = "spread"
+
+    @property
+    def missed(self) -> dict[str, float]:
+        """Of targets that are reached on no plant, the share."""
+        return {name: share for name, share in self.shares.items() if not share <= 1}
 
     def __str__(self) -> str:
         reached = np.isfinite(self.samples)
         if not reached.any():
-            return "no plant of the spread reaches every target"
+            return f"no plant of the {self.drawn_from} reaches every target"
         count = len(self.samples)
         share, word = (0.9, "90 %") if count >= _PLANTS else (1.0, "largest")
         median, most = np.quantile(self.samples, [0.5, share], method="inverted_cdf")
         told = f"{median:.0f} samples" if np.isfinite(median) else "more rounds than there are"
         often = f"{most:.0f}" if np.isfinite(most) else "more rounds than there are"
-        return f"{told} (median of {count} plants of the spread; {word}: {often})"
+        return f"{told} (median of {count} plants of the {self.drawn_from}; {word}: {often})"
 
 
 class Campaign:
@@ -170,6 +178,7 @@ class Campaign:
         steps: samples of a round; a robust signal has half as many.
         redesign: whether signals are redesigned for later rounds.
         spread: of the parameters before the campaign.
+        prior: what else was known of them.
         most_rounds, most_samples: the budget; samples are not limited where that is None.
         coast: samples of free motion after an end that must be safe.
         records: of all rounds.
@@ -198,6 +207,7 @@ class Campaign:
         coast: int | None = None,
         redesign: bool = True,
         rivals: Sequence[RivalLike] = (),
+        prior: PriorLike | Sequence[PriorLike] | None = None,
     ) -> None:
         """A campaign before its first round.
 
@@ -223,6 +233,10 @@ class Campaign:
                 the targets with fewer samples than what was played first; see `next_experiment`.
             rivals: other plants of which one may be the true one, as for `discriminate`. Signals
                 tell them apart first, in rounds of 20 samples.
+            prior: what is known beside the spread, as for `identify`: the run folder of earlier
+                records, or distributions by parameter. The first round then plays a signal that
+                is designed for it, where that is better than the policy; without a policy no
+                robust signal is needed. Not with rivals.
 
         Raises:
             ValueError: for a name or a value that is not allowed.
@@ -250,7 +264,7 @@ class Campaign:
         self.spread = Spread.of(usual if spread is None else spread)
         self.coast = coast if coast is not None else usual_coast or COAST
         require_whole("coast", self.coast, 0)
-        self.redesign = redesign
+        self.redesign, self.prior = redesign, prior
         self.discrimination: Discrimination | None = None
         if isinstance(rivals, str) or not isinstance(rivals, Sequence):
             raise wrong_type("rivals", rivals, "a list of plants")
@@ -263,12 +277,19 @@ class Campaign:
             for own in self.discrimination.rival_plants:
                 for quantity in others_of(own, self.targets):
                     require_defined(quantity, own)
+        if prior is not None:
+            if rivals:
+                raise ValueError("a prior is of one plant: it does not go with rivals")
+            if told := excluded(self.plant, self._before, self.spread):
+                raise ValueError(f"{told}, or another prior")
         self.records: list[Record] = []
         self.rounds: list[Round] = []
         self.result: Identification | None = None
         self.next: NextExperiment | None = None
         self.reason, self.interrupted, self.prediction = "", "", ""
         self.haste, self.playing = 1.0, ""
+        if prior is not None and max(shares_of(self.targets, self.known).values()) <= 1:
+            raise ValueError("every target is reached by the prior: ask for more")
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -283,14 +304,25 @@ class Campaign:
         return tuple(told)
 
     @cached_property
+    def _before(self) -> Region:
+        """What is known before the first round."""
+        return region_of(self.declared, self.prior or {}, self.spread)
+
+    @cached_property
     def opening(self) -> Policy | Replay:
-        """What the first round plays: the policy, or a robust signal, which takes minutes.
+        """What the first round plays: the policy, a signal for the prior, or a robust one.
+
+        Designing a robust signal takes minutes.
 
         Raises:
             ValueError: for a signal that reaches a critical level on a plant of the spread.
         """
         if self.policy is not None:
             return self.policy
+        if self.prior is not None:
+            made = self._candidates(self._before, None)[-1]
+            if made.is_safe:
+                return made.excitation
         steps, spread = self.steps // 2, self.spread.setting
         made = design(self.declared, steps=steps, spread=spread, coast=self.coast)
         if made.violations:
@@ -321,8 +353,8 @@ class Campaign:
                 return None
             self.playing = DISCRIMINATING
             return self.discrimination.excitation
-        if self.result is not None and self.redesign and self.next is None:
-            self.next = self._next(self.result)
+        if self.redesign and self.next is None:
+            self.next = self._next()
         chosen = None if self.next is None else self.next.chosen
         is_other = self.plant.description.hash != self.declared.description.hash
         if self.next is not None and chosen is None and is_other:
@@ -331,6 +363,9 @@ class Campaign:
         if is_other and not self.redesign:
             made_for, own = self.declared.description.name, self.plant.description.name
             self.reason = f"the {self._opening_told} is for {made_for}, not for {own}"
+            return None
+        if told := self._nothing_more():
+            self.reason = told
             return None
         self.playing = self._opening_name if chosen is None else chosen.name
         return self.opening if chosen is None else chosen.excitation
@@ -351,17 +386,61 @@ class Campaign:
         """Whether several rivals are still possible."""
         return self.discrimination is not None and self.discrimination.chosen is None
 
-    def _next(self, result: Identification) -> NextExperiment | None:
-        """The candidates of the coming round; None where the estimate is not to be trusted."""
-        if unexplained(result) or result.held:
+    def _next(self) -> NextExperiment | None:
+        """The candidates of the coming round; None where no estimate is to be trusted."""
+        if self.result is None and (self.prior is None or self.rounds):
             return None
-        region, known = region_of(self.plant, result, self.spread), self.known
-        made = candidates(
-            self.plant, region, self.targets, (self._opening_name, self.opening),
+        if self.result is not None and (unexplained(self.result) or self.result.held):
+            return None
+        made = self._candidates(self._region, (self._opening_name, self.opening))
+        best = best_of(made, self.targets)
+        return NextExperiment(self.plant, self.known, self.targets, tuple(made), best)
+
+    def _candidates(
+        self, region: Region, opening: tuple[str, Policy | Replay] | None
+    ) -> list[Candidate]:
+        """What could be played, given what is known: the opening, and a redesigned signal."""
+        return candidates(
+            self.plant, region, self.targets, opening,
             num_steps=self.steps, coast=self.coast, seed=len(self.rounds),
         )  # fmt: skip
-        best = best_of(made, self.targets)
-        return NextExperiment(self.plant, known, self.targets, tuple(made), best)
+
+    @property
+    def _region(self) -> Region:
+        """What is known, from all rounds and before them."""
+        if self.result is None:
+            return self._before
+        return region_of(self.plant, self.result, self.spread)
+
+    def _nothing_more(self) -> str:
+        """A sentence where all rounds that are left would tell hardly more; else nothing.
+
+        Each of them is taken to bring what the coming one is predicted to bring.
+        """
+        if self.result is None or unexplained(self.result):
+            return ""
+        left = self.most_rounds - sum(r.ended in WHOLE for r in self.rounds)
+        if self.most_samples is not None:
+            left = min(left, (self.most_samples - self.num_samples) // self.steps)
+        chosen, now = None if self.next is None else self.next.chosen, self._region
+        played = self.records[-1].inputs[:-1] if chosen is None else chosen.inputs
+        inputs = jnp.asarray(np.resize(played, (self.steps, played.shape[1])))
+        gained = running_information(self.plant, self.plant.Params(*now.center), inputs)[-1]
+        then = Region(now.center, now.information + left * gained)
+        others = others_of(self.plant, self.targets)
+        before, after = (
+            shares_of(self.targets, intervals_in(self.plant, region, others))
+            for region in (now, then)
+        )
+        name, share = max(after.items(), key=lambda item: item[1])
+        if share <= 1 or share < _HARDLY * before[name]:
+            return ""
+        target = next(t for t in self.targets if t.name == name)
+        more = f"{left} more round{'s' * (left != 1)}"
+        return (
+            f"nothing more can be had: {more} would hardly tell more of {name}, known to "
+            f"{target.at(before[name])}, and not to {target}"
+        )
 
     def tell(
         self,
@@ -396,7 +475,8 @@ class Campaign:
             raise ValueError(f"a round is sampled every {dt:g} s: got one of {interval:g} s")
         self.records.append(record)
         played, structure = played or self.playing or self._opening_name, ""
-        if self.is_undecided:
+        others = self.discrimination is not None and any(self.discrimination.fitted_beside)
+        if self.is_undecided or others:  # these are fitted to all records, too
             structure = self._compare()
         count, status = len(record.time) - 1, structure
         if not self.is_undecided:
@@ -415,6 +495,8 @@ class Campaign:
             self.reason = ""
         elif unsafe or near >= 1:
             self.reason = f"unsafe: {ended if unsafe else 'a critical level was reached'}"
+        elif told := self._contradicted():
+            self.reason = f"the records contradict the prior of {', '.join(told)}"
         elif shares and max(shares.values()) <= 1:
             self.reason = REACHED
         elif self.discrimination is not None and not self.discrimination.is_explained:
@@ -436,20 +518,38 @@ class Campaign:
         """Compares the rivals; the plant is the one that is chosen. Returns the decision."""
         if self.discrimination is None:
             return ""
+        before = self.discrimination.chosen
         self.discrimination = self.discrimination.after(self.records, _PADDED)
-        if self.is_undecided or self.discrimination.plant is not self.plant:
+        now = self.discrimination.chosen
+        if now is None or before is None or now.name != before.name:
             self.result = None
         self.plant = self.discrimination.plant or self.plant
         return self.discrimination.decision
 
     def _identify(self) -> str:
         """Identifies all records together; returns the status."""
+        uncertain, is_free = (
+            ({}, False) if self.discrimination is None else self.discrimination.fitted_beside
+        )
         try:
-            result = identify(self.records, self.plant, start=self._start(), initial_state="known")
+            result = identify(
+                self.records, self.plant, start=self._start(), prior=self.prior,
+                uncertain=uncertain, initial_state="free" if is_free else "known",
+                room=(_PADDED, self.steps + 1),
+            )  # fmt: skip
         except ValueError as error:  # this record tells nothing; another one may
             return str(error)
         self.result = result if result.is_usable else self.result
         return result.status
+
+    def _contradicted(self) -> list[str]:
+        """Parameters in which the records contradict the prior."""
+        if self.prior is None or self.result is None:
+            return []
+        _, joint, _ = with_prior(self.declared, self.prior, self.declared.nominal, {}, {})
+        return (
+            [] if joint is None else joint.contradicted(self.result.params, self.result.std_error)
+        )
 
     def _is_explained(self) -> bool:
         """Whether the residual is noise, of the declared size where there are rivals.
@@ -476,10 +576,12 @@ class Campaign:
     def known(self) -> dict[str, Interval]:
         """Of each parameter and target, the estimate and half of its 95 % interval.
 
-        It is that from all rounds; empty without one.
+        It is that from all rounds, or before them that of the prior; empty without one.
         """
         others = others_of(self.plant, self.targets)
-        return {} if self.result is None else known_of(self.plant, self.result, others)
+        if self.result is not None:
+            return known_of(self.plant, self.result, others)
+        return {} if self.prior is None else intervals_in(self.plant, self._before, others)
 
     def _start(self) -> dict[str, float] | None:
         """Where the next identification begins."""
@@ -491,66 +593,73 @@ class Campaign:
 
     def monitor(self, waits: bool = False) -> Monitor:
         """A judge of the next round while it runs; see `Monitor`."""
-        room = 1 / self.haste
+        before, room = self.prior if self.result is None else self.result, 1 / self.haste
         return Monitor(
-            self.plant, self.result, self.targets, self.steps, self.coast, waits, self.spread, room
+            self.plant, before, self.targets, self.steps, self.coast, waits, self.spread, room
         )
 
     @cached_property
     def expected(self) -> Expected:
         """What the campaign will reach; computed once, in seconds, or a minute without a policy.
 
-        With a policy, every round plays it. Without one, the first plays the robust signal, and
-        all others what is redesigned for each plant after it.
+        With a policy, every round plays it. Without one, or where that reaches too little, all
+        rounds after the first play what is redesigned for each plant.
         """
-        opening, steps, count = self.opening, self.steps, _PLANTS
+        redesigns = self.redesign and self._whole_rounds > 1
+        if self.policy is None:
+            return self._expected(redesigns)
+        found = self._expected(False)
+        return self._expected(True) if found.missed and redesigns else found
+
+    def _expected(self, redesigns: bool) -> Expected:
+        """The same, with redesigned signals after the first round or without them."""
+        opening, steps = self.opening, self.steps
         if isinstance(opening, Policy):
             excitation = PolicyExcitation.of(opening)
         else:
-            excitation, steps, count = opening, len(opening.inputs), _FEWER
+            excitation, steps = opening, len(opening.inputs)
+        count = _FEWER if redesigns or self.policy is None else _PLANTS
         keys = jax.random.split(jax.random.key(0), count)
-        episodes = run_episodes(self.plant, excitation, steps, self.spread, keys)
+        drawn = None if self.prior is None else plants_of(self.plant, self.prior, self.spread)
+        episodes = run_episodes(self.plant, excitation, steps, self.spread, keys, prior=drawn)
         first = later = episodes.trajectory.inputs
-        if self.redesign and self.policy is None and self._whole_rounds > 1:
+        if redesigns:
             later = jnp.stack([
                 self._redesigned(jax.tree.map(lambda x, i=i: x[i], episodes.params), first[i])
                 for i in range(count)
             ])  # fmt: skip
         asked = [t.quantity for t in self.targets]
-        outlook = _halves(self.plant, episodes.params, first, later, self._whole_rounds, asked)
+        known = self._before.information * (self.prior is not None)
+        outlook = _halves(
+            self.plant, episodes.params, first, later, self._whole_rounds, asked, known
+        )
         values, halves = map(np.asarray, outlook)
         shares = {
             t.name: t.share(values[:, None, i], halves[..., i]) for i, t in enumerate(self.targets)
         }
         is_reached = np.max(list(shares.values()), axis=0) <= 1  # plant, sample
         samples = np.where(is_reached.any(axis=1), is_reached.argmax(axis=1) + 1.0, np.inf)
-        return Expected(samples, {name: float(np.nanmin(s[:, -1])) for name, s in shares.items()})
+        best = {name: float(np.nanmin(s[:, -1])) for name, s in shares.items()}
+        return Expected(samples, best, "spread" if self.prior is None else "prior")
 
     def _redesigned(
         self, params: Params, first: Float[Array, "time input"]
     ) -> Float[Array, "step input"]:
         """What would be played on a plant after the first round; that again where nothing is."""
-        before = jnp.eye(len(params)) / prior_sd_of(self.spread) ** 2
         gained = running_information(self.plant, params, first)[-1]
-        region = Region(jnp.stack(list(params)), before + gained)
-        made = candidates(
-            self.plant, region, self.targets, (self._opening_name, self.opening),
-            num_steps=self.steps, coast=self.coast,
-        )[-1]  # fmt: skip
+        region = Region(jnp.stack(list(params)), self._before.information + gained)
+        made = self._candidates(region, (self._opening_name, self.opening))[-1]
         return jnp.asarray(made.inputs if made.is_safe else np.resize(first, made.inputs.shape))
 
     def require_reachable(self) -> None:
         """Predicts what is reached; ValueError where no plant of the spread reaches the targets."""
-        far = {name: share for name, share in self.expected.shares.items() if not share <= 1}
-        if far:
+        if far := self.expected.missed:
             name, share = max(far.items(), key=lambda item: item[1])
             target = next(t for t in self.targets if t.name == name)
-            best = target.half * share
-            told = f"{100 * best:.2g} %" if target.is_relative else f"{best:.2g}"
             raise ValueError(
                 f"no campaign of at most {self._whole_rounds} rounds of {self.steps} samples "
-                f"reaches {name} to {target}: at best {told}; ask for less, or for more "
-                + ("rounds" if self.policy else "rounds or steps")
+                f"reaches {name} to {target}: at best {target.at(share)}; ask for less, or for "
+                "more " + ("rounds" if self.policy else "rounds or steps")
             )
         self.prediction = str(self.expected)
 
@@ -574,6 +683,7 @@ class Campaign:
             **({} if self.most_samples is None else {"most_samples": self.most_samples}),
             "coast": self.coast,
             "redesign": self.redesign,
+            "prior": {} if self.prior is None else self._known_before,
             "rivals": {} if self.discrimination is None else self.discrimination.plants,
             "structure": self.discrimination and self.discrimination.to_dict(),
             "warnings": list(self.warnings),
@@ -585,6 +695,12 @@ class Campaign:
             "num_samples": self.num_samples,
             "rounds": [r.to_dict() for r in self.rounds],
         }
+
+    @property
+    def _known_before(self) -> dict[str, dict[str, float]]:
+        """What was known of the parameters before the first round, as JSON-ready data."""
+        known = intervals_in(self.declared, self._before, ())
+        return {name: interval._asdict() for name, interval in known.items()}
 
     def _allowed(self) -> dict[str, float]:
         """Of each target, half of the interval that is allowed; empty without an estimate."""
@@ -683,6 +799,7 @@ def _halves(
     later: Float[Array, "plant step input"],
     rounds: int,
     quantities: Sequence[AbstractQuantity],
+    known: Float[Array, "param param"],
 ) -> tuple[Float[Array, "plant quantity"], Float[Array, "plant sample quantity"]]:
     """Values, and half of each interval after every sample of all rounds.
 
@@ -693,10 +810,11 @@ def _halves(
         later: inputs of each other round.
         rounds: of the campaign.
         quantities: that are asked.
+        known: information before the first round.
     """
 
     def one(params: Params, first: Array, later: Array) -> tuple[Array, Array]:
-        opened = running_information(plant, params, first)
+        opened = known[None] + running_information(plant, params, first)
         each = running_information(plant, params, later)
         before = opened[-1][None] + jnp.arange(rounds - 1)[:, None, None] * each[-1][None]
         others = (before[:, None] + each[None]).reshape((rounds - 1) * len(each), *each.shape[1:])

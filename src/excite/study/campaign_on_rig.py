@@ -19,6 +19,7 @@ from ..description import (
     require_whole,
     wrong_type,
 )
+from ..estimation.prior_knowledge import PriorLike
 from ..excitation import Replay
 from ..files import csv_text, locked_folder, read_json, write_bytes, write_json
 from ..plant.catalogue import PlantLike
@@ -27,8 +28,10 @@ from ..progress import SHOWN, Progress
 from ..record import read_record
 from ..rig.catalogue import RigOptions, rig_named
 from ..rig.contract import AbstractRig, Sample
+from ..rig.fmu import FMURig
 from ..rig.loop import interruptible
 from ..rig.session import RunResult, run
+from ..rig.simulated import SimulatedRig
 from ..safety import Trip
 from .campaign import REACHED, WHOLE, Campaign, Round
 from .discrimination import RivalLike
@@ -52,13 +55,14 @@ def campaign(
     coast: int | None = None,
     redesign: bool = True,
     rivals: Sequence[RivalLike] = (),
+    prior: PriorLike | Sequence[PriorLike] | None = None,
     address: str = "0",
     fast: bool = False,
     seed: int = 0,
     fault: Mapping[str, float] | None = None,
     filter: bool = False,
     guard: bool = False,
-    pause: float = 0.0,
+    pause: float | None = None,
     command: str = "",
     progress: Progress = SHOWN,
     on_round: Callable[[Round], None] = lambda _: None,
@@ -78,7 +82,7 @@ def campaign(
 
     Args:
         plant: as for `Campaign`, and so are `target`, `policy`, `steps`, `spread`, `rounds`,
-            `samples`, `coast`, `redesign` and `rivals`.
+            `samples`, `coast`, `redesign`, `rivals` and `prior`.
         rig: a name, `FILE.fmu`, `FILE.json`, `path/to/file.py:ClassName` or a rig, as for `run`.
         out: folder of the campaign.
         address: board identifier of the Quanser rig.
@@ -88,7 +92,8 @@ def campaign(
         filter: adds a predictive safety filter for parameters within the spread.
         guard: ends a round that no declared plant explains, as for `run`. Guard and filter know
             one plant: rounds that tell rivals apart are played without them.
-        pause: before every round but the first, so that the plant comes to rest [s].
+        pause: before every round but the first, so that the plant comes to rest [s]. A simulated
+            rig and an FMU begin at rest by themselves; for any other rig it must be given.
         command: stored in the folder, to repeat the campaign.
         progress: called with a text, how much is done, and the total.
         on_round: called after every round.
@@ -103,14 +108,14 @@ def campaign(
         plant, target, policy=policy, steps=steps, spread=spread, rounds=rounds, samples=samples,
         coast=coast,
         redesign=redesign and not guard,  # a guard knows its policy
-        rivals=rivals,
+        rivals=rivals, prior=prior,
     )  # fmt: skip
     if guard and made.policy is None:
         raise ValueError("a guard knows a policy: it does not go without one")
     if guard and made.policy is not None:
         guard_of(made.policy, made.declared.description)  # before the first round
     require_whole("seed", seed, 0, LARGEST_SEED)
-    if not 0 <= as_number("pause", pause) < 1e5:
+    if pause is not None and not 0 <= as_number("pause", pause) < 1e5:
         raise ValueError(f"pause must be a number of seconds, not below 0: got {pause!r}")
     root = path_from("out", out)
 
@@ -123,18 +128,24 @@ def campaign(
         options = RigOptions(address, fast, seed, made.spread, fault or {}, experiment=count)
         return rig_named(rig, made.declared, made.declared.description, options)
 
-    if not opened(0).starts_at_rest:
+    first = opened(0)
+    if not first.starts_at_rest:
         raise ValueError(
             "every round of a campaign begins at rest, and this rig does not say that it does "
             "(starts_at_rest)"
+        )
+    if pause is None and rounds > 1 and not isinstance(first, SimulatedRig | FMURig):
+        raise ValueError(
+            "say how long this rig takes to come to rest after a round: pause (--pause) in "
+            "seconds, 0 if it comes to rest by itself"
         )
     name = rig if isinstance(rig, str) else type(rig).__name__
     settings = {"rig": name, "seed": seed, "fault": dict(by_name("fault", fault)), "filter": filter,
                 "guard": guard}  # fmt: skip
     folder = _Folder.checked(root, made, settings, command)
     if not folder.has_rounds:
-        first = "designing the first signal, and " * (made.policy is None)
-        progress(f"{first}predicting what can be reached", 0, rounds)
+        designing = "designing the first signal, and " * (made.policy is None)
+        progress(f"{designing}predicting what can be reached", 0, rounds)
         made.require_reachable()
     if rivals and (guard or filter):
         on_warning("rounds that tell rivals apart are played without guard and filter")
@@ -172,6 +183,7 @@ def campaign(
             elif signals and not made.reason:
                 made.interrupted = signals[0]
             folder.write(made)
+            folder.save_round(made)
     progress("done", rounds, rounds)
     return made
 
@@ -247,7 +259,16 @@ class _Folder:
     ) -> _Folder:
         """A folder that is new, or of the same campaign; ValueError for anything else."""
         own = made.to_dict()
-        kept = ("plant_hash", "policy_hash", "steps", "spread", "coast", "redesign", "rivals")
+        kept = (
+            "plant_hash",
+            "policy_hash",
+            "steps",
+            "spread",
+            "coast",
+            "redesign",
+            "rivals",
+            "prior",
+        )
         settings = {**{name: own[name] for name in kept}, **asked}
         file = root / "campaign.json"
         if file.is_file() and (root / "round-01.csv").exists():
@@ -283,6 +304,11 @@ class _Folder:
             columns = {"sample": samples, **dict(zip(made.known, halves.T, strict=True))}
             write_bytes(self.root / "knowledge.csv", csv_text(columns).encode())
             made.result.save(self.root / "estimate", overwrite=True)
+
+    def save_round(self, made: Campaign) -> None:
+        """The run folder of what the rounds so far tell together."""
+        if made.rounds and made.result is not None:
+            made.result.save(self.path(len(made.rounds) - 1).with_suffix(""), overwrite=True)
 
     def resume(self, made: Campaign, on_round: Callable[[Round], None]) -> None:
         """Takes the rounds that were played before; one that was hardly begun is played again."""

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jax.scipy.special import ndtr
+from jaxtyping import Float
 
 from ..description import (
     HALF_95,
@@ -21,11 +21,11 @@ from ..description import (
     RARE,
     SpreadLike,
     by_name,
+    names_of,
     path_from,
     require_whole,
     wrong_type,
 )
-from ..estimation import Experiments
 from ..estimation.diagnosis import chi2_tail
 from ..estimation.evidence import Fit, Rival, fitted, probabilities, unplayed
 from ..estimation.from_records import experiments_of, parts_of, sampled_as
@@ -42,8 +42,7 @@ from ..report.numbers import digits_for, number
 from ..report.tables import html_table, text_table
 from ..rig.contract import Interval
 from ..training.design import designed_record
-from ..training.discrimination import discriminating, error_bound
-from ..training.redesign import first_signals
+from ..training.discrimination import discriminating, error_bound, first_signals
 from .next_experiment import COAST
 
 if TYPE_CHECKING:
@@ -120,9 +119,29 @@ class Discrimination:
 
     @property
     def plant(self) -> AbstractPlant | None:
-        """The plant of the chosen rival."""
-        chosen = self.chosen
-        return None if chosen is None else self._rivals[self.rivals.index(chosen)].box.plant
+        """The plant of the chosen rival, with the constants and the initial state of its fit."""
+        if (chosen := self.chosen) is None:
+            return None
+        index = self.rivals.index(chosen)
+        own = self._rivals[index]
+        if not any(self.fitted_beside):
+            return own.box.plant
+        return own.box.at(2 * ndtr(self._fits[index].z) - 1)[0]
+
+    @property
+    def fitted_beside(self) -> tuple[dict[str, float], bool]:
+        """What the chosen rival has ranges of, beside its parameters.
+
+        That is the standard deviation of each such constant, and whether initial states are among
+        them.
+        """
+        if (chosen := self.chosen) is None:
+            return {}, False
+        d = self._rivals[self.rivals.index(chosen)].box.plant.definition
+        others = chosen.estimate.keys() - names_of(d.parameters)
+        constants = [name for name in names_of(d.constants) if name in others]
+        sd = {name: chosen.estimate[name].ci95_half / HALF_95 for name in constants}
+        return sd, len(others) > len(constants)
 
     def after(self, records: Sequence[Record], padded: int = 0) -> Discrimination:
         """The same rivals after these records; see `judged`."""
@@ -421,7 +440,7 @@ def judged(rivals: Sequence[Rival], records: Sequence[Record], padded: int = 0) 
         linear = np.zeros(records[0].inputs.shape[1], bool)
         for i, rival in enumerate(rivals):
             experiments = experiments_of(rival.box.plant, whole, True, linear)
-            experiments = _padded(experiments, padded)
+            experiments = experiments.padded(padded, 0)
             fits[i], count = fitted(rival, experiments), int(np.sum(experiments.valid))
     each = tuple(
         _judged(rival, fit, float(p), count)
@@ -437,16 +456,6 @@ def _until_gap(record: Record) -> Record:
         record,
         time=record.time[part], inputs=record.inputs[part], outputs=record.outputs[part],
     )  # fmt: skip
-
-
-def _padded(experiments: Experiments, count: int) -> Experiments:
-    """With experiments in which nothing was measured, up to this number."""
-
-    def longer(values: Array) -> Array:
-        missing = max(0, count - len(values))
-        return jnp.concatenate([values, jnp.zeros((missing, *values.shape[1:]), values.dtype)])
-
-    return jax.tree.map(longer, experiments)
 
 
 def _judged(rival: Rival, fit: Fit, probability: float, count: int) -> JudgedRival:
@@ -465,7 +474,7 @@ def _judged(rival: Rival, fit: Fit, probability: float, count: int) -> JudgedRiv
 
 def with_experiment(found: Discrimination, steps: int, coast: int, seed: int) -> Discrimination:
     """The same with the experiment that tells the rivals apart, where a safe one is found."""
-    starts = first_signals(found._rivals[0].box.plant, 1, steps, seed)[:, 0]
+    starts = first_signals(found._rivals[0].box.plant, steps, seed)
     made = discriminating(found._rivals, found._fits, starts, coast)
     after, near = float(jnp.exp(jnp.min(made.log_bounds))), float(made.nearness)
     inputs = np.asarray(made.inputs) if np.isfinite(after) else None

@@ -14,8 +14,7 @@ from jaxtyping import Array, Float
 from ..description import Spread, SpreadLike, names_of, prior_sd_of
 from ..environment.falsification import nearness
 from ..estimation import NLS, Estimate
-from ..estimation.prior_knowledge import with_prior
-from ..estimation.result import Identification
+from ..estimation.prior_knowledge import PriorLike, with_prior
 from ..information.identifiability import worst_seen
 from ..plant import AbstractPlant, Params
 from ..rig.contract import Interval, Sample
@@ -38,7 +37,7 @@ class Monitor:
     def __init__(
         self,
         plant: AbstractPlant,
-        before: Identification | None,
+        before: PriorLike | Sequence[PriorLike] | None,
         targets: Sequence[Target],
         num_steps: int,
         coast: int,
@@ -50,7 +49,7 @@ class Monitor:
 
         Args:
             plant: as identification knows it.
-            before: estimate from all earlier rounds.
+            before: estimate from all earlier rounds, or what was known before the first one.
             targets: that end the round.
             num_steps: of the round.
             coast: samples of free motion after its end that must be safe.

@@ -54,6 +54,14 @@ class Target:
         """Half of the interval that is allowed, in the quantity's unit."""
         return self.half * np.abs(value) if self.is_relative else self.half
 
+    def at(self, share: float) -> str:
+        """A share of the interval that is allowed, in words."""
+        return (
+            f"{100 * self.half * share:.2g} %"
+            if self.is_relative
+            else (f"{self.half * share:.2g} {self.quantity.unit}".rstrip())
+        )
+
     def __str__(self) -> str:
         if self.is_relative:
             return f"{100 * self.half:g} %"

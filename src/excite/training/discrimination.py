@@ -25,16 +25,20 @@ from jaxtyping import Array, Float
 
 from ..environment.falsification import nearness
 from ..estimation.evidence import Fit, Rival, nearest, probabilities
+from ..excitation import Chirp, Square
+from ..plant import AbstractPlant
 from ..safety import safe_input
 from .gradient import GradientSettings, mean_excess
-from .redesign import JUDGES, SAFE, loudest_safe, searched
+from .redesign import JUDGES, SAFE, half_as_large, loudest_safe, searched
 from .redesign import SEARCH as REDESIGN
+from .signals import random_sines
 
 SEARCH = dataclasses.replace(REDESIGN, num_updates=40)
 
 _PLANTS, _WATCHED = 4, 12  # of each rival: of the bound, and of the penalty
 _WIDE = 4.0  # standard deviations up to which a plant is possible, for safety
 _STEPS = 20  # of the last search for the nearest plants
+_SINES = 4  # sums of sines from which the search begins
 
 
 class Discriminating(eqx.Module):
@@ -50,6 +54,21 @@ class Discriminating(eqx.Module):
     inputs: Float[Array, "time input"]
     log_bounds: Float[Array, " start"]
     nearness: Float[Array, ""]
+
+
+def first_signals(
+    plant: AbstractPlant, num_steps: int, seed: int = 0
+) -> Float[Array, "start time input"]:
+    """Where a search begins: sums of sines, one of them soft, a chirp, a square wave and a step.
+
+    What acts near zero, such as a dead zone, shows in a soft signal, and a lag in a step.
+    """
+    keys = jax.random.split(jax.random.key(seed), _SINES)
+    sines = jax.vmap(lambda key: random_sines(plant, num_steps, key))(keys)
+    waves = [kind.shape(plant, num_steps, keys[0]) for kind in (Chirp(), Square())]
+    step = jnp.ones_like(sines[0])
+    shapes = jnp.concatenate([sines, 0.1 * sines[:1], jnp.stack([*waves, step])])
+    return half_as_large(plant, shapes)
 
 
 def error_bound(probabilities: Float[Array, " rival"]) -> Float[Array, ""]:
@@ -149,7 +168,7 @@ def discriminating(
         log_bound, _ = told_apart(inputs, unmoved, _STEPS)
         return inputs, jnp.where(size < SAFE, log_bound, jnp.inf), size
 
-    inputs, log_bounds, sizes = jax.lax.map(from_start, starts)
+    inputs, log_bounds, sizes = jax.vmap(from_start)(starts)
     best = jnp.argmin(log_bounds)
     return Discriminating(inputs[best], log_bounds, sizes[best])
 

@@ -93,10 +93,16 @@ def first_signals(
 ) -> Float[Array, "start round time input"]:
     """Where a search begins: sums of sines with random phases, of the usual amplitude."""
     keys = jax.random.split(jax.random.key(seed), (_STARTS, num_rounds))
-    usual = np.array([i.amplitude for i in plant.definition.inputs])[None, None, None]
-    shapes = jax.vmap(jax.vmap(partial(random_sines, plant, num_steps)))(keys)
-    lower, upper = (x[None, None, None] for x in plant.input_limits)
-    return (lower + upper) / 2 + 0.5 * usual * shapes
+    return half_as_large(plant, jax.vmap(jax.vmap(partial(random_sines, plant, num_steps)))(keys))
+
+
+def half_as_large(
+    plant: AbstractPlant, shapes: Float[Array, "*start time input"]
+) -> Float[Array, "*start time input"]:
+    """Signals of shapes between -1 and 1, around the middle, with half of the usual amplitude."""
+    usual = jnp.asarray([i.amplitude for i in plant.definition.inputs])
+    middle, _ = _range(plant, shapes)
+    return middle + 0.5 * usual.reshape(middle.shape) * shapes
 
 
 @eqx.filter_jit
