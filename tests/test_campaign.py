@@ -455,6 +455,11 @@ def test_a_spread_that_excludes_the_estimate_is_a_warning():
     assert sentence.startswith("the spread 0.3 excludes the estimate of J_p, 0.0")
 
 
+def still() -> ex.Policy:
+    """A policy that plays nothing."""
+    return steady(size=0.0)
+
+
 KNOWN = {"J_p": "lognormal:0.024:5%", "K_pu": "lognormal:0.0112:5%"}
 
 
@@ -462,7 +467,7 @@ KNOWN = {"J_p": "lognormal:0.024:5%", "K_pu": "lognormal:0.0112:5%"}
     ("options", "words"),
     [
         ({"prior": {"c": "normal:1:2"}}, "'c'"),
-        ({"prior": {"J_p": "normal:1:0.001"}}, "excludes the estimate of J_p, 1 kg m^2"),
+        ({"prior": {"J_p": "normal:1:0.001"}}, "excludes the estimate of J_p, 1 kg m²"),
         ({"prior": KNOWN, "target": {"J_p": "50%"}}, "every target is reached by the prior"),
         ({"prior": KNOWN, "rivals": ["aero2_lag"]}, "it does not go with rivals"),
     ],
@@ -485,9 +490,16 @@ def test_what_was_known_before_counts_in_every_estimate_and_prediction():
         assert interval.estimate == pytest.approx(result.params[name], rel=1e-6)
         low, high = result.ci95(name)
         assert interval.ci95_half == pytest.approx((high - low) / 2, rel=1e-4)
-    without = ex.Campaign("aero2", {"D_p": "0.001%"}, **options)
-    assert campaign.expected.shares["D_p"] < without.expected.shares["D_p"]
-    assert "of the prior" in str(dataclasses.replace(campaign.expected, samples=np.ones(32)))
+
+
+def test_what_is_expected_of_an_experiment_that_tells_nothing_is_the_prior():
+    options: Any = {"policy": still(), "redesign": False}
+    expected = ex.Campaign("aero2", {"J_p": "1%"}, prior=KNOWN, **options).expected
+    assert expected.shares["J_p"] == pytest.approx(HALF_95 * 5, rel=0.01)
+    assert str(expected) == "no plant of the prior reaches every target"
+    without = ex.Campaign("aero2", {"J_p": "1%"}, **options).expected
+    assert without.shares["J_p"] > 1e6
+    assert str(without) == "no plant of the spread reaches every target"
 
 
 def test_records_that_contradict_the_prior_end_the_campaign():
@@ -507,11 +519,8 @@ def test_with_a_prior_and_without_a_policy_the_first_signal_is_designed_for_the_
 
 
 def test_a_campaign_ends_where_nothing_more_can_be_had():
-    still = dataclasses.replace(
-        steady(), weights=tuple((0 * W, 0 * b) for W, b in steady().weights)
-    )
     record = ex.simulate("aero2", steady(), params=TRUE, seed=1)
-    campaign = ex.Campaign("aero2", {"D_p": "0.01%"}, policy=still, redesign=False)
+    campaign = ex.Campaign("aero2", {"D_p": "0.01%"}, policy=still(), redesign=False)
     campaign.tell(record)
     assert campaign.ask() is not None  # this round told something
     campaign.records.append(dataclasses.replace(record, inputs=0 * record.inputs))

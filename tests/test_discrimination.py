@@ -23,8 +23,7 @@ from excite.plant.uncertainty import Uncertainty
 from excite.simulation import response
 from excite.study import campaign_on_rig
 from excite.study.discrimination import rivals_from
-from excite.training.discrimination import discriminating, error_bound
-from excite.training.redesign import first_signals
+from excite.training.discrimination import discriminating, error_bound, first_signals
 
 LAG = "aero2_lag,tau=0.05:0.25"
 RIVALS = ("aero2", LAG)
@@ -98,7 +97,7 @@ def test_before_an_experiment_all_rivals_are_as_probable():
 def designed():
     """Two rivals, and the signal that tells them apart."""
     rivals = rivals_from(RIVALS, 0.3)
-    starts = first_signals(Aero2(), 1, STEPS)[:, 0]
+    starts = first_signals(Aero2(), STEPS)
     return rivals, discriminating(rivals, [unplayed(r) for r in rivals], starts, COAST)
 
 
@@ -115,11 +114,40 @@ def test_the_signal_is_safe_on_plants_of_both_rivals_coast_included(designed):
     assert np.abs(made.inputs).max() <= 24
 
 
+def test_a_search_begins_with_loud_and_soft_signals_within_the_limits():
+    starts = np.asarray(first_signals(Aero2(), STEPS))
+    peaks = np.abs(starts).max(axis=(1, 2))
+    assert peaks.max() == pytest.approx(0.5 * Aero2().definition.inputs[0].amplitude)
+    assert peaks.min() == pytest.approx(0.1 * peaks.max())
+    assert len(np.unique(starts.round(6), axis=0)) == len(starts) == 8
+
+
+@pytest.mark.slow
+def test_the_least_distance_of_two_rivals_rises_with_every_sample(designed):
+    (first, other), made = designed
+    inputs, sd = made.inputs, first.box.plant.sensor.sd[None]
+    before = unplayed(first)
+
+    @jax.jit
+    def least(z, seen):
+        target = other.response(z, inputs)
+
+        def residual(own):
+            return (seen[:, None] * (first.response(own, inputs) - target) / sd).ravel()
+
+        return nearest(residual, before, before.z, 60)[1]
+
+    for z in np.random.default_rng(0).normal(size=(3, len(other.box.names))):
+        distances = [float(least(jnp.asarray(z), jnp.arange(STEPS + 1) <= n)) for n in range(21)]
+        assert np.all(np.diff(distances) > -1e-6 * distances[-1])
+        assert distances[-1] > 10
+
+
 @pytest.mark.slow
 def test_the_bound_of_two_known_plants_is_that_of_kailath_and_holds():
     sd = 0.02
     rivals = [one_unknown("aero2", {}, sd), one_unknown("aero2_lag", {"tau": (0.1, 0.1)}, sd)]
-    starts = first_signals(Aero2(), 1, STEPS)[:, 0]
+    starts = first_signals(Aero2(), STEPS)
     made = discriminating(rivals, [unplayed(r) for r in rivals], starts, COAST)
     ideal, lagging = (np.asarray(r.response(jnp.zeros(len(r.box.names)), made.inputs))
                       for r in rivals)  # fmt: skip
@@ -128,8 +156,15 @@ def test_the_bound_of_two_known_plants_is_that_of_kailath_and_holds():
     bound = float(jnp.exp(jnp.min(made.log_bounds)))
     assert bound == pytest.approx(0.5 * math.exp(-D / 8), rel=1e-6)
     assert norm.cdf(-math.sqrt(D) / 2) <= bound  # the error of the likelihood ratio
-    for start in starts:  # as loud as the input may be
+    rest = jnp.zeros((COAST, 1))
+    for start in starts:  # as loud as the input may be, and safe
         loud = start * 24 / jnp.max(jnp.abs(start))
+        while max(
+            float(nearness(Aero2(), r.response(jnp.zeros(len(r.box.names)), whole)))
+            for r in rivals
+            for whole in [jnp.concatenate([loud, rest])]
+        ) > 0.97:  # fmt: skip
+            loud = 0.95 * loud
         one, other = (np.asarray(r.response(jnp.zeros(len(r.box.names)), loud)) for r in rivals)
         assert float(np.sum((one - other) ** 2)) / sd**2 < D
 
