@@ -36,7 +36,7 @@ from starlette.testclient import TestClient
 
 import excite as ex
 from excite import web
-from excite.files import write_json
+from excite.files import locked_folder, write_json
 from excite.plant import Aero2
 from excite.record import READ_ENDINGS
 from excite.record.bags import BAG_ENDINGS
@@ -888,6 +888,14 @@ def test_a_campaign_is_shown_with_what_is_known_and_its_rounds(page: TestClient,
     assert shown["campaign"]["rounds"]["rows"][0][:4] == ["1", "policy", "40", "50 %"]
     [row] = [row for row in shown["campaign"]["known"]["rows"] if row[0] == "D_p"]
     assert row[-2:] == ["1 %", "missed"]
+    assert shown["campaign"]["now"] == ""
+    with locked_folder(folder, "this campaign"):
+        now = [page.get("/api/run", params={"name": "known"}).json()["campaign"]["now"]]
+        content["playing"] = "redesigned"
+        (folder / "campaign.json").write_text(json.dumps(content))
+        (folder / "round-02.csv").write_text("time,voltage,pitch\n0,0,0\n0.1,1,0.01\n")
+        now.append(page.get("/api/run", params={"name": "known"}).json()["campaign"]["now"])
+    assert now == ["Round 2 is prepared.", "Round 2 (redesigned): 1 sample so far."]
     content["reason"] = "every target is reached"
     (folder / "campaign.json").write_text(json.dumps(content))
     assert page.get("/api/run", params={"name": "known"}).json()["is_finished"]

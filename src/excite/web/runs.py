@@ -23,7 +23,7 @@ from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
 
 from ..description import PlantDescription
-from ..files import folder_word, json_ready
+from ..files import folder_word, is_locked, json_ready
 from ..record import RECORD_KIND
 from ..report.answer import answered, best_columns
 from ..report.frontier import QUANTITY, frontier
@@ -359,9 +359,20 @@ def _campaign(run: Path) -> dict[str, object]:
     return {
         "known": known,
         "rounds": rounds,
+        "now": _now_played(run, content) if is_locked(run / ".lock") else "",
         "interrupted": str(content.get("interrupted", "")),
         "told": str(content.get("reason") or content.get("interrupted") or ""),
     }
+
+
+def _now_played(run: Path, content: Mapping[str, Any]) -> str:
+    """What a campaign does whose process works in its folder."""
+    index = len(content["rounds"]) + 1
+    samples = len(_text(run, f"round-{index:02}.csv").splitlines()) - 2  # without names and start
+    if samples < 1:
+        return f"Round {index} is prepared."
+    playing = content.get("playing") or "the last one begun"
+    return f"Round {index} ({playing}): {samples} sample{'s' * (samples != 1)} so far."
 
 
 def _table(text: str) -> dict[str, object]:

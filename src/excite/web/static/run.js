@@ -35,6 +35,7 @@ export async function show(run) {
     const policies = content.files.filter(isPolicy), others = content.files.filter((file) => !isPolicy(file));
     const report = content.is_finished ? [download(`api/run/report.html?name=${name}`, "Report")] : [];
     if (!content.is_finished && content.kind === "experiment") card.append(el("p", {}, "It is still being recorded, or its process was killed."));
+    else if (content.campaign.now) card.append(el("p", { role: "status" }, content.campaign.now));
     else if (!content.is_finished) card.append(el("p", {}, "Not finished. To resume it after an interruption, rerun the command in the folder where it was started: ", el("code", {}, content.command || "the same command")));
     card.append(el("p", { class: "row downloads" }, ...report, ...others.map(link)));
     if (policies.length) card.append(el("details", { open: policies.length < 4 }, el("summary", {}, `Policies (${policies.length})`), el("p", { class: "row downloads" }, ...policies.map(link))));
