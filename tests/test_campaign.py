@@ -502,8 +502,9 @@ def test_what_is_expected_of_an_experiment_that_tells_nothing_is_the_prior():
     assert str(without) == "no plant of the spread reaches every target"
 
 
-def test_records_that_contradict_the_prior_end_the_campaign():
-    prior = {"J_p": "lognormal:0.05:2%"}
+@pytest.mark.parametrize("sd", ["2%", "0.01%"])  # the second outweighs the records
+def test_records_that_contradict_the_prior_end_the_campaign(sd):
+    prior = {"J_p": f"lognormal:0.05:{sd}"}
     campaign = ex.Campaign("aero2", EASY, policy=steady(), prior=prior, redesign=False)
     campaign.tell(ex.simulate("aero2", campaign.ask(), params=TRUE, seed=1))
     assert campaign.reason == "the records contradict the prior of J_p"

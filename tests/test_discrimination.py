@@ -367,6 +367,8 @@ def test_the_constants_of_the_chosen_rival_are_those_of_its_fit():
     records = [ex.simulate(true, "prbs", steps=60, seed=seed) for seed in (1, 2)]
     for record in records:
         campaign.tell(record)
+    assert campaign.discrimination is not None
+    assert campaign.discrimination.chosen is not None
     assert campaign.discrimination.chosen.name == "aero2,d_S=20%"
     found = campaign.plant.constants.d_S
     sd = campaign.discrimination.fitted_beside[0]["d_S"]

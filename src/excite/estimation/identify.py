@@ -142,6 +142,7 @@ def identify(
     dt: float | None = None,
     rows: slice | str | None = None,
     room: tuple[int, int] = (0, 0),
+    causes: bool = True,
     progress: Progress = SHOWN,
 ) -> Identification:
     """Parameters of one plant from one or several records.
@@ -191,6 +192,8 @@ def identify(
         rows: rows of the files to use, counted from 0: slice(100, 1000, 5) or "100:1000:5".
         room: number of records, and of samples in each, for which the estimator nls is compiled:
             after the first of many fits, those of no more records and samples take no time for it.
+        causes: whether likely causes are looked for where the residual is not noise, which takes
+            seconds.
 
     Raises:
         ValueError: for records too short, or in which no parameter can be identified, for a
@@ -255,7 +258,9 @@ def identify(
     whole = experiments_of(plant, records, known, linear)
     seen, experiments = transitions(plant, whole) if by_steps else (plant, whole)
     progress("first search", 0.0, 1.0)
-    find = partial(_suspects, seen, records, experiments, estimator, begin, linear, progress)
+    find = partial(
+        _suspects, seen, records, experiments, estimator, begin, linear, causes, progress
+    )
     too = PRIOR_TOO * bool(num_priors)
     try:
         has_room = isinstance(estimator, NLS) and not by_steps
@@ -774,13 +779,14 @@ def _suspects(
     estimator: AbstractEstimator,
     start: Params,
     linear: np.ndarray,
+    is_asked: bool,
     progress: Progress,
     fit: Fit,
     is_best: bool,
     follows_input: bool,
 ) -> tuple[tuple[Suspect, ...], tuple[str, ...]]:
     """What the plant may leave out, where more than noise is left, and in which rows."""
-    if not isinstance(estimator, NLS) or fit.has_ended_in(Status.NOT_FINITE):
+    if not (is_asked and isinstance(estimator, NLS)) or fit.has_ended_in(Status.NOT_FINITE):
         return (), ()
     if plant.definition.is_disturbed:
         return (), ()  # disturbances explain what a suspect would

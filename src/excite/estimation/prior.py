@@ -154,6 +154,23 @@ class Prior(eqx.Module):
             told.removeprefix(start) for told in self.verdict(values, sd) if told.startswith(start)
         ]
 
+    def excludes(self, values: Mapping[str, float], sd: Mapping[str, float]) -> list[str]:
+        """Names of parameters for which an estimate without this prior lies outside it.
+
+        Args:
+            values: estimated parameters.
+            sd: standard error of those that are not held.
+        """
+        found, inverse = [], np.linalg.inv(np.asarray(self.root))
+        for name, is_log, mean, spread in zip(
+            self.names, self.logarithmic, self.mean, np.linalg.norm(inverse, axis=1), strict=True
+        ):
+            own = sd[name] / (values[name] if is_log else 1.0)
+            moved = (math.log(values[name]) if is_log else values[name]) - float(mean)
+            if chi2_tail(1, moved**2 / (spread**2 + own**2)) < RARE:
+                found.append(name)
+        return found
+
     def verdict(self, values: Mapping[str, float], sd: Mapping[str, float]) -> tuple[str, ...]:
         """Sentences where the data contradict the prior, or tell little beyond it.
 

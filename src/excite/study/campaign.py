@@ -505,6 +505,8 @@ class Campaign:
             self.reason = "all rounds are played" + f"; {structure}" * self.is_undecided
         elif self.most_samples is not None and not self._fits(self.num_samples + count):
             self.reason = f"the budget of {self.most_samples} samples is used up"
+        if self.reason and unexplained(self.result):
+            self._identify(causes=True)
         missing = farthest(shares) if shares else f"there is no estimate yet ({status})"
         decision = f"end: {self.reason}" if self.reason else f"go on: {missing}"
         if structure and not self.is_undecided:
@@ -526,8 +528,11 @@ class Campaign:
         self.plant = self.discrimination.plant or self.plant
         return self.discrimination.decision
 
-    def _identify(self) -> str:
-        """Identifies all records together; returns the status."""
+    def _identify(self, causes: bool = False) -> str:
+        """Identifies all records together; returns the status.
+
+        Likely causes of a residual are looked for at the end: this takes longer than a decision.
+        """
         uncertain, is_free = (
             ({}, False) if self.discrimination is None else self.discrimination.fitted_beside
         )
@@ -535,7 +540,7 @@ class Campaign:
             result = identify(
                 self.records, self.plant, start=self._start(), prior=self.prior,
                 uncertain=uncertain, initial_state="free" if is_free else "known",
-                room=(_PADDED, self.steps + 1),
+                room=(_PADDED, self.steps + 1), causes=causes,
             )  # fmt: skip
         except ValueError as error:  # this record tells nothing; another one may
             return str(error)
@@ -543,13 +548,22 @@ class Campaign:
         return result.status
 
     def _contradicted(self) -> list[str]:
-        """Parameters in which the records contradict the prior."""
+        """Parameters in which the records contradict the prior.
+
+        Where it leaves a residual that is not noise, they are asked without it.
+        """
         if self.prior is None or self.result is None:
             return []
         _, joint, _ = with_prior(self.declared, self.prior, self.declared.nominal, {}, {})
-        return (
-            [] if joint is None else joint.contradicted(self.result.params, self.result.std_error)
-        )
+        if joint is None:
+            return []
+        if not unexplained(self.result):
+            return joint.contradicted(self.result.params, self.result.std_error)
+        alone = identify(
+            self.records, self.plant, start=self._start(), initial_state="known",
+            room=(_PADDED, self.steps + 1), causes=False,
+        )  # fmt: skip
+        return joint.excludes(alone.params, alone.std_error)
 
     def _is_explained(self) -> bool:
         """Whether the residual is noise, of the declared size where there are rivals.
