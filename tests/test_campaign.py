@@ -470,6 +470,7 @@ KNOWN = {"J_p": "lognormal:0.024:5%", "K_pu": "lognormal:0.0112:5%"}
         ({"prior": {"J_p": "normal:1:0.001"}}, "excludes the estimate of J_p, 1 kg m²"),
         ({"prior": KNOWN, "target": {"J_p": "50%"}}, "every target is reached by the prior"),
         ({"prior": KNOWN, "rivals": ["aero2_lag"]}, "it does not go with rivals"),
+        ({"prior": {"J_p": "uniform:0.02:0.03"}}, "and no uniform one: got J_p"),
     ],
 )
 def test_a_prior_that_cannot_be_used_is_one_sentence(options, words):
@@ -482,7 +483,9 @@ def test_what_was_known_before_counts_in_every_estimate_and_prediction():
     options: Any = {"policy": steady(), "redesign": False, "rounds": 2}
     campaign = ex.Campaign("aero2", {"D_p": "0.001%"}, prior=KNOWN, **options)
     half = campaign.known["J_p"].ci95_half / campaign.known["J_p"].estimate
-    assert half == pytest.approx(HALF_95 * 0.05, rel=0.01)  # the spread tells a little more
+    assert half == pytest.approx(HALF_95 * 0.05)
+    assert campaign.known["D_p"].ci95_half == math.inf  # the spread is no prior
+    assert not campaign.to_dict()["rounds"]
     record = ex.simulate("aero2", campaign.ask(), params=TRUE, seed=1)
     campaign.tell(record)
     result = ex.identify(record, "aero2", prior=KNOWN, initial_state="known")
@@ -490,12 +493,15 @@ def test_what_was_known_before_counts_in_every_estimate_and_prediction():
         assert interval.estimate == pytest.approx(result.params[name], rel=1e-6)
         low, high = result.ci95(name)
         assert interval.ci95_half == pytest.approx((high - low) / 2, rel=1e-4)
+    # After every sample, what was known before counts, too.
+    assert campaign.knowledge()[1][10, 0] < half * campaign.known["J_p"].estimate
 
 
 def test_what_is_expected_of_an_experiment_that_tells_nothing_is_the_prior():
     options: Any = {"policy": still(), "redesign": False}
-    expected = ex.Campaign("aero2", {"J_p": "1%"}, prior=KNOWN, **options).expected
-    assert expected.shares["J_p"] == pytest.approx(HALF_95 * 5, rel=0.01)
+    prior = {**KNOWN, "D_p": "lognormal:0.0011:10%"}
+    expected = ex.Campaign("aero2", {"J_p": "1%"}, prior=prior, **options).expected
+    assert expected.shares["J_p"] == pytest.approx(HALF_95 * 5)
     assert str(expected) == "no plant of the prior reaches every target"
     without = ex.Campaign("aero2", {"J_p": "1%"}, **options).expected
     assert without.shares["J_p"] > 1e6
@@ -515,19 +521,49 @@ def test_with_a_prior_and_without_a_policy_the_first_signal_is_designed_for_the_
     prior = {**KNOWN, "D_p": "lognormal:0.0011:10%"}
     campaign = ex.Campaign("aero2", {"D_p": "1%"}, policy="none", prior=prior, steps=60, coast=20)
     told = campaign.tell(ex.simulate("aero2", campaign.ask(), params=TRUE, seed=1))
-    assert (told.num_samples, told.played) == (60, "redesigned")
+    assert (told.num_samples, told.played) == (60, "signal for the prior")
     assert told.nearness < 1
+
+
+@pytest.mark.science
+def test_a_campaign_with_a_prior_is_resumed_with_the_same_one_only(tmp_path):
+    made = repeated(tmp_path / "a", {"D_p": "2%"}, rounds=1, prior=KNOWN)
+    again = repeated(tmp_path / "a", {"D_p": "2%"}, rounds=1, prior=KNOWN)
+    assert again.to_dict() == made.to_dict()
+    with pytest.raises(ValueError, match="is another campaign, with prior"):
+        repeated(tmp_path / "a", rounds=1, prior={"J_p": "lognormal:0.024:6%"})
+    with pytest.raises(ValueError, match="is another campaign, with prior"):
+        repeated(tmp_path / "a", rounds=1)
+
+
+def test_records_that_tell_nothing_contradict_no_prior():
+    prior = {name: f"lognormal:{value}:5%" for name, value in TRUE.items()}
+    campaign = ex.Campaign("aero2", EASY, policy=steady(), prior=prior, redesign=False)
+    record = ex.simulate("aero2", still(), params=TRUE, noise={"pitch": 0.05}, seed=1)
+    assert campaign.tell(record).decision.startswith("go on: ")
+
+
+def test_a_prior_that_is_right_ends_no_campaign():
+    ended = []
+    for seed in range(40):  # at a chance of one in a hundred, one of three parameters would
+        rng = np.random.default_rng(seed)
+        prior = {n: f"lognormal:{v * math.exp(0.05 * rng.normal())}:5%" for n, v in TRUE.items()}
+        campaign = ex.Campaign("aero2", EASY, policy=steady(), prior=prior, redesign=False)
+        campaign.tell(ex.simulate("aero2", steady(), params=TRUE, seed=seed))
+        ended.append(campaign.reason)
+    assert {*ended} <= {"", REACHED}
 
 
 def test_a_campaign_ends_where_nothing_more_can_be_had():
     record = ex.simulate("aero2", steady(), params=TRUE, seed=1)
-    campaign = ex.Campaign("aero2", {"D_p": "0.01%"}, policy=still(), redesign=False)
-    campaign.tell(record)
-    assert campaign.ask() is not None  # this round told something
-    campaign.records.append(dataclasses.replace(record, inputs=0 * record.inputs))
-    assert campaign.ask() is None
-    assert campaign.reason.startswith(
-        "nothing more can be had: 9 more rounds would hardly tell more of D_p, known to "
+    for policy, goes_on in ((steady(), True), (still(), False)):  # what comes next counts
+        campaign = ex.Campaign("aero2", {"D_p": "0.01%"}, policy=policy, redesign=False)
+        campaign.tell(record)
+        assert (campaign.ask() is not None) == goes_on
+    half = 100 * campaign.known["D_p"].ci95_half / campaign.known["D_p"].estimate
+    assert campaign.reason == (
+        "nothing more can be had: 9 more rounds would hardly tell more of D_p, which is known to "
+        f"{half:.2g} %"
     )
 
 

@@ -778,3 +778,30 @@ def test_an_end_near_the_estimate_is_no_other_one():
     assert ended(0.05, 50.0).startswith(f"{told}; another ended at J_p=")
     assert ended(50.0, 50.0) == told
     assert ended(0.0, 0.0).startswith("2 of 2 starts")
+
+
+@pytest.mark.parametrize("initial_state", ["known", "free"])
+def test_a_search_with_room_for_more_records_finds_the_same(initial_state):
+    records = [ex.simulate("aero2", "prbs", steps=30 + i, seed=i) for i in range(2)]
+    own, roomy = (
+        ex.identify(records, "aero2", initial_state=initial_state, room=room)
+        for room in ((0, 0), (4, 50))
+    )
+    for name in ("J_p", "K_pu", "D_p"):
+        assert roomy.params[name] == pytest.approx(own.params[name], rel=1e-5)
+        assert roomy.std_error[name] == pytest.approx(own.std_error[name], rel=1e-4)
+        assert roomy.ci95(name) == pytest.approx(own.ci95(name), rel=1e-4)
+    assert [f.simulated.shape for f in roomy.fitted] == [f.simulated.shape for f in own.fitted]
+
+
+@pytest.mark.parametrize(
+    ("room", "error", "words"),
+    [
+        (5, TypeError, "room"),
+        ((1, 2, 3), TypeError, "room"),
+        ((-1, 2), ValueError, "room must be a whole number"),
+    ],
+)
+def test_a_room_that_is_no_pair_of_numbers_is_one_sentence(room, error, words):
+    with pytest.raises(error, match=words):
+        ex.identify(ex.simulate("aero2", "prbs", steps=30), room=room)

@@ -237,6 +237,14 @@ class Estimate(eqx.Module):
     degrees: Float[Array, " param"] | None = None
     prediction: Prediction | None = None
 
+    def of(self, padded: Experiments) -> Estimate:
+        """The same of experiments that were `padded`."""
+        sizes = zip(padded.valid.shape, self.residual.shape, strict=True)
+        longer = [(0, new - own) for new, own in sizes]
+        state = np.pad(self.initial_state, [longer[0], (0, 0)], mode="edge")
+        rows = state, np.pad(self.residual, longer)
+        return eqx.tree_at(lambda e: (e.initial_state, e.residual), self, rows)
+
 
 @dataclass(frozen=True)
 class Basis:

@@ -190,8 +190,8 @@ def identify(
         set_inputs: values of constant inputs that the files do not have: {"voltage": 5.0}.
         dt: sampling time of files without time [s].
         rows: rows of the files to use, counted from 0: slice(100, 1000, 5) or "100:1000:5".
-        room: number of records, and of samples in each, for which the estimator nls is compiled:
-            after the first of many fits, those of no more records and samples take no time for it.
+        room: number of records, and of samples in each, for which the estimator nls is compiled.
+            After the first of many fits, those of no more records and samples take no time for it.
         causes: whether likely causes are looked for where the residual is not noise, which takes
             seconds.
 
@@ -203,6 +203,8 @@ def identify(
     given = records_in(records, "records")
     if not given:
         raise ValueError("no record is given")
+    if not isinstance(room, tuple) or len(room) != 2:
+        raise wrong_type("room", room, "a pair of whole numbers")
     for number in room:
         require_whole("room", number, 0)
     held_out = records_in(validate, "validate")
@@ -257,14 +259,15 @@ def identify(
     known = known and all(len(parts_of(record)) == 1 for record in records)
     whole = experiments_of(plant, records, known, linear)
     seen, experiments = transitions(plant, whole) if by_steps else (plant, whole)
+    if not isinstance(estimator, NLS) or by_steps:
+        room = (0, 0)
     progress("first search", 0.0, 1.0)
     find = partial(
         _suspects, seen, records, experiments, estimator, begin, linear, causes, progress
     )
     too = PRIOR_TOO * bool(num_priors)
     try:
-        has_room = isinstance(estimator, NLS) and not by_steps
-        fit = fit_of(seen, experiments, estimator, begin, progress, room if has_room else (0, 0))
+        fit = fit_of(seen, experiments, estimator, begin, progress, room)
     except NothingLeftError as refusal:
         raise _with_causes(str(refusal) + too, find(refusal.fit, False, False)[0]) from None
     params, prediction = fit.estimate.params, fit.estimate.prediction
@@ -293,7 +296,7 @@ def identify(
     if not is_fit:
         raise _with_causes(nothing_seen(plant) + too, found)
     covariance, degrees, factor, verdict = _confidence(
-        seen, experiments, estimator, fit, whiteness, uncertain_sd, bool(wrong), by_steps
+        seen, experiments, estimator, fit, whiteness, uncertain_sd, bool(wrong), by_steps, room
     )
     others = (
         *(s for record in [*records, *validation] for s in _other_plant(record, plant)),
@@ -547,6 +550,7 @@ def _confidence(
     uncertain: np.ndarray,
     is_wrong: bool,
     by_steps: bool,
+    room: tuple[int, int],
 ) -> tuple[np.ndarray, np.ndarray, float, tuple[str, ...]]:
     """Covariance of the estimates, its degrees of freedom, and the sentences of the verdict.
 
@@ -569,12 +573,14 @@ def _confidence(
     if by_steps:
         coloured, is_wrong = [], False
     if isinstance(estimator, NLS) and (coloured or uncertain.any() or is_wrong):
-        estimate, free = jax.device_put((fit.estimate, fit.free))
-        S, residual = map(np.asarray, estimator.sensitivity(plant, experiments, estimate, free))
+        is_known = experiments.initial_state_known
+        whole = experiments.padded(*room) if is_known else experiments  # as for the search
+        estimate, free = jax.device_put((fit.estimate.of(whole), fit.free))
+        S, residual = map(np.asarray, estimator.sensitivity(plant, whole, estimate, free))
         prior = np.asarray(estimator.prior_information(plant, estimate, S.shape[-1], free))
-        valid = np.asarray(experiments.valid)
+        valid = np.asarray(whole.valid)
         if is_wrong:
-            signals = _signals(plant, experiments, estimate)
+            signals = _signals(plant, whole, estimate)
             factor = misfit_factor(S, residual, valid, signals, len(plant.definition.states))
         if coloured:
             robust, its = robust_covariance(S, residual, valid, prior)
@@ -588,7 +594,7 @@ def _confidence(
         known = (inverse @ prior @ inverse)[: len(names), : len(names)] * np.outer(size, size)
         covariance = factor**2 * (covariance - known) + known
         if uncertain.any():
-            to_constants = np.asarray(estimator.constant_sensitivity(plant, experiments, estimate))
+            to_constants = np.asarray(estimator.constant_sensitivity(plant, whole, estimate))
             effect = effect_of_constants(S, to_constants, prior)[: len(names)] * uncertain[None]
             effect = effect * size[:, None]
             covariance, degrees = with_independent(covariance, degrees, effect @ effect.T)

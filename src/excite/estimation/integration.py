@@ -58,11 +58,8 @@ def too_coarse(
     the weights that `NLS` begins with. With a long record more steps may be needed, because its
     standard errors are smaller.
     """
-    state, residual = estimate.initial_state, estimate.residual
     experiments = experiments.padded(*room)  # as for the search: compiled once
-    longer = [(0, n - m) for n, m in zip(experiments.valid.shape, residual.shape, strict=True)]
-    wider = np.pad(state, [longer[0], (0, 0)], mode="edge"), np.pad(residual, longer)
-    estimate = eqx.tree_at(lambda e: (e.initial_state, e.residual), estimate, wider)
+    estimate = estimate.of(experiments)
     experiments, estimate, is_free = jax.device_put((experiments, estimate, free))
     part, own, change, noise = _changed(plant, experiments, estimate)
     if np.linalg.norm(change) <= _ENOUGH * float(noise):

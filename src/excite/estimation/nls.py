@@ -394,8 +394,9 @@ class Problem(eqx.Module):
     @property
     def degrees(self) -> Float[Array, " output"]:
         """Degrees of freedom of each output's residual: values less its share of the unknowns."""
-        num_experiments, num_states = self.experiments.initial_state.shape
-        states = 0 if self.experiments.initial_state_known else num_experiments * num_states
+        is_measured = jnp.any(self.experiments.valid, axis=(1, 2))
+        states = jnp.sum(is_measured) * self.experiments.initial_state.shape[1]
+        states = 0 if self.experiments.initial_state_known else states
         spent = (jnp.sum(self.free) + states) / self.num_outputs
         return jnp.maximum(jnp.sum(self.experiments.valid, axis=(0, 1)) - spent, 1.0)
 

@@ -149,26 +149,29 @@ class Prior(eqx.Module):
 
     def contradicted(self, values: Mapping[str, float], sd: Mapping[str, float]) -> list[str]:
         """Names of parameters in which the data contradict the distribution; see `verdict`."""
-        start = _CONTRADICTED.format("")
-        return [
-            told.removeprefix(start) for told in self.verdict(values, sd) if told.startswith(start)
-        ]
+        return [name for name, chance in self.chances(values, sd).items() if chance < RARE]
 
-    def excludes(self, values: Mapping[str, float], sd: Mapping[str, float]) -> list[str]:
-        """Names of parameters for which an estimate without this prior lies outside it.
+    def chances(
+        self, values: Mapping[str, float], sd: Mapping[str, float], includes_prior: bool = True
+    ) -> dict[str, float]:
+        """Of each parameter, how probable data are that move it as far, if the prior is right.
 
         Args:
             values: estimated parameters.
-            sd: standard error of those that are not held.
+            sd: standard error, for white noise, of those that are not held.
+            includes_prior: whether the estimate was made with this prior.
         """
-        found, inverse = [], np.linalg.inv(np.asarray(self.root))
+        found, inverse = {}, np.linalg.inv(np.asarray(self.root))
         for name, is_log, mean, spread in zip(
             self.names, self.logarithmic, self.mean, np.linalg.norm(inverse, axis=1), strict=True
         ):
-            own = sd[name] / (values[name] if is_log else 1.0)
+            if name not in sd:
+                continue
+            after = sd[name] / (values[name] if is_log else 1.0)
             moved = (math.log(values[name]) if is_log else values[name]) - float(mean)
-            if chi2_tail(1, moved**2 / (spread**2 + own**2)) < RARE:
-                found.append(name)
+            # The variance of what the data move is the prior's less the estimate's.
+            variance = spread**2 + (-1 if includes_prior else 1) * after**2
+            found[name] = chi2_tail(1, moved**2 / variance) if variance > 0 else 1.0
         return found
 
     def verdict(self, values: Mapping[str, float], sd: Mapping[str, float]) -> tuple[str, ...]:
@@ -178,19 +181,13 @@ class Prior(eqx.Module):
             values: estimated parameters.
             sd: standard error, for white noise, of those that are not held.
         """
-        told, inverse = [], np.linalg.inv(np.asarray(self.root))
-        for name, is_log, mean, spread in zip(
-            self.names, self.logarithmic, self.mean, np.linalg.norm(inverse, axis=1), strict=True
-        ):
-            if name not in sd:
-                continue
-            after = sd[name] / (values[name] if is_log else 1.0)
-            moved = (math.log(values[name]) if is_log else values[name]) - float(mean)
-            # The variance of what the data move is the prior's less the estimate's.
-            gained = spread**2 - after**2
-            if gained > 0 and chi2_tail(1, moved**2 / gained) < RARE:
+        told, spread = [], np.linalg.norm(np.linalg.inv(np.asarray(self.root)), axis=1)
+        for name, chance in self.chances(values, sd).items():
+            index = self.names.index(name)
+            after = sd[name] / (values[name] if self.logarithmic[index] else 1.0)
+            if chance < RARE:
                 told.append(_CONTRADICTED.format(name))
-            elif after > _LITTLE * spread:
+            elif after > _LITTLE * spread[index]:
                 told.append(
                     f"the estimate of {name} is that of its prior; the data hardly change it"
                 )

@@ -10,6 +10,7 @@ are identified together.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 import textwrap
@@ -26,11 +27,13 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..description import (
+    HALF_95,
     RARE,
     PlantDescription,
     Spread,
     SpreadLike,
     names_of,
+    prior_sd_of,
     require_whole,
     wrong_type,
 )
@@ -38,10 +41,11 @@ from ..environment import run_episodes
 from ..estimation import Status
 from ..estimation.diagnosis import chi2_tail
 from ..estimation.identify import RecordLike, identify, record_for
+from ..estimation.prior import uniform_names
 from ..estimation.prior_knowledge import PriorLike, plants_of, with_prior
 from ..estimation.result import Identification
 from ..excitation import PolicyExcitation, Replay
-from ..information import require_noise, running_information
+from ..information import relative_size, require_noise, running_information
 from ..plant import AbstractPlant, Params
 from ..plant.catalogue import PlantLike, plant_from, require_inputs
 from ..policy import Policy, mismatch, read_policy
@@ -55,14 +59,15 @@ from ..training.design import design
 from ..training.redesign import Region
 from .discrimination import Discrimination, RivalLike, judged, rivals_from, with_experiment
 from .falsify import trained_in
-from .knowledge import excluded, intervals_in, region_of, unexplained
+from .knowledge import excluded, intervals_in, noise_factor, region_of, unexplained
 from .monitor import Monitor
-from .next_experiment import COAST, Candidate, NextExperiment, best_of, candidates
+from .next_experiment import COAST, Candidate, NextExperiment, best_of, candidate, candidates
 from .quantities import (
     AbstractQuantity,
     OneParameter,
     half_intervals,
     known_of,
+    propagated,
     require_defined,
     slopes,
 )
@@ -82,15 +87,16 @@ if TYPE_CHECKING:
 REACHED = "every target is reached"
 WHOLE = (COMPLETE, REACHED)  # ends of rounds that count in the budget
 
-DISCRIMINATING, ROBUST = "signal for rivals", "robust"
+DISCRIMINATING, ROBUST, FOR_PRIOR = "signal for rivals", "robust", "signal for the prior"
 NO_POLICY = "none"  # instead of a policy's name
 
 DESIGNED = 50  # samples of a round without a policy, unless another number is given
 
 _SHORT = 20  # samples of a round that tells rivals apart
-_PADDED = 8  # rounds for which identification and the fits of rivals are compiled
+_PADDED = 8  # rounds for which identification and the fits of rivals are compiled, or 16, 24, ...
 _PLANTS = 32  # drawn to predict what a campaign reaches
 _FEWER = 8  # where a signal is redesigned for each of them
+_CONTRADICTED = 1e-4  # chance of records by which they contradict a prior, over its parameters
 _HARDLY = 0.98  # what all rounds that are left must make of an interval, or none is played
 
 
@@ -280,6 +286,12 @@ class Campaign:
         if prior is not None:
             if rivals:
                 raise ValueError("a prior is of one plant: it does not go with rivals")
+            bounded, _, _ = with_prior(self.plant, prior, self.plant.nominal, {}, {})
+            if names := uniform_names(bounded):
+                raise ValueError(
+                    f"a campaign takes normal and lognormal priors, and no uniform one: "
+                    f"got {', '.join(names)}"
+                )
             if told := excluded(self.plant, self._before, self.spread):
                 raise ValueError(f"{told}, or another prior")
         self.records: list[Record] = []
@@ -305,8 +317,14 @@ class Campaign:
 
     @cached_property
     def _before(self) -> Region:
-        """What is known before the first round."""
+        """Plants that are possible before the first round, by prior and spread."""
         return region_of(self.declared, self.prior or {}, self.spread)
+
+    @cached_property
+    def _of_prior(self) -> Region:
+        """What the prior alone says: nothing without one."""
+        spread = jnp.eye(len(self._before.center)) / prior_sd_of(self.spread) ** 2
+        return Region(self._before.center, self._before.information - spread)
 
     @cached_property
     def opening(self) -> Policy | Replay:
@@ -320,7 +338,10 @@ class Campaign:
         if self.policy is not None:
             return self.policy
         if self.prior is not None:
-            made = self._candidates(self._before, None)[-1]
+            made = candidates(
+                self.plant, self._before, self.targets, None,
+                num_steps=self.steps, coast=self.coast,
+            )[-1]  # fmt: skip
             if made.is_safe:
                 return made.excitation
         steps, spread = self.steps // 2, self.spread.setting
@@ -362,6 +383,7 @@ class Campaign:
             return None
         if is_other and not self.redesign:
             made_for, own = self.declared.description.name, self.plant.description.name
+            own += " with other constants" * (own == made_for)
             self.reason = f"the {self._opening_told} is for {made_for}, not for {own}"
             return None
         if told := self._nothing_more():
@@ -388,7 +410,7 @@ class Campaign:
 
     def _next(self) -> NextExperiment | None:
         """The candidates of the coming round; None where no estimate is to be trusted."""
-        if self.result is None and (self.prior is None or self.rounds):
+        if self.result is None and (self.prior is None or self.policy is None or self.rounds):
             return None
         if self.result is not None and (unexplained(self.result) or self.result.held):
             return None
@@ -422,10 +444,15 @@ class Campaign:
         left = self.most_rounds - sum(r.ended in WHOLE for r in self.rounds)
         if self.most_samples is not None:
             left = min(left, (self.most_samples - self.num_samples) // self.steps)
-        chosen, now = None if self.next is None else self.next.chosen, self._region
-        played = self.records[-1].inputs[:-1] if chosen is None else chosen.inputs
-        inputs = jnp.asarray(np.resize(played, (self.steps, played.shape[1])))
+        coming, now = None if self.next is None else self.next.chosen, self._region
+        if coming is None:
+            coming = candidate(
+                self.plant, now, self.targets, self._opening_name, self.opening,
+                self.steps, self.coast, len(self.rounds),
+            )  # fmt: skip
+        inputs = jnp.asarray(coming.inputs)
         gained = running_information(self.plant, self.plant.Params(*now.center), inputs)[-1]
+        gained = gained / max(noise_factor(self.result), 1e-3) ** 2  # as the intervals see it
         then = Region(now.center, now.information + left * gained)
         others = others_of(self.plant, self.targets)
         before, after = (
@@ -433,13 +460,13 @@ class Campaign:
             for region in (now, then)
         )
         name, share = max(after.items(), key=lambda item: item[1])
-        if share <= 1 or share < _HARDLY * before[name]:
+        if not 1 < share < math.inf or share < _HARDLY * before[name]:
             return ""
         target = next(t for t in self.targets if t.name == name)
         more = f"{left} more round{'s' * (left != 1)}"
         return (
-            f"nothing more can be had: {more} would hardly tell more of {name}, known to "
-            f"{target.at(before[name])}, and not to {target}"
+            f"nothing more can be had: {more} would hardly tell more of {name}, which is known "
+            f"to {target.at(shares_of(self.targets, self.known)[name])}"
         )
 
     def tell(
@@ -505,8 +532,8 @@ class Campaign:
             self.reason = "all rounds are played" + f"; {structure}" * self.is_undecided
         elif self.most_samples is not None and not self._fits(self.num_samples + count):
             self.reason = f"the budget of {self.most_samples} samples is used up"
-        if self.reason and unexplained(self.result):
-            self._identify(causes=True)
+        if self.reason and self.result is not None and unexplained(self.result):
+            self._look_for_causes(self.result)
         missing = farthest(shares) if shares else f"there is no estimate yet ({status})"
         decision = f"end: {self.reason}" if self.reason else f"go on: {missing}"
         if structure and not self.is_undecided:
@@ -521,31 +548,48 @@ class Campaign:
         if self.discrimination is None:
             return ""
         before = self.discrimination.chosen
-        self.discrimination = self.discrimination.after(self.records, _PADDED)
+        self.discrimination = self.discrimination.after(self.records, self._room(_SHORT))
         now = self.discrimination.chosen
         if now is None or before is None or now.name != before.name:
             self.result = None
         self.plant = self.discrimination.plant or self.plant
         return self.discrimination.decision
 
-    def _identify(self, causes: bool = False) -> str:
-        """Identifies all records together; returns the status.
-
-        Likely causes of a residual are looked for at the end: this takes longer than a decision.
-        """
-        uncertain, is_free = (
-            ({}, False) if self.discrimination is None else self.discrimination.fitted_beside
-        )
+    def _identify(self) -> str:
+        """Identifies all records together; returns the status."""
         try:
-            result = identify(
-                self.records, self.plant, start=self._start(), prior=self.prior,
-                uncertain=uncertain, initial_state="free" if is_free else "known",
-                room=(_PADDED, self.steps + 1), causes=causes,
-            )  # fmt: skip
+            result = self._identified(self.prior)
         except ValueError as error:  # this record tells nothing; another one may
             return str(error)
         self.result = result if result.is_usable else self.result
         return result.status
+
+    def _identified(
+        self, prior: PriorLike | Sequence[PriorLike] | None, causes: bool = False
+    ) -> Identification:
+        """The estimate from all records together."""
+        uncertain, is_free = (
+            ({}, False) if self.discrimination is None else self.discrimination.fitted_beside
+        )
+        return identify(
+            self.records, self.plant, start=self._start(), prior=prior, uncertain=uncertain,
+            initial_state="free" if is_free else "known", room=self._room(self.steps),
+            causes=causes,
+        )  # fmt: skip
+
+    def _room(self, steps: int) -> tuple[int, int]:
+        """Number and length of records for which programs are compiled: whole rounds of `steps`."""
+        longest = max(len(record.time) for record in self.records) - 1
+        count = _PADDED * math.ceil(len(self.records) / _PADDED)
+        return count, steps * math.ceil(longest / steps) + 1 + self.plant.has_feedthrough
+
+    def _look_for_causes(self, result: Identification) -> None:
+        """Looks for likely causes of the residual, which takes longer than a decision."""
+        with contextlib.suppress(ValueError):
+            found = self._identified(self.prior, causes=True)
+            self.result = dataclasses.replace(
+                result, suspects=found.suspects, verdict=found.verdict
+            )
 
     def _contradicted(self) -> list[str]:
         """Parameters in which the records contradict the prior.
@@ -555,15 +599,16 @@ class Campaign:
         if self.prior is None or self.result is None:
             return []
         _, joint, _ = with_prior(self.declared, self.prior, self.declared.nominal, {}, {})
-        if joint is None:
+        found, is_alone = self.result, bool(unexplained(self.result))
+        if is_alone:
+            try:
+                found = self._identified(None)
+            except ValueError:  # without the prior the records tell nothing
+                return []
+        if joint is None or not found.is_usable:
             return []
-        if not unexplained(self.result):
-            return joint.contradicted(self.result.params, self.result.std_error)
-        alone = identify(
-            self.records, self.plant, start=self._start(), initial_state="known",
-            room=(_PADDED, self.steps + 1), causes=False,
-        )  # fmt: skip
-        return joint.excludes(alone.params, alone.std_error)
+        chances = joint.chances(found.params, found.std_error, not is_alone)
+        return [name for name, chance in chances.items() if chance < _CONTRADICTED / len(chances)]
 
     def _is_explained(self) -> bool:
         """Whether the residual is noise, of the declared size where there are rivals.
@@ -580,11 +625,13 @@ class Campaign:
 
     @property
     def _opening_name(self) -> str:
-        return ROBUST if self.policy is None else "policy"
+        if self.policy is not None:
+            return "policy"
+        return ROBUST if self.prior is None else FOR_PRIOR
 
     @property
     def _opening_told(self) -> str:
-        return "robust signal" if self.policy is None else "policy"
+        return "robust signal" if self._opening_name == ROBUST else self._opening_name
 
     @property
     def known(self) -> dict[str, Interval]:
@@ -595,7 +642,7 @@ class Campaign:
         others = others_of(self.plant, self.targets)
         if self.result is not None:
             return known_of(self.plant, self.result, others)
-        return {} if self.prior is None else intervals_in(self.plant, self._before, others)
+        return {} if self.prior is None else self._known_before(others)
 
     def _start(self) -> dict[str, float] | None:
         """Where the next identification begins."""
@@ -623,7 +670,11 @@ class Campaign:
         if self.policy is None:
             return self._expected(redesigns)
         found = self._expected(False)
-        return self._expected(True) if found.missed and redesigns else found
+        if not (found.missed and redesigns):
+            return found
+        other = self._expected(True)
+        least = {name: min(share, found.shares[name]) for name, share in other.shares.items()}
+        return dataclasses.replace(other, shares=least)
 
     def _expected(self, redesigns: bool) -> Expected:
         """The same, with redesigned signals after the first round or without them."""
@@ -643,10 +694,10 @@ class Campaign:
                 for i in range(count)
             ])  # fmt: skip
         asked = [t.quantity for t in self.targets]
-        known = self._before.information * (self.prior is not None)
         outlook = _halves(
-            self.plant, episodes.params, first, later, self._whole_rounds, asked, known
-        )
+            self.plant, episodes.params, first, later, self._whole_rounds, asked,
+            self._of_prior.information,
+        )  # fmt: skip
         values, halves = map(np.asarray, outlook)
         shares = {
             t.name: t.share(values[:, None, i], halves[..., i]) for i, t in enumerate(self.targets)
@@ -697,7 +748,7 @@ class Campaign:
             **({} if self.most_samples is None else {"most_samples": self.most_samples}),
             "coast": self.coast,
             "redesign": self.redesign,
-            "prior": {} if self.prior is None else self._known_before,
+            "prior": {} if self.prior is None else _json_ready(self._known_before(())),
             "rivals": {} if self.discrimination is None else self.discrimination.plants,
             "structure": self.discrimination and self.discrimination.to_dict(),
             "warnings": list(self.warnings),
@@ -705,25 +756,29 @@ class Campaign:
             "reason": self.reason,
             "playing": self.playing,
             "interrupted": self.interrupted,
-            "estimate": self._estimate(),
+            "estimate": _json_ready(self.known),
             "num_samples": self.num_samples,
             "rounds": [r.to_dict() for r in self.rounds],
         }
 
-    @property
-    def _known_before(self) -> dict[str, dict[str, float]]:
-        """What was known of the parameters before the first round, as JSON-ready data."""
-        known = intervals_in(self.declared, self._before, ())
-        return {name: interval._asdict() for name, interval in known.items()}
+    def _known_before(self, others: Sequence[AbstractQuantity]) -> dict[str, Interval]:
+        """What the prior says of each parameter and of other quantities; the spread is none."""
+        plant, (center, information) = self.declared, jax.tree.leaves(self._of_prior)
+        params, own = plant.Params(*center), np.flatnonzero(np.diag(information) > 0)
+        covariance = np.zeros(information.shape)
+        covariance[np.ix_(own, own)] = np.linalg.inv(np.asarray(information)[np.ix_(own, own)])
+        size = np.asarray(relative_size(plant, params))
+        covariance *= np.outer(size, size)
+        halves = np.full(len(size), np.inf)
+        halves[own] = HALF_95 * np.sqrt(np.diag(covariance)[own])
+        each = zip(params._fields, map(float, center), halves.tolist(), strict=True)
+        known = {name: Interval(value, half) for name, value, half in each}
+        return known | propagated(others, plant, params, covariance, halves)
 
     def _allowed(self) -> dict[str, float]:
         """Of each target, half of the interval that is allowed; empty without an estimate."""
         known = self.known
         return {t.name: float(t.allowed(known[t.name].estimate)) for t in self.targets if known}
-
-    def _estimate(self) -> dict[str, dict[str, float]]:
-        """What is known, as JSON-ready data."""
-        return {name: interval._asdict() for name, interval in self.known.items()}
 
     header = ("parameter", "estimate", "± 95 %", "relative", "target", "")
 
@@ -787,6 +842,8 @@ class Campaign:
             raise ValueError("the campaign has no estimate yet")
         params = self.plant.Params(*self.result.params.values())
         before, parts = jnp.zeros((len(params), len(params))), []
+        if self.prior is not None:
+            before = self._of_prior.information
         for record in self.records:
             inputs = jnp.asarray(record.inputs[:-1])
             parts.append(running_information(self.plant, params, inputs) + before[None])
@@ -837,6 +894,11 @@ def _halves(
         return values, half_intervals(quantities, plant, params, running)
 
     return jax.vmap(one)(params, first, later)
+
+
+def _json_ready(known: Mapping[str, Interval]) -> dict[str, dict[str, float]]:
+    """What is known, as JSON-ready data."""
+    return {name: interval._asdict() for name, interval in known.items()}
 
 
 def _policy(given: str | Path | Policy | None, plant: PlantDescription) -> Policy | None:

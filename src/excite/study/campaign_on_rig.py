@@ -21,7 +21,7 @@ from ..description import (
 )
 from ..estimation.prior_knowledge import PriorLike
 from ..excitation import Replay
-from ..files import csv_text, locked_folder, read_json, write_bytes, write_json
+from ..files import csv_text, json_ready, locked_folder, read_json, write_bytes, write_json
 from ..plant.catalogue import PlantLike
 from ..policy import Policy, guard_of
 from ..progress import SHOWN, Progress
@@ -269,7 +269,7 @@ class _Folder:
             "rivals",
             "prior",
         )
-        settings = {**{name: own[name] for name in kept}, **asked}
+        settings = json_ready({**{name: own[name] for name in kept}, **asked})
         file = root / "campaign.json"
         if file.is_file() and (root / "round-01.csv").exists():
             before = read_json(file, "settings", "rounds")["settings"]
@@ -307,7 +307,7 @@ class _Folder:
 
     def save_round(self, made: Campaign) -> None:
         """The run folder of what the rounds so far tell together."""
-        if made.rounds and made.result is not None:
+        if made.result is not None and len(made.result.fitted) == len(made.rounds):
             made.result.save(self.path(len(made.rounds) - 1).with_suffix(""), overwrite=True)
 
     def resume(self, made: Campaign, on_round: Callable[[Round], None]) -> None:
@@ -326,6 +326,8 @@ class _Folder:
             count = len(made.rounds)
             goes_on, name = _has_samples(self.path(count + 1)), "".join(names[count : count + 1])
             on_round(made.tell(record, str(ended["reason"]), trip in _UNSAFE, goes_on, name))
+            if not self.path(count).with_suffix("").is_dir():  # killed before it was written
+                self.save_round(made)
             if not is_same:  # rounds that ended at other targets did not end too early
                 made.haste = 1.0
         self.write(made)

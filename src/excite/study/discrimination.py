@@ -124,7 +124,7 @@ class Discrimination:
             return None
         index = self.rivals.index(chosen)
         own = self._rivals[index]
-        if not any(self.fitted_beside):
+        if {*own.box.names} <= {*names_of(own.box.plant.definition.parameters)}:
             return own.box.plant
         return own.box.at(2 * ndtr(self._fits[index].z) - 1)[0]
 
@@ -132,20 +132,20 @@ class Discrimination:
     def fitted_beside(self) -> tuple[dict[str, float], bool]:
         """What the chosen rival has ranges of, beside its parameters.
 
-        That is the standard deviation of each such constant, and whether initial states are among
-        them.
+        That is the standard deviation of each such constant, if it has one, and whether initial
+        states are among them. Two constants whose fits are correlated count as independent.
         """
         if (chosen := self.chosen) is None:
             return {}, False
         d = self._rivals[self.rivals.index(chosen)].box.plant.definition
         others = chosen.estimate.keys() - names_of(d.parameters)
-        constants = [name for name in names_of(d.constants) if name in others]
-        sd = {name: chosen.estimate[name].ci95_half / HALF_95 for name in constants}
-        return sd, len(others) > len(constants)
+        constants = others & {*names_of(d.constants)}
+        sd = {name: chosen.estimate[name].ci95_half / HALF_95 for name in sorted(constants)}
+        return {n: own for n, own in sd.items() if own > 0}, len(others) > len(constants)
 
-    def after(self, records: Sequence[Record], padded: int = 0) -> Discrimination:
+    def after(self, records: Sequence[Record], room: tuple[int, int] = (0, 0)) -> Discrimination:
         """The same rivals after these records; see `judged`."""
-        return judged(self._rivals, records, padded)
+        return judged(self._rivals, records, room)
 
     @property
     def decision(self) -> str:
@@ -425,14 +425,15 @@ def _from_rest(given: RecordLike, rival: Rival, initial_state: str) -> Record:
     return record
 
 
-def judged(rivals: Sequence[Rival], records: Sequence[Record], padded: int = 0) -> Discrimination:
+def judged(
+    rivals: Sequence[Rival], records: Sequence[Record], room: tuple[int, int] = (0, 0)
+) -> Discrimination:
     """The rivals after the records.
 
     Args:
         rivals: with the sensor and the sampling time of the records.
         records: from rest; of one with a gap in time, the part before the gap counts.
-        padded: experiments without measurements that are added, up to this number, so that the
-            programs of a campaign are compiled once.
+        room: number of records, and of samples in each, for which programs are compiled.
     """
     fits, count = [unplayed(rival) for rival in rivals], 0
     if records:
@@ -440,7 +441,7 @@ def judged(rivals: Sequence[Rival], records: Sequence[Record], padded: int = 0) 
         linear = np.zeros(records[0].inputs.shape[1], bool)
         for i, rival in enumerate(rivals):
             experiments = experiments_of(rival.box.plant, whole, True, linear)
-            experiments = experiments.padded(padded, 0)
+            experiments = experiments.padded(*room)
             fits[i], count = fitted(rival, experiments), int(np.sum(experiments.valid))
     each = tuple(
         _judged(rival, fit, float(p), count)

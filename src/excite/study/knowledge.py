@@ -137,14 +137,24 @@ def unexplained(result: Identification | None) -> tuple[str, ...]:
     """Sentences, where the plant does not explain the records of a result."""
     if result is None or result.basis is None:
         return ()
-    sd = np.asarray(result.basis.plant.sensor.sd)
-    residual = np.concatenate([part.computed["residual"] for part in result.fitted])
-    size = float(np.nanmax(np.sqrt(np.nanmean((residual / sd[None]) ** 2, axis=0))))
+    size = noise_factor(result)
     cause = "".join(f" (likely cause: {suspect.name})" for suspect in result.suspects[:1])
     why = f"the plant may be wrong, and what is predicted too good{cause}"
     if size > _LARGE:
         return (f"the residual is {size:.2g} times the declared noise: {why}",)
     return (f"the residual follows the input: {why}",) * (result.misfit_factor > 1)
+
+
+def noise_factor(result: Identification) -> float:
+    """The residual's root mean square over the declared noise, of the output where it is largest.
+
+    One for a result that was not computed here.
+    """
+    if result.basis is None:
+        return 1.0
+    sd = np.asarray(result.basis.plant.sensor.sd)
+    residual = np.concatenate([part.computed["residual"] for part in result.fitted])
+    return float(np.nanmax(np.sqrt(np.nanmean((residual / sd[None]) ** 2, axis=0))))
 
 
 def region_of(

@@ -147,18 +147,18 @@ def candidates(
         name, given = opening
         own = given.layout.num_steps if isinstance(given, Policy) else len(given.inputs)
         length = min(num_steps, own)
-        found.append(_candidate(plant, region, targets, name, given, length, coast, seed))
+        found.append(candidate(plant, region, targets, name, given, length, coast, seed))
         inputs = jnp.asarray(np.resize(found[0].inputs, (num_steps, found[0].inputs.shape[1])))
         starts = jnp.concatenate([starts, jnp.broadcast_to(inputs, (1, *starts.shape[1:]))])
     asked = over_targets(plant, plant.Params(*region.center), targets)
     made = redesigned(plant, region, jnp.asarray(asked), starts, coast)
     replay = Replay(made.inputs[0])
-    redesign = _candidate(plant, region, targets, REDESIGNED, replay, num_steps, coast, seed)
+    redesign = candidate(plant, region, targets, REDESIGNED, replay, num_steps, coast, seed)
     is_found = bool(jnp.isfinite(made.shares).any())
     return [*found, redesign if is_found else replace(redesign, nearness=np.inf)]
 
 
-def _candidate(
+def candidate(
     plant: AbstractPlant,
     region: Region,
     targets: Sequence[Target],
@@ -449,7 +449,7 @@ def next_experiment(
     nearness = 0.0 if best is None else best.nearness
     if best is not None and isinstance(best.excitation, Policy):
         replay = Replay(jnp.asarray(best.inputs))
-        as_signal = _candidate(own, region, targets, best.name, replay, length, coast, seed)
+        as_signal = candidate(own, region, targets, best.name, replay, length, coast, seed)
         nearness = as_signal.nearness
     result = NextExperiment(own, now, targets, tuple(made), best, given.warnings, nearness)
     if out is not None:

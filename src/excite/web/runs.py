@@ -355,11 +355,12 @@ def _campaign(run: Path) -> dict[str, object]:
         tables = known_table(plant, content), rounds_table(content["rounds"])
     except (LookupError, TypeError, AttributeError, ArithmeticError, ValueError):
         return {}
+    is_playing = not content.get("reason") and is_locked(run / ".lock")
     known, rounds = ({"header": header, "rows": rows} for header, rows in tables)
     return {
         "known": known,
         "rounds": rounds,
-        "now": _now_played(run, content) if is_locked(run / ".lock") else "",
+        "now": _now_played(run, content) if is_playing else "",
         "interrupted": str(content.get("interrupted", "")),
         "told": str(content.get("reason") or content.get("interrupted") or ""),
     }

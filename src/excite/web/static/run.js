@@ -39,7 +39,7 @@ export async function show(run) {
     else if (!content.is_finished) card.append(el("p", {}, "Not finished. To resume it after an interruption, rerun the command in the folder where it was started: ", el("code", {}, content.command || "the same command")));
     card.append(el("p", { class: "row downloads" }, ...report, ...others.map(link)));
     if (policies.length) card.append(el("details", { open: policies.length < 4 }, el("summary", {}, `Policies (${policies.length})`), el("p", { class: "row downloads" }, ...policies.map(link))));
-    const isFollowed = content.kind === "campaign" && !content.is_finished && !content.campaign.interrupted;
+    const isFollowed = content.kind === "campaign" && !content.is_finished && (content.campaign.now || !content.campaign.interrupted);
     if (isFollowed) following = setTimeout(() => isWanted(run.name) && !section.hidden && show(run), 2000);
     put(card, ...(told?.card ? [told.card] : []));
     if (content.curves.length) {
