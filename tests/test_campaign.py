@@ -508,6 +508,7 @@ def test_what_is_expected_of_an_experiment_that_tells_nothing_is_the_prior():
     assert str(without) == "no plant of the spread reaches every target"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sd", ["2%", "0.01%"])  # the second outweighs the records
 def test_records_that_contradict_the_prior_end_the_campaign(sd):
     prior = {"J_p": f"lognormal:0.05:{sd}"}
@@ -536,6 +537,7 @@ def test_a_campaign_with_a_prior_is_resumed_with_the_same_one_only(tmp_path):
         repeated(tmp_path / "a", rounds=1)
 
 
+@pytest.mark.slow
 def test_records_that_tell_nothing_contradict_no_prior():
     prior = {name: f"lognormal:{value}:5%" for name, value in TRUE.items()}
     campaign = ex.Campaign("aero2", EASY, policy=steady(), prior=prior, redesign=False)
@@ -543,6 +545,7 @@ def test_records_that_tell_nothing_contradict_no_prior():
     assert campaign.tell(record).decision.startswith("go on: ")
 
 
+@pytest.mark.slow
 def test_a_prior_that_is_right_ends_no_campaign():
     ended = []
     for seed in range(40):  # at a chance of one in a hundred, one of three parameters would
@@ -624,6 +627,7 @@ def test_the_expected_samples_are_those_of_the_bound():
             assert share(count - 1) > 1
 
 
+@pytest.mark.slow  # compiles the redesign
 def test_a_target_that_nothing_reaches_is_refused_before_the_first_round(tmp_path):
     with pytest.raises(ValueError, match=r"reaches D_p to 1e-07 %: at best .* %; ask for less"):
         ex.campaign("aero2", {"D_p": "0.0000001%"}, policy=steady(), out=tmp_path / "a", fast=True)

@@ -56,10 +56,11 @@ def campaign_on(box: Uncertainty, policy: ex.Policy, seed: int) -> dict[str, Any
         time = np.arange(len(outputs)) * float(box.plant.dt)
         campaign.tell(Record.of_episode(time, inputs, outputs))
     return {
-        "seed": seed,
-        "reason": campaign.reason,
-        "rounds": [r.played for r in campaign.rounds],
-        "is_warned": bool(campaign.warnings),
+        "campaigns": 1,
+        "rounds": len(campaign.rounds),
+        "redesigned": sum(r.played == "redesigned" for r in campaign.rounds),
+        "warned": int(bool(campaign.warnings)),
+        "violations": int(max(largest) >= 1),
         "largest": max(largest),
     }
 
@@ -74,22 +75,16 @@ def main() -> None:
     policy = ex.read_policy(POLICY)
     ranges = policy.provenance["uncertainty"]
     box = Uncertainty.of(plant_from("aero2"), policy.provenance["spread"], ranges)
-    rows = json.loads(asked.out.read_text())["rows"] if asked.out.exists() else []
-    for seed in range(asked.seed + len(rows), asked.seed + asked.campaigns):
-        rows.append(campaign_on(box, policy, seed))
-        table = {
-            "policy_hash": policy.hash,
-            "uncertainty": ranges,
-            "campaigns": len(rows),
-            "rounds": sum(len(r["rounds"]) for r in rows),
-            "redesigned": sum(r["rounds"].count("redesigned") for r in rows),
-            "warned": sum(r["is_warned"] for r in rows),
-            "violations": sum(r["largest"] >= 1 for r in rows),
-            "largest": max(r["largest"] for r in rows),
-        }
-        if len(rows) % 10 == 0 or seed == asked.seed + asked.campaigns - 1:
-            write_json(asked.out, {**table, "rows": rows})
-            print(json.dumps(table), flush=True)
+    table: dict[str, Any] = {"policy_hash": policy.hash, "uncertainty": ranges, "campaigns": 0}
+    if asked.out.exists():
+        table = json.loads(asked.out.read_text())
+    for seed in range(asked.seed + table["campaigns"], asked.seed + asked.campaigns):
+        own = campaign_on(box, policy, seed)
+        largest = max(table.get("largest", 0.0), own.pop("largest"))
+        table |= {name: table.get(name, 0) + count for name, count in own.items()}
+        table["largest"] = largest
+        write_json(asked.out, table)
+        print(json.dumps(table), flush=True)
 
 
 if __name__ == "__main__":

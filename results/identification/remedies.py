@@ -12,7 +12,7 @@ half a second hardly tells them at these sizes. A drift of the speed grows to 0.
 noise's standard deviation: it is estimated to be five standard errors from zero, near the limit of
 significance, and is hardly told from a bias. Drag is estimated to be four standard errors from
 zero, and hides in the viscous friction. The rows "4 x" are of these two, four times as large. On
-cart_pole an offset is missed in 2 of 20 records: without it the search ends far from the truth.
+cart_pole an offset is missed in 6 of 75 records: without it the search ends far from the truth.
 
 All effects of all plants have 20 records before the first one has 40, and so on. Counts are written
 to remedies.json after every few records, and the script goes on where it was interrupted.

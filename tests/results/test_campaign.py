@@ -48,6 +48,22 @@ def test_the_page_says_what_a_policy_does_whose_plants_also_have_delay_lag_and_a
     assert f"a median of {median:.0f} samples, and {row['missed']} of the 1000" in told
 
 
+def test_whole_campaigns_on_plants_with_delay_and_lag_play_the_policy_and_are_safe():
+    found = json.loads((FOLDER / "uncertain.json").read_text())
+    policy = read_policy(FOLDER / "policies" / "aero2-wide-robust.safetensors")
+    assert found["policy_hash"] == policy.hash
+    assert found["uncertainty"] == policy.provenance["uncertainty"]
+    assert (found["violations"], found["redesigned"]) == (0, 0)
+    count = found["campaigns"]
+    assert found["warned"] == count
+    assert found["rounds"] == 3 * count
+    told = PAGE[PAGE.index("Whole campaigns know nothing") :].partition("\n\n")[0]
+    told = told.replace("\n", " ")
+    assert f"In {count} campaigns" in told
+    assert f"(largest {found['largest']:.3f})" in told
+    assert f"All {count} were warned" in told
+
+
 def test_the_page_says_what_campaigns_with_guard_on_the_detailed_rig_did():
     found = json.loads((FOLDER / "detailed_rig.json").read_text())
     count, rows = found["campaigns"], found["rows"]
