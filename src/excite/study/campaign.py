@@ -41,7 +41,7 @@ from ..environment import run_episodes
 from ..estimation import Status
 from ..estimation.diagnosis import chi2_tail
 from ..estimation.identify import RecordLike, identify, record_for
-from ..estimation.prior import uniform_names
+from ..estimation.prior import Prior, uniform_names
 from ..estimation.prior_knowledge import PriorLike, plants_of, with_prior
 from ..estimation.result import Identification
 from ..excitation import PolicyExcitation, Replay
@@ -270,7 +270,8 @@ class Campaign:
         self.spread = Spread.of(usual if spread is None else spread)
         self.coast = coast if coast is not None else usual_coast or COAST
         require_whole("coast", self.coast, 0)
-        self.redesign, self.prior = redesign, prior
+        self.redesign = redesign
+        self.prior = None if prior is None else self._normal(prior, bool(rivals))
         self.discrimination: Discrimination | None = None
         if isinstance(rivals, str) or not isinstance(rivals, Sequence):
             raise wrong_type("rivals", rivals, "a list of plants")
@@ -283,25 +284,29 @@ class Campaign:
             for own in self.discrimination.rival_plants:
                 for quantity in others_of(own, self.targets):
                     require_defined(quantity, own)
-        if prior is not None:
-            if rivals:
-                raise ValueError("a prior is of one plant: it does not go with rivals")
-            bounded, _, _ = with_prior(self.plant, prior, self.plant.nominal, {}, {})
-            if names := uniform_names(bounded):
-                raise ValueError(
-                    f"a campaign takes normal and lognormal priors, and no uniform one: "
-                    f"got {', '.join(names)}"
-                )
-            if told := excluded(self.plant, self._before, self.spread):
-                raise ValueError(f"{told}, or another prior")
         self.records: list[Record] = []
         self.rounds: list[Round] = []
         self.result: Identification | None = None
         self.next: NextExperiment | None = None
         self.reason, self.interrupted, self.prediction = "", "", ""
         self.haste, self.playing = 1.0, ""
-        if prior is not None and max(shares_of(self.targets, self.known).values()) <= 1:
-            raise ValueError("every target is reached by the prior: ask for more")
+        if self.prior is not None:
+            if told := excluded(self.plant, self._before, self.spread):
+                raise ValueError(f"{told}, or another prior")
+            if max(shares_of(self.targets, self.known).values()) <= 1:
+                raise ValueError("every target is reached by the prior: ask for more")
+
+    def _normal(self, given: PriorLike | Sequence[PriorLike], has_rivals: bool) -> Prior | None:
+        """All priors as one, which is read once; ValueError for one that cannot be used."""
+        if has_rivals:
+            raise ValueError("a prior is of one plant: it does not go with rivals")
+        bounded, joint, _ = with_prior(self.plant, given, self.plant.nominal, {}, {})
+        if names := uniform_names(bounded):
+            raise ValueError(
+                "a campaign takes normal and lognormal priors, and no uniform one: got "
+                + ", ".join(names)
+            )
+        return joint
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -333,7 +338,8 @@ class Campaign:
         Designing a robust signal takes minutes.
 
         Raises:
-            ValueError: for a signal that reaches a critical level on a plant of the spread.
+            ValueError: for a signal that reaches a critical level on a plant of the spread, or on
+                one that the prior leaves possible.
         """
         if self.policy is not None:
             return self.policy
@@ -342,8 +348,12 @@ class Campaign:
                 self.plant, self._before, self.targets, None,
                 num_steps=self.steps, coast=self.coast,
             )[-1]  # fmt: skip
-            if made.is_safe:
-                return made.excitation
+            if not made.is_safe:
+                raise ValueError(
+                    "no safe first signal was found for the prior; a narrower one, fewer steps or "
+                    "a policy may help"
+                )
+            return made.excitation
         steps, spread = self.steps // 2, self.spread.setting
         made = design(self.declared, steps=steps, spread=spread, coast=self.coast)
         if made.violations:
@@ -463,11 +473,10 @@ class Campaign:
         if not 1 < share < math.inf or share < _HARDLY * before[name]:
             return ""
         target = next(t for t in self.targets if t.name == name)
-        more = f"{left} more round{'s' * (left != 1)}"
-        return (
-            f"nothing more can be had: {more} would hardly tell more of {name}, which is known "
-            f"to {target.at(shares_of(self.targets, self.known)[name])}"
-        )
+        more, known = f"{left} more round{'s' * (left != 1)}", self.known
+        reached = shares_of(self.targets, known)[name]
+        told = f"known to {target.at(reached)}" if reached < math.inf else "not identifiable"
+        return f"nothing more can be had: {more} would hardly tell more of {name}, which is {told}"
 
     def tell(
         self,
@@ -564,9 +573,7 @@ class Campaign:
         self.result = result if result.is_usable else self.result
         return result.status
 
-    def _identified(
-        self, prior: PriorLike | Sequence[PriorLike] | None, causes: bool = False
-    ) -> Identification:
+    def _identified(self, prior: Prior | None, causes: bool = False) -> Identification:
         """The estimate from all records together."""
         uncertain, is_free = (
             ({}, False) if self.discrimination is None else self.discrimination.fitted_beside
@@ -598,16 +605,15 @@ class Campaign:
         """
         if self.prior is None or self.result is None:
             return []
-        _, joint, _ = with_prior(self.declared, self.prior, self.declared.nominal, {}, {})
         found, is_alone = self.result, bool(unexplained(self.result))
         if is_alone:
             try:
                 found = self._identified(None)
             except ValueError:  # without the prior the records tell nothing
                 return []
-        if joint is None or not found.is_usable:
+        if not found.is_usable:
             return []
-        chances = joint.chances(found.params, found.std_error, not is_alone)
+        chances = self.prior.chances(found.params, found.std_error, not is_alone)
         return [name for name, chance in chances.items() if chance < _CONTRADICTED / len(chances)]
 
     def _is_explained(self) -> bool:
@@ -748,7 +754,7 @@ class Campaign:
             **({} if self.most_samples is None else {"most_samples": self.most_samples}),
             "coast": self.coast,
             "redesign": self.redesign,
-            "prior": {} if self.prior is None else _json_ready(self._known_before(())),
+            "prior": {} if self.prior is None else _as_data(self._known_before(())),
             "rivals": {} if self.discrimination is None else self.discrimination.plants,
             "structure": self.discrimination and self.discrimination.to_dict(),
             "warnings": list(self.warnings),
@@ -756,7 +762,7 @@ class Campaign:
             "reason": self.reason,
             "playing": self.playing,
             "interrupted": self.interrupted,
-            "estimate": _json_ready(self.known),
+            "estimate": _as_data(self.known),
             "num_samples": self.num_samples,
             "rounds": [r.to_dict() for r in self.rounds],
         }
@@ -896,7 +902,7 @@ def _halves(
     return jax.vmap(one)(params, first, later)
 
 
-def _json_ready(known: Mapping[str, Interval]) -> dict[str, dict[str, float]]:
+def _as_data(known: Mapping[str, Interval]) -> dict[str, dict[str, float]]:
     """What is known, as JSON-ready data."""
     return {name: interval._asdict() for name, interval in known.items()}
 

@@ -259,16 +259,8 @@ class _Folder:
     ) -> _Folder:
         """A folder that is new, or of the same campaign; ValueError for anything else."""
         own = made.to_dict()
-        kept = (
-            "plant_hash",
-            "policy_hash",
-            "steps",
-            "spread",
-            "coast",
-            "redesign",
-            "rivals",
-            "prior",
-        )
+        kept = ("plant_hash", "policy_hash", "steps", "spread", "coast", "redesign", "rivals",
+                "prior")  # fmt: skip
         settings = json_ready({**{name: own[name] for name in kept}, **asked})
         file = root / "campaign.json"
         if file.is_file() and (root / "round-01.csv").exists():
