@@ -255,6 +255,13 @@ def test_without_a_policy_signals_are_redesigned_after_the_first(designed):
 
 
 @pytest.mark.slow
+def test_a_first_signal_is_played_again_although_it_is_shorter_than_a_round(designed):
+    designed.redesign = False
+    designed.tell(ex.simulate("aero2", designed.ask(), params=TRUE, seed=0))
+    assert designed.ask() is designed.opening
+
+
+@pytest.mark.slow
 def test_a_robust_signal_that_is_played_again_is_called_so(designed):
     record = ex.simulate("aero2", designed.ask(), params=TRUE, seed=0)
     designed.tell(record)
@@ -524,6 +531,34 @@ def test_with_a_prior_and_without_a_policy_the_first_signal_is_designed_for_the_
     told = campaign.tell(ex.simulate("aero2", campaign.ask(), params=TRUE, seed=1))
     assert (told.num_samples, told.played) == (60, "signal for the prior")
     assert told.nearness < 1
+
+
+@pytest.mark.slow
+def test_noise_that_is_not_white_contradicts_no_prior():
+    rng, ended = np.random.default_rng(0), []
+    for seed in range(20):
+        prior = {n: f"lognormal:{v * math.exp(0.01 * rng.normal())}:1%" for n, v in TRUE.items()}
+        campaign = ex.Campaign("aero2", {"D_p": "0.01%"}, policy=steady(), prior=prior)
+        campaign.redesign = False
+        record = ex.simulate("aero2", steady(), params=TRUE, seed=seed)
+        noise = np.zeros(len(record.time))
+        for k in range(1, len(noise)):
+            noise[k] = 0.9 * noise[k - 1] + 1.5e-4 * rng.normal()
+        outputs = record.outputs + noise[:, None]
+        campaign.tell(dataclasses.replace(record, outputs=outputs))
+        ended.append(campaign.reason)
+    assert {*ended} == {""}
+
+
+def test_a_prior_is_no_estimate():
+    campaign = ex.Campaign("aero2", EASY, policy=steady(), prior=KNOWN, redesign=False)
+    record = ex.simulate("aero2", still(), params=TRUE, seed=1)
+    lost = dataclasses.replace(record, outputs=np.full_like(record.outputs, np.nan))
+    lost.outputs[:3] = record.outputs[:3]
+    told = campaign.tell(lost)
+    assert campaign.result is None
+    assert told.known == {}
+    assert told.decision.startswith("go on: there is no estimate yet")
 
 
 @pytest.mark.science

@@ -459,7 +459,7 @@ def misfit_factor(
     for o, noise in enumerate(coloured_noise(sensitivity, residual, valid)):
         seen = valid[:, :, o].reshape(-1)
         estimated = _basis(sensitivity[:, :, o].reshape(len(seen), -1))
-        directions = np.column_stack([np.ones(len(seen)), past]) * seen[:, None]
+        directions = np.where(seen[:, None], np.column_stack([np.ones(len(seen)), past]), 0.0)
         directions = _basis(directions, estimated)
         along = directions.T @ residual[:, :, o].reshape(-1)
         by_experiment = directions.reshape(*valid.shape[:2], -1)

@@ -59,7 +59,7 @@ from ..training.design import design
 from ..training.redesign import Region
 from .discrimination import Discrimination, RivalLike, judged, rivals_from, with_experiment
 from .falsify import trained_in
-from .knowledge import excluded, intervals_in, noise_factor, region_of, unexplained
+from .knowledge import excluded, intervals_in, noise_factors, region_of, unexplained
 from .monitor import Monitor
 from .next_experiment import COAST, Candidate, NextExperiment, best_of, candidate, candidates
 from .quantities import (
@@ -460,9 +460,10 @@ class Campaign:
                 self.plant, now, self.targets, self._opening_name, self.opening,
                 self.steps, self.coast, len(self.rounds),
             )  # fmt: skip
-        inputs = jnp.asarray(coming.inputs)
-        gained = running_information(self.plant, self.plant.Params(*now.center), inputs)[-1]
-        gained = gained / max(noise_factor(self.result), 1e-3) ** 2  # as the intervals see it
+        params, inputs = self.plant.Params(*now.center), jnp.asarray(coming.inputs)
+        gained = running_information(self.plant, params, inputs)[-1]
+        noise = float(np.nanmin(noise_factors(self.plant, self.result)))  # the intervals know it
+        gained = gained / max(noise, 1e-3) ** 2
         then = Region(now.center, now.information + left * gained)
         others = others_of(self.plant, self.targets)
         before, after = (
@@ -523,7 +524,7 @@ class Campaign:
                 status = structure if self.is_undecided else self._identify()
         sizes = np.abs(record.outputs) / critical_levels(d)[None]
         near = float(np.nanmax(sizes, initial=0.0))
-        known = self.known
+        known = self.known if self.result is not None else {}  # a prior is no estimate
         shares = shares_of(self.targets, known)
         if ended == REACHED:  # says the running estimate; the intervals of all records may be wider
             self.haste = max([self.haste, *(s for s in shares.values() if math.isfinite(s))])
@@ -591,27 +592,36 @@ class Campaign:
         return count, steps * math.ceil(longest / steps) + 1 + self.plant.has_feedthrough
 
     def _look_for_causes(self, result: Identification) -> None:
-        """Looks for likely causes of the residual, which takes longer than a decision."""
+        """Looks for likely causes of the residual, which takes longer than a decision.
+
+        With a prior there are none: it may explain what they explain.
+        """
+        if self.prior is not None or len(result.fitted) < len(self.records):
+            return
         with contextlib.suppress(ValueError):
-            found = self._identified(self.prior, causes=True)
-            self.result = dataclasses.replace(
-                result, suspects=found.suspects, verdict=found.verdict
-            )
+            found = self._identified(None, causes=True)
+            if found.is_usable:
+                self.result = dataclasses.replace(
+                    result, suspects=found.suspects, verdict=found.verdict
+                )
 
     def _contradicted(self) -> list[str]:
         """Parameters in which the records contradict the prior.
 
-        Where it leaves a residual that is not noise, they are asked without it.
+        Where the residual is not white noise, they are asked without it. If the plant does not
+        explain them then either, they say nothing of the prior.
         """
         if self.prior is None or self.result is None:
             return []
-        found, is_alone = self.result, bool(unexplained(self.result))
+        found = self.result
+        is_coloured = any(p < RARE for p in found.whiteness.values())
+        is_alone = is_coloured or bool(unexplained(found))
         if is_alone:
             try:
                 found = self._identified(None)
             except ValueError:  # without the prior the records tell nothing
                 return []
-        if not found.is_usable:
+        if not found.is_usable or unexplained(found):
             return []
         chances = self.prior.chances(found.params, found.std_error, not is_alone)
         return [name for name, chance in chances.items() if chance < _CONTRADICTED / len(chances)]
@@ -672,7 +682,8 @@ class Campaign:
         With a policy, every round plays it. Without one, or where that reaches too little, all
         rounds after the first play what is redesigned for each plant.
         """
-        redesigns = self.redesign and self._whole_rounds > 1
+        is_for_prior = self.prior is not None and self.policy is not None
+        redesigns = self.redesign and (self._whole_rounds > 1 or is_for_prior)
         if self.policy is None:
             return self._expected(redesigns)
         found = self._expected(False)
@@ -694,7 +705,11 @@ class Campaign:
         drawn = None if self.prior is None else plants_of(self.plant, self.prior, self.spread)
         episodes = run_episodes(self.plant, excitation, steps, self.spread, keys, prior=drawn)
         first = later = episodes.trajectory.inputs
-        if redesigns:
+        if redesigns and self.prior is not None and self.policy is not None:
+            made = self._candidates(self._before, (self._opening_name, opening))[-1]
+            if made.is_safe:
+                first = later = jnp.broadcast_to(jnp.asarray(made.inputs), first.shape)
+        if redesigns and self._whole_rounds > 1:
             later = jnp.stack([
                 self._redesigned(jax.tree.map(lambda x, i=i: x[i], episodes.params), first[i])
                 for i in range(count)
@@ -777,6 +792,7 @@ class Campaign:
         covariance *= np.outer(size, size)
         halves = np.full(len(size), np.inf)
         halves[own] = HALF_95 * np.sqrt(np.diag(covariance)[own])
+        halves = np.array([float(f"{half:.9g}") for half in halves])  # alike on other machines
         each = zip(params._fields, map(float, center), halves.tolist(), strict=True)
         known = {name: Interval(value, half) for name, value, half in each}
         return known | propagated(others, plant, params, covariance, halves)

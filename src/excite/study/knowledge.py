@@ -9,6 +9,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from ..description import Spread, SpreadLike, names_of, prior_sd_of, wrong_type
 from ..estimation.identify import RecordLike, identify, plant_named_by, require_shipped
@@ -137,7 +138,7 @@ def unexplained(result: Identification | None) -> tuple[str, ...]:
     """Sentences, where the plant does not explain the records of a result."""
     if result is None or result.basis is None:
         return ()
-    size = noise_factor(result)
+    size = float(np.nanmax(noise_factors(result.basis.plant, result)))
     cause = "".join(f" (likely cause: {suspect.name})" for suspect in result.suspects[:1])
     why = f"the plant may be wrong, and what is predicted too good{cause}"
     if size > _LARGE:
@@ -145,16 +146,10 @@ def unexplained(result: Identification | None) -> tuple[str, ...]:
     return (f"the residual follows the input: {why}",) * (result.misfit_factor > 1)
 
 
-def noise_factor(result: Identification) -> float:
-    """The residual's root mean square over the declared noise, of the output where it is largest.
-
-    One for a result that was not computed here.
-    """
-    if result.basis is None:
-        return 1.0
-    sd = np.asarray(result.basis.plant.sensor.sd)
+def noise_factors(plant: AbstractPlant, result: Identification) -> Float[np.ndarray, " output"]:
+    """Of each output, the residual's root mean square over the declared noise."""
     residual = np.concatenate([part.computed["residual"] for part in result.fitted])
-    return float(np.nanmax(np.sqrt(np.nanmean((residual / sd[None]) ** 2, axis=0))))
+    return np.sqrt(np.nanmean((residual / np.asarray(plant.sensor.sd)[None]) ** 2, axis=0))
 
 
 def region_of(

@@ -145,9 +145,7 @@ def candidates(
     found, starts = [], first_signals(plant, ahead, num_steps, seed)
     if opening is not None:
         name, given = opening
-        own = given.layout.num_steps if isinstance(given, Policy) else len(given.inputs)
-        length = min(num_steps, own)
-        found.append(candidate(plant, region, targets, name, given, length, coast, seed))
+        found.append(candidate(plant, region, targets, name, given, num_steps, coast, seed))
         inputs = jnp.asarray(np.resize(found[0].inputs, (num_steps, found[0].inputs.shape[1])))
         starts = jnp.concatenate([starts, jnp.broadcast_to(inputs, (1, *starts.shape[1:]))])
     asked = over_targets(plant, plant.Params(*region.center), targets)
@@ -168,11 +166,12 @@ def candidate(
     coast: int,
     seed: int,
 ) -> Candidate:
-    """What an excitation would bring."""
+    """What an excitation would bring, in this many samples or as many as it has."""
     own = PolicyExcitation.of(given) if isinstance(given, Policy) else given
+    length = given.layout.num_steps if isinstance(given, Policy) else len(given.inputs)
     key = jax.random.key(seed)
     quantities = quantities_of(plant, targets)
-    outlook = _outlook(plant, region, own, num_steps, coast, key, quantities)
+    outlook = _outlook(plant, region, own, min(num_steps, length), coast, key, quantities)
     inputs, values, halves, size = map(np.asarray, outlook)
     after = {
         q.name: Interval(float(value), float(half))

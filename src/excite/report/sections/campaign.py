@@ -86,6 +86,7 @@ class CampaignRun(Run):
                 facts(
                     [
                         *((key, c[key]) for key in _SETTINGS),
+                        *([("prior", _prior(c["prior"]))] if c.get("prior") else []),
                         *((key, value) for key, value in c["settings"].items() if key not in c),
                     ]
                 ),
@@ -108,6 +109,12 @@ class CampaignRun(Run):
             "the records. Rounds end at the dotted lines."
         )
         return [Figure(drawn, f"{name}-known", caption, _KNOWLEDGE)]
+
+
+def _prior(known: Mapping[str, Mapping[str, Any]]) -> str:
+    """What was known before the first round, in words."""
+    told = {n: (own["estimate"], own["ci95_half"]) for n, own in known.items()}
+    return ", ".join(f"{n} = {v:.4g} ± {h:.2g}" for n, (v, h) in told.items() if h is not None)
 
 
 def outcome(content: Mapping[str, Any]) -> str:
