@@ -157,9 +157,9 @@ def test_the_bound_of_two_known_plants_is_that_of_kailath_and_holds():
     assert bound == pytest.approx(0.5 * math.exp(-D / 8), rel=1e-6)
     assert norm.cdf(-math.sqrt(D) / 2) <= bound  # the error of the likelihood ratio
     rest = jnp.zeros((COAST, 1))
-    for start in starts:  # as loud as the input may be, and safe
+    for i, start in enumerate(starts):  # as loud as the input may be; a wave or a step, and safe
         loud = start * 24 / jnp.max(jnp.abs(start))
-        while max(
+        while i > 4 and max(
             float(nearness(Aero2(), r.response(jnp.zeros(len(r.box.names)), whole)))
             for r in rivals
             for whole in [jnp.concatenate([loud, rest])]

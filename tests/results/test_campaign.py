@@ -99,7 +99,7 @@ def test_the_page_says_how_often_the_true_rival_is_found_with_much_noise():
     table = PAGE[PAGE.index("| designed after every round") :].partition("\n\n")[0]
     lines = {line.split("|")[1].strip(): line for line in table.splitlines()}
     wrong, undecided = (sum(row[of] for row in designed) for of in ("decided_wrong", "undecided"))
-    assert wrong < 0.01 * sum(row["plants"] for row in designed)
+    assert (wrong, undecided) == (2, 8)
     assert found["designed"]["aero2"]["decided_wrong"] == 0
     told = PAGE[PAGE.index("Of 800 designed campaigns") :].partition("\n\n")[0].replace("\n", " ")
     assert f"{wrong} chose a wrong rival" in told

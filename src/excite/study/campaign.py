@@ -2,10 +2,10 @@
 
 Where several plants may be the true one, the first rounds play signals that tell them apart, until
 one is chosen. A round then plays from rest: a policy, or, where there is none, a signal that is
-safe for the whole spread; once there is an estimate, a signal redesigned for what is known, where
-that is better. It ends with its last sample, or as soon as the running estimate reaches every
-target and the free motion that would follow is predicted to be safe. After every round all records
-are identified together.
+safe for the whole spread; once there is an estimate or a prior, a signal redesigned for what is
+known, where that is better. It ends with its last sample, or as soon as the running estimate
+reaches every target and the free motion that would follow is predicted to be safe. After every
+round all records are identified together.
 """
 
 from __future__ import annotations
@@ -27,13 +27,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..description import (
-    HALF_95,
     RARE,
     PlantDescription,
     Spread,
     SpreadLike,
     names_of,
-    prior_sd_of,
     require_whole,
     wrong_type,
 )
@@ -45,7 +43,7 @@ from ..estimation.prior import Prior, uniform_names
 from ..estimation.prior_knowledge import PriorLike, plants_of, with_prior
 from ..estimation.result import Identification
 from ..excitation import PolicyExcitation, Replay
-from ..information import relative_size, require_noise, running_information
+from ..information import require_noise, running_information
 from ..plant import AbstractPlant, Params
 from ..plant.catalogue import PlantLike, plant_from, require_inputs
 from ..policy import Policy, mismatch, read_policy
@@ -59,7 +57,15 @@ from ..training.design import design
 from ..training.redesign import Region
 from .discrimination import Discrimination, RivalLike, judged, rivals_from, with_experiment
 from .falsify import trained_in
-from .knowledge import excluded, intervals_in, noise_factors, region_of, unexplained
+from .knowledge import (
+    excluded,
+    intervals_in,
+    intervals_of_prior,
+    noise_factors,
+    region_of,
+    told_by,
+    unexplained,
+)
 from .monitor import Monitor
 from .next_experiment import COAST, Candidate, NextExperiment, best_of, candidate, candidates
 from .quantities import (
@@ -67,7 +73,6 @@ from .quantities import (
     OneParameter,
     half_intervals,
     known_of,
-    propagated,
     require_defined,
     slopes,
 )
@@ -125,8 +130,7 @@ class Round:
 
     def to_dict(self) -> dict[str, Any]:
         """The round as JSON-ready data."""
-        known = {name: interval._asdict() for name, interval in self.known.items()}
-        return {**dataclasses.asdict(self), "known": known}
+        return {**dataclasses.asdict(self), "known": _as_data(self.known)}
 
 
 @dataclass(frozen=True)
@@ -327,9 +331,8 @@ class Campaign:
 
     @cached_property
     def _of_prior(self) -> Region:
-        """What the prior alone says: nothing without one."""
-        spread = jnp.eye(len(self._before.center)) / prior_sd_of(self.spread) ** 2
-        return Region(self._before.center, self._before.information - spread)
+        """What the prior alone tells: nothing without one."""
+        return told_by(self.declared, self.prior or {})
 
     @cached_property
     def opening(self) -> Policy | Replay:
@@ -420,20 +423,23 @@ class Campaign:
 
     def _next(self) -> NextExperiment | None:
         """The candidates of the coming round; None where no estimate is to be trusted."""
-        if self.result is None and (self.prior is None or self.policy is None or self.rounds):
+        if self.result is None and (self.rounds or not self._may_redesign_first):
             return None
         if self.result is not None and (unexplained(self.result) or self.result.held):
             return None
-        made = self._candidates(self._region, (self._opening_name, self.opening))
+        made = self._candidates(self._region)
         best = best_of(made, self.targets)
         return NextExperiment(self.plant, self.known, self.targets, tuple(made), best)
 
-    def _candidates(
-        self, region: Region, opening: tuple[str, Policy | Replay] | None
-    ) -> list[Candidate]:
+    @property
+    def _may_redesign_first(self) -> bool:
+        """Whether the first round may play a signal for the prior in place of the policy."""
+        return self.redesign and self.prior is not None and self.policy is not None
+
+    def _candidates(self, region: Region) -> list[Candidate]:
         """What could be played, given what is known: the opening, and a redesigned signal."""
         return candidates(
-            self.plant, region, self.targets, opening,
+            self.plant, region, self.targets, (self._opening_name, self.opening),
             num_steps=self.steps, coast=self.coast, seed=len(self.rounds),
         )  # fmt: skip
 
@@ -658,7 +664,13 @@ class Campaign:
         others = others_of(self.plant, self.targets)
         if self.result is not None:
             return known_of(self.plant, self.result, others)
-        return {} if self.prior is None else self._known_before(others)
+        return self._known_before(others)
+
+    def _known_before(self, others: Sequence[AbstractQuantity]) -> dict[str, Interval]:
+        """What the prior tells of each parameter and of other quantities; empty without one."""
+        if self.prior is None:
+            return {}
+        return intervals_of_prior(self.declared, self._of_prior, others)
 
     def _start(self) -> dict[str, float] | None:
         """Where the next identification begins."""
@@ -680,10 +692,10 @@ class Campaign:
         """What the campaign will reach; computed once, in seconds, or a minute without a policy.
 
         With a policy, every round plays it. Without one, or where that reaches too little, all
-        rounds after the first play what is redesigned for each plant.
+        rounds after the first play what is redesigned for each plant, and with a prior the first
+        one what is redesigned for it.
         """
-        is_for_prior = self.prior is not None and self.policy is not None
-        redesigns = self.redesign and (self._whole_rounds > 1 or is_for_prior)
+        redesigns = self._may_redesign_first or (self.redesign and self._whole_rounds > 1)
         if self.policy is None:
             return self._expected(redesigns)
         found = self._expected(False)
@@ -705,8 +717,8 @@ class Campaign:
         drawn = None if self.prior is None else plants_of(self.plant, self.prior, self.spread)
         episodes = run_episodes(self.plant, excitation, steps, self.spread, keys, prior=drawn)
         first = later = episodes.trajectory.inputs
-        if redesigns and self.prior is not None and self.policy is not None:
-            made = self._candidates(self._before, (self._opening_name, opening))[-1]
+        if redesigns and self._may_redesign_first:
+            made = self._candidates(self._before)[-1]
             if made.is_safe:
                 first = later = jnp.broadcast_to(jnp.asarray(made.inputs), first.shape)
         if redesigns and self._whole_rounds > 1:
@@ -734,7 +746,7 @@ class Campaign:
         """What would be played on a plant after the first round; that again where nothing is."""
         gained = running_information(self.plant, params, first)[-1]
         region = Region(jnp.stack(list(params)), self._before.information + gained)
-        made = self._candidates(region, (self._opening_name, self.opening))[-1]
+        made = self._candidates(region)[-1]
         return jnp.asarray(made.inputs if made.is_safe else np.resize(first, made.inputs.shape))
 
     def require_reachable(self) -> None:
@@ -769,7 +781,7 @@ class Campaign:
             **({} if self.most_samples is None else {"most_samples": self.most_samples}),
             "coast": self.coast,
             "redesign": self.redesign,
-            "prior": {} if self.prior is None else _as_data(self._known_before(())),
+            "prior": _as_data(self._known_before(())),
             "rivals": {} if self.discrimination is None else self.discrimination.plants,
             "structure": self.discrimination and self.discrimination.to_dict(),
             "warnings": list(self.warnings),
@@ -781,21 +793,6 @@ class Campaign:
             "num_samples": self.num_samples,
             "rounds": [r.to_dict() for r in self.rounds],
         }
-
-    def _known_before(self, others: Sequence[AbstractQuantity]) -> dict[str, Interval]:
-        """What the prior says of each parameter and of other quantities; the spread is none."""
-        plant, (center, information) = self.declared, jax.tree.leaves(self._of_prior)
-        params, own = plant.Params(*center), np.flatnonzero(np.diag(information) > 0)
-        covariance = np.zeros(information.shape)
-        covariance[np.ix_(own, own)] = np.linalg.inv(np.asarray(information)[np.ix_(own, own)])
-        size = np.asarray(relative_size(plant, params))
-        covariance *= np.outer(size, size)
-        halves = np.full(len(size), np.inf)
-        halves[own] = HALF_95 * np.sqrt(np.diag(covariance)[own])
-        halves = np.array([float(f"{half:.9g}") for half in halves])  # alike on other machines
-        each = zip(params._fields, map(float, center), halves.tolist(), strict=True)
-        known = {name: Interval(value, half) for name, value, half in each}
-        return known | propagated(others, plant, params, covariance, halves)
 
     def _allowed(self) -> dict[str, float]:
         """Of each target, half of the interval that is allowed; empty without an estimate."""
@@ -864,7 +861,7 @@ class Campaign:
             raise ValueError("the campaign has no estimate yet")
         params = self.plant.Params(*self.result.params.values())
         before, parts = jnp.zeros((len(params), len(params))), []
-        if self.prior is not None:
+        if self.prior is not None:  # otherwise the plant may be a rival's
             before = self._of_prior.information
         for record in self.records:
             inputs = jnp.asarray(record.inputs[:-1])

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..description import Spread, SpreadLike, names_of, prior_sd_of, wrong_type
+from ..description import HALF_95, Spread, SpreadLike, names_of, prior_sd_of, wrong_type
 from ..estimation.identify import RecordLike, identify, plant_named_by, require_shipped
 from ..estimation.prior import Prior
 from ..estimation.prior_knowledge import PriorLike, prior_of_run, run_with_estimate, with_prior
@@ -22,7 +22,14 @@ from ..plant.catalogue import PlantLike, plant_from
 from ..report.rows import EstimateSummary
 from ..rig.contract import Interval
 from ..training.redesign import Region
-from .quantities import AbstractQuantity, half_intervals, known_of, parameters_of, slopes
+from .quantities import (
+    AbstractQuantity,
+    half_intervals,
+    known_of,
+    parameters_of,
+    propagated,
+    slopes,
+)
 
 KnownLike = RecordLike | Identification | Sequence[RecordLike | Identification]
 """Records, their files or DataFrames, results of `identify`, their run folders, or several."""
@@ -63,6 +70,24 @@ def intervals_in(
     halves = half_intervals(quantities, plant, params, region.information)
     each = zip(quantities, values, halves, strict=True)
     return {q.name: Interval(float(value), float(half)) for q, value, half in each}
+
+
+def intervals_of_prior(
+    plant: AbstractPlant, told: Region, others: Sequence[AbstractQuantity]
+) -> dict[str, Interval]:
+    """The same of a prior: infinite for a parameter, or a quantity of one, that it leaves out."""
+    params, information = plant.Params(*told.center), np.asarray(told.information)
+    own = np.flatnonzero(np.diag(information) > 0)
+    covariance = np.zeros(information.shape)
+    covariance[np.ix_(own, own)] = np.linalg.inv(information[np.ix_(own, own)])
+    size = np.asarray(relative_size(plant, params))
+    covariance *= np.outer(size, size)
+    halves = np.full(len(size), np.inf)
+    halves[own] = HALF_95 * np.sqrt(np.diag(covariance)[own])
+    halves = np.array([float(f"{half:.9g}") for half in halves])  # alike on other machines
+    each = zip(params._fields, map(float, told.center), halves.tolist(), strict=True)
+    known = {name: Interval(value, half) for name, value, half in each}
+    return known | propagated(others, plant, params, covariance, halves)
 
 
 def known_before(
@@ -162,9 +187,16 @@ def region_of(
         known: the result, its run folder, or a normal distribution.
         spread: of the parameters before; it is all that is known of one that was not estimated.
     """
+    told = told_by(plant, known)
+    before = jnp.eye(len(told.center)) / prior_sd_of(spread) ** 2
+    return Region(told.center, told.information + before)
+
+
+def told_by(plant: AbstractPlant, known: PriorLike | Sequence[PriorLike]) -> Region:
+    """What a result or a prior tells by itself: nothing of a parameter that it leaves out."""
     _, prior, center = with_prior(plant, known, plant.nominal, {}, {})
     size = np.asarray(relative_size(plant, center))
-    information = np.eye(len(size)) / prior_sd_of(spread) ** 2
+    information = np.zeros((len(size), len(size)))
     if prior is not None:
         names = names_of(plant.definition.parameters)
         index = [names.index(name) for name in prior.names]
