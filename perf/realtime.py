@@ -1,4 +1,4 @@
-"""What the real-time loop costs: a policy's step, a supervisor's check, readings that come late.
+"""What the real-time loop costs: a step of policy and guard, a check, readings that come late.
 
 Absolute times, not ratios: a loop at 500 Hz has 2 ms for everything, and nothing to be compared
 with. NumPy alone; the rig of the loop does nothing but wait.
@@ -14,12 +14,16 @@ from pathlib import Path
 
 import numpy as np
 
-from excite.policy import Policy, read_policy, shipped_policies
+from excite.policy import Policy, guard_of, read_policy, shipped_policies
 from excite.rig import AbstractRig, Outcome, Pacer, PolicyPlayer, Reading, Recorder, run_loop
+from excite.rig.guard import Guard, GuardedPlayer
+from excite.rig.player import SignalPlayer
 from excite.safety import Supervision, Watch, check_reading
 
 POLICY, NUM_READINGS, STEPS = "aero2", 50, 100
 """Readings in one dt of 0.1 s (500 Hz), and samples (10 s)."""
+
+GUARDED = "aero2", "dc_motor", "cart_pole", "aero2_detailed"
 
 
 class IdleRig(AbstractRig):
@@ -66,6 +70,21 @@ def policy_step(policy: Policy) -> str:
     return microseconds(step, 5000)
 
 
+def guard_step(policy: Policy, size: float) -> str:
+    """A step of the guard alone: a plant at rest, or outputs at a part of their scales."""
+    guard = Guard.from_dict(guard_of(policy, policy.plant))
+    at_rest = SignalPlayer(np.tile(guard.rules.rest, (200, 1)))
+    player, outputs = (
+        GuardedPlayer(at_rest, guard),
+        size * np.array([o.scale for o in policy.plant.outputs]),
+    )
+
+    def step(i: int) -> None:
+        player.applied(player(i, outputs))
+
+    return microseconds(step, 100)
+
+
 def supervisor_check(policy: Policy) -> str:
     rules, pitch = Supervision.of(policy.plant), np.array([0.1])
     watch = Watch.start(np, rules, pitch)
@@ -86,6 +105,10 @@ def loop(policy: Policy) -> Outcome:
 def main() -> None:
     policy = read_policy(shipped_policies()[POLICY])
     print(f"a step of the policy {POLICY}: {policy_step(policy)}")
+    for name in GUARDED:
+        own = read_policy(shipped_policies()[name])
+        print(f"a step of the guard of {name}, watching: {guard_step(own, 0.0)}")
+        print(f"a step of the guard of {name}, braking: {guard_step(own, 0.5)}")
     print(f"a check of a reading: {supervisor_check(policy)}")
     outcome = loop(policy)
     late = outcome.to_dict()["late_ms_percentiles"] or {}

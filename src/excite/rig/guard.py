@@ -138,12 +138,14 @@ class Guard:
         """The declared plants; a program has a fixed number of points, and some may be spare."""
         count = num_points(self.rules)
 
+        def filled(rows: np.ndarray) -> np.ndarray:  # np.resize takes five times as long
+            return rows[np.arange(count) % len(rows)]
+
         def advance(points: np.ndarray, past: np.ndarray) -> np.ndarray:
-            rows = np.resize(points, (count, *points.shape[1:]))
-            return self.advance(rows, np.resize(past, (count, *past.shape[1:])))[: len(points)]
+            return self.advance(filled(points), filled(past))[: len(points)]
 
         def output(points: np.ndarray) -> np.ndarray:
-            return self.output(np.resize(points, (count, points.shape[1])))[: len(points)]
+            return self.output(filled(points))[: len(points)]
 
         return Model(advance, output)
 

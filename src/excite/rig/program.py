@@ -12,6 +12,8 @@ import json
 import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property, partial
+from operator import itemgetter, methodcaller
 from typing import Any, Self
 
 import numpy as np
@@ -20,7 +22,49 @@ Numpy = Callable[..., Any]
 
 _LONGEST = 10_000_000  # bytes of a program: a file of a few bytes cannot fill the memory
 
-_BY_ELEMENT: Mapping[str, Numpy] = {
+
+def _integer_pow(y: int) -> Numpy:
+    if y == 2:
+        return np.square
+    return lambda x: np.power(x, y) if y > 0 else 1.0 / np.power(x, -y)
+
+
+def _broadcast_in_dim(shape: list[int], broadcast_dimensions: list[int]) -> Numpy:
+    def broadcast(x: np.ndarray) -> np.ndarray:
+        ones = [1] * len(shape)
+        for axis, size in zip(broadcast_dimensions, np.shape(x), strict=True):
+            ones[axis] = size
+        return np.broadcast_to(np.reshape(x, ones), shape)
+
+    return broadcast
+
+
+def _stack(axis: int) -> Numpy:
+    def stacked(*parts: np.ndarray) -> np.ndarray:  # np.stack takes four times as long
+        whole = np.array(parts)
+        return whole.transpose((*range(1, axis + 1), 0, *range(axis + 1, whole.ndim)))
+
+    return stacked if axis else lambda *parts: np.array(parts)
+
+
+def _dot_general(dimension_numbers: list[list[list[int]]]) -> Numpy:
+    (of_a, of_b), (batch_a, batch_b) = dimension_numbers
+
+    def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        if not (batch_a or batch_b):
+            return np.tensordot(a, b, (of_a, of_b))
+        names_a, names_b = list(range(np.ndim(a))), list(range(20, 20 + np.ndim(b)))
+        for i, j in zip([*of_a, *batch_a], [*of_b, *batch_b], strict=True):
+            names_b[j] = names_a[i]
+        batch = [names_a[i] for i in batch_a]
+        used = {*batch, *(names_a[i] for i in of_a)}
+        rest = [n for n in (*names_a, *names_b) if n not in used]
+        return np.einsum(a, names_a, b, names_b, [*batch, *rest])
+
+    return dot
+
+
+_PLAIN: Mapping[str, Numpy] = {
     "add": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.divide, "neg": np.negative,
     "max": np.maximum, "min": np.minimum, "pow": np.power, "rem": np.fmod, "abs": np.abs,
     "sign": np.sign, "floor": np.floor, "ceil": np.ceil, "sqrt": np.sqrt, "square": np.square,
@@ -31,55 +75,46 @@ _BY_ELEMENT: Mapping[str, Numpy] = {
     "le": np.less_equal, "gt": np.greater, "ge": np.greater_equal, "eq": np.equal,
     "ne": np.not_equal, "and": np.logical_and, "or": np.logical_or, "not": np.logical_not,
     "is_finite": np.isfinite, "copy": np.asarray, "stop_gradient": np.asarray,
-}  # fmt: skip
-
-
-def _broadcast(x: np.ndarray, shape: list[int], broadcast_dimensions: list[int]) -> np.ndarray:
-    ones = [1] * len(shape)
-    for axis, size in zip(broadcast_dimensions, np.shape(x), strict=True):
-        ones[axis] = size
-    return np.broadcast_to(np.reshape(x, ones), shape)
-
-
-def _dot(a: np.ndarray, b: np.ndarray, dimension_numbers: list[list[list[int]]]) -> np.ndarray:
-    (of_a, of_b), (batch_a, batch_b) = dimension_numbers
-    if batch_a or batch_b:
-        names_a, names_b = list(range(np.ndim(a))), list(range(20, 20 + np.ndim(b)))
-        for i, j in zip([*of_a, *batch_a], [*of_b, *batch_b], strict=True):
-            names_b[j] = names_a[i]
-        batch = [names_a[i] for i in batch_a]
-        used = {*batch, *(names_a[i] for i in of_a)}
-        rest = [n for n in (*names_a, *names_b) if n not in used]
-        return np.einsum(a, names_a, b, names_b, [*batch, *rest])
-    return np.tensordot(a, b, (of_a, of_b))
-
-
-OPERATIONS: Mapping[str, Numpy] = {
-    **_BY_ELEMENT,
-    "integer_pow": lambda x, y: np.power(x, y) if y > 0 else 1.0 / np.power(x, -y),
     "rsqrt": lambda x: 1.0 / np.sqrt(x),
     "logistic": lambda x: 1.0 / (1.0 + np.exp(-x)),
     "clamp": lambda low, x, high: np.clip(x, low, high),
     "select_n": lambda which, first, second: np.where(which, second, first),
-    "convert_element_type": lambda x, new_dtype: np.asarray(x).astype(new_dtype),
-    "broadcast_in_dim": _broadcast,
-    "reshape": lambda x, new_sizes: x.reshape(new_sizes),
-    "squeeze": lambda x, dimensions: x.squeeze(tuple(dimensions)),
-    "transpose": lambda x, permutation: x.transpose(permutation),
-    "concatenate": lambda *parts, dimension: np.concatenate(parts, dimension),
-    "stack": lambda *parts, axis: np.stack(parts, axis),
-    "slice": lambda x, start_indices, limit_indices, strides: x[
+}  # fmt: skip
+
+_WITH_SETTINGS: Mapping[str, Callable[..., Numpy]] = {
+    "integer_pow": _integer_pow,
+    "convert_element_type": lambda new_dtype: methodcaller("astype", _dtype(new_dtype)),
+    "broadcast_in_dim": _broadcast_in_dim,
+    "reshape": lambda new_sizes: methodcaller("reshape", new_sizes),
+    "squeeze": lambda dimensions: methodcaller("squeeze", tuple(dimensions)),
+    "transpose": lambda permutation: methodcaller("transpose", permutation),
+    "concatenate": lambda dimension: lambda *parts: np.concatenate(parts, dimension),
+    "stack": _stack,
+    "slice": lambda start_indices, limit_indices, strides: itemgetter(
         tuple(map(slice, start_indices, limit_indices, strides or [1] * len(start_indices)))
-    ],
-    "row": lambda x, i: x[i],
-    "index": lambda x, at: x[tuple(i if isinstance(i, int) else slice(*i) for i in at)],
-    "reduce_sum": lambda x, axes: np.sum(x, tuple(axes)),
-    "reduce_max": lambda x, axes: np.max(x, tuple(axes)),
-    "reduce_min": lambda x, axes: np.min(x, tuple(axes)),
-    "dot_general": _dot,
-    "iota": lambda dtype, shape, dimension: np.asarray(np.indices(shape)[dimension], dtype),
+    ),
+    "row": lambda i: itemgetter(i),
+    "index": lambda at: itemgetter(tuple(i if isinstance(i, int) else slice(*i) for i in at)),
+    "reduce_sum": lambda axes: partial(np.sum, axis=tuple(axes)),
+    "reduce_max": lambda axes: partial(np.max, axis=tuple(axes)),
+    "reduce_min": lambda axes: partial(np.min, axis=tuple(axes)),
+    "dot_general": _dot_general,
+    "iota": lambda dtype, shape, dimension: (
+        lambda: np.asarray(np.indices(shape)[dimension], _dtype(dtype))
+    ),
 }
+
+OPERATIONS = frozenset((*_PLAIN, *_WITH_SETTINGS))
 """By the names of JAX; the settings of each are named as there."""
+
+
+def function_of(name: str, settings: Mapping[str, Any]) -> Numpy:
+    """The function of arrays that an operation is.
+
+    Raises:
+        KeyError, TypeError: for an operation or for settings that do not exist.
+    """
+    return _PLAIN[name] if name in _PLAIN else _WITH_SETTINGS[name](**settings)
 
 
 @dataclass(frozen=True)
@@ -117,10 +152,21 @@ class Program:
 
     def __call__(self, *arrays: np.ndarray) -> np.ndarray:
         """The function, in double precision."""
-        values: dict[int, Any] = {**dict(enumerate(arrays)), **self.constants}
-        for o in self.operations:
-            values[o.gives] = OPERATIONS[o.name](*(values[i] for i in o.takes), **o.settings)
-        return values[self.result]
+        known, steps, result = self._steps
+        values = [*arrays, *known]
+        for function, takes in steps:
+            values.append(function(*[values[i] for i in takes]))
+        return values[result]
+
+    @cached_property
+    def _steps(self) -> tuple[list[np.ndarray], list[tuple[Numpy, list[int]]], int]:
+        """Constants, what is done with inputs and constants in turn, and the result's place."""
+        numbers = [*range(self.num_inputs), *self.constants, *(o.gives for o in self.operations)]
+        place = {number: i for i, number in enumerate(numbers)}
+        steps = [
+            (function_of(o.name, o.settings), [place[i] for i in o.takes]) for o in self.operations
+        ]
+        return list(self.constants.values()), steps, place[self.result]
 
     def to_text(self) -> str:
         """The program in few letters: its JSON, compressed."""
@@ -171,7 +217,9 @@ class Program:
                 Operation(_known(name), tuple(takes), gives, dict(settings))
                 for name, takes, gives, settings in data["operations"]
             )
-            return cls(int(data["num_inputs"]), constants, operations, int(data["result"]))
+            read = cls(int(data["num_inputs"]), constants, operations, int(data["result"]))
+            read._steps  # noqa: B018  what is damaged is found now
+            return read
         except (KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"a plant's program is damaged ({error!r})") from None
 

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jax.extend.core import Jaxpr, Literal
 
-from .program import OPERATIONS, Operation, Program
+from .program import OPERATIONS, Operation, Program, function_of
 
 _INNER = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr",
           "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "remat": "jaxpr",
@@ -108,7 +108,7 @@ class _Writer:
         if task in self.done:
             return self.done[task]
         if name in OPERATIONS and all(i in self.constants for i in takes):
-            value = OPERATIONS[name](*(self.constants[i] for i in takes), **settings)
+            value = function_of(name, settings)(*(self.constants[i] for i in takes))
             number = self.constant(np.asarray(value))
         else:
             number = self.new()
@@ -144,7 +144,7 @@ class _Writer:
             if operation.gives in needed:
                 kept.append(operation)
                 needed |= set(operation.takes)
-        if unknown := sorted({o.name for o in kept} - set(OPERATIONS)):
+        if unknown := sorted({o.name for o in kept} - OPERATIONS):
             raise ValueError(
                 f"the plant's equations use {', '.join(unknown)}, which a guard cannot run "
                 "without JAX"
