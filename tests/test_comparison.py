@@ -90,6 +90,16 @@ def test_what_cannot_be_compared_is_refused(plants, words):
         ex.compare_plants(record, plants)
 
 
+@pytest.mark.slow
+def test_the_initial_state_is_known_for_all_plants_or_for_none():
+    record = ex.simulate("aero2", "multisine", steps=200, seed=1)  # from rest: aero2 knows it
+    found = ex.compare_plants(record, ["aero2", "aero2_lag"])
+    assert {p.result.initial_state_known for p in found.plants} == {False}
+    assert [p.name for p in found.plants] == ["aero2", "aero2_lag"]
+    unknowns = {p.name: p.num_unknowns for p in found.plants}
+    assert unknowns["aero2"] == 3 + 2 + 1  # parameters, states, noise
+
+
 def test_plants_are_compared_without_priors_and_other_likelihoods():
     with pytest.raises(ValueError, match="compared by a normal likelihood, without priors"):
         ex.compare_plants("record.csv", ["aero2", "aero2_lag"], likelihood="student")

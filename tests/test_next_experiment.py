@@ -198,6 +198,25 @@ def test_what_is_not_allowed_is_one_sentence(options, words):
     assert words in str(error.value)
 
 
+def test_records_that_contradict_what_was_known_are_refused(tmp_path):
+    # A strong prior makes the residual large, so that its size hides the contradiction.
+    ex.identify(ex.simulate("aero2", "chirp", params={"J_p": 0.03}, seed=1)).save(tmp_path / "run")
+    record = ex.simulate("aero2", "chirp", seed=2)
+    with pytest.raises(ValueError, match=r"the records contradict the earlier results in .*J_p"):
+        ex.next_experiment([record, tmp_path / "run"])
+    for prior in ({"J_p": "normal:0.03:1%"}, {"J_p": "normal:0.03:0.01%"}, tmp_path / "run"):
+        with pytest.raises(ValueError, match=r"the records contradict the prior of .*J_p"):
+            ex.next_experiment(record, prior=prior)
+
+
+def test_the_usual_target_is_half_of_what_is_shown():
+    record = ex.simulate("aero2", "chirp", steps=60, seed=1)
+    made = ex.next_experiment(record, steps=10, coast=5)
+    for target in made.targets:
+        half = made.known[target.name].ci95_half
+        assert float(target.allowed(made.known[target.name].estimate)) == pytest.approx(half / 2)
+
+
 @pytest.mark.science
 def test_run_folders_are_taken_as_results(tmp_path):
     record = ex.simulate("aero2", "chirp", steps=60, seed=1)
@@ -210,7 +229,7 @@ def test_run_folders_are_taken_as_results(tmp_path):
     both = ex.next_experiment([tmp_path / "run", other], steps=30, coast=20).known
     alone = ex.next_experiment(other, steps=30, coast=20).known
     assert both["J_p"].ci95_half < 0.85 * alone["J_p"].ci95_half
-    with pytest.raises(ValueError, match=r"estimate\.json"):
+    with pytest.raises(ValueError, match="has no estimate: give a run folder"):
         ex.next_experiment(tmp_path)
 
 

@@ -614,6 +614,30 @@ def test_a_run_is_replaced_only_when_told_to(tmp_path):
     assert os.listdir(tmp_path) == ["run"]
 
 
+def test_a_run_is_never_replaced_by_one_of_another_kind(tmp_path):
+    path = tmp_path / "run"
+    with new_run_folder(path) as folder:
+        write_json(folder / "run.json", {"kind": "excite campaign"})
+    told = "holds a campaign, which is never replaced by a study; choose another name"
+    with pytest.raises(ValueError, match=told):
+        require_free_run_folder(path, True, "study")
+    with pytest.raises(ValueError, match=told), new_run_folder(path, True, "study"):
+        pass
+    require_free_run_folder(path, True, "campaign")
+
+
+def test_files_of_others_in_a_run_folder_that_is_replaced_are_kept(tmp_path):
+    path = tmp_path / "run"
+    finished_run(path)
+    for name in ("record_2.csv", "record.json", "notes.txt", "records.csv"):
+        (path / name).write_text("old")
+    with new_run_folder(path, True, own=["record", "run"]) as folder:
+        (folder / "record.json").write_text("new")
+    assert {p.name: p.read_text() for p in path.iterdir()} == {
+        "record.json": "new", "notes.txt": "old", "records.csv": "old"
+    }  # fmt: skip
+
+
 def test_a_run_that_fails_leaves_the_one_that_it_was_to_replace(tmp_path):
     finished_run(tmp_path / "run")
     with pytest.raises(RuntimeError), new_run_folder(tmp_path / "run", overwrite=True):

@@ -99,7 +99,7 @@ class Known:
         self.rounds.append((inputs, measured(self.plant, self.params, inputs, own)))
         if is_last:
             return
-        most = -(-MOST // LONG) + 1
+        most = -(-MOST // min(self.length, LONG)) + 1
         (_, inputs), (_, outputs) = (x.shape for x in self.rounds[0])
         sizes = (0, inputs), (1, outputs), (1, outputs)
         pads = [np.zeros((most, self.length + n, width)) for n, width in sizes]

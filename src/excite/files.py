@@ -206,8 +206,14 @@ def is_locked(path: Path) -> bool:
     return False
 
 
-def require_free_run_folder(path: Path, overwrite: bool) -> None:
-    """Raises ValueError where a run folder may not be written at `path`."""
+def require_free_run_folder(path: Path, overwrite: bool, kind: str = "") -> None:
+    """Raises ValueError where a run folder may not be written at `path`.
+
+    Args:
+        path: of the folder.
+        overwrite: whether a run folder there is replaced.
+        kind: of that run, as its marker says; default any.
+    """
     for parent in path.absolute().parents:
         if parent.exists():
             if not parent.is_dir():
@@ -217,14 +223,30 @@ def require_free_run_folder(path: Path, overwrite: bool) -> None:
         return
     if not (path / "run.json").is_file():
         raise ValueError(f"{path} exists and is no run folder; choose another name")
+    found = str(read_json(path / "run.json").get("kind", "")).removeprefix("excite ")
+    if kind and found != kind:
+        raise ValueError(
+            f"{path} holds a {found or 'run'}, which is never replaced by a {kind}; choose another "
+            "name"
+        )
     if not overwrite:
         raise ValueError(f"{path} holds a run; choose another name or add --overwrite")
 
 
 @contextlib.contextmanager
-def new_run_folder(path: Path, overwrite: bool = False) -> Iterator[Path]:
-    """A folder to fill; it appears at `path` when everything in it is written."""
-    require_free_run_folder(path, overwrite)
+def new_run_folder(
+    path: Path, overwrite: bool = False, kind: str = "", own: Collection[str] | None = None
+) -> Iterator[Path]:
+    """A folder to fill; it appears at `path` when everything in it is written.
+
+    Args:
+        path: of the folder.
+        overwrite: whether a run folder there is replaced.
+        kind: see `require_free_run_folder`.
+        own: names of the files of such a run, without number and ending: others are kept; default
+            all are replaced.
+    """
+    require_free_run_folder(path, overwrite, kind)
     path = path.absolute()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -235,6 +257,9 @@ def new_run_folder(path: Path, overwrite: bool = False) -> Iterator[Path]:
         yield unfinished
         unfinished.chmod(0o755)
         if path.exists():
+            for other in path.iterdir():
+                if own is not None and re.sub(r"(_\d+)?\.\w+$", "", other.name) not in own:
+                    other.rename(unfinished / other.name)
             shutil.rmtree(path)
         unfinished.rename(path)
     finally:

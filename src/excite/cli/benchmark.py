@@ -31,7 +31,7 @@ def benchmark(
     from ..files import require_free_run_folder
 
     if out is not None:
-        require_free_run_folder(out, overwrite)
+        require_free_run_folder(out, overwrite, "study")
     chosen = study_in(study).changed(episodes=episodes, seed=seed, estimators=estimators)
     if chosen.agents or chosen.clairvoyant:
         what = "agents to train" if chosen.agents else "signals to design"

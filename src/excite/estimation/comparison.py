@@ -89,14 +89,16 @@ def compare_plants(
 
     Args:
         records: as for `identify`.
-        plants: names, `path/to/file.py:ClassName`, plants or classes, with the same outputs.
+        plants: names, `path/to/file.py:ClassName`, plants or classes, with the same outputs. Where
+            the initial state of one is not known, those of all are estimated.
         options: of `identify`, for all plants alike.
 
     Raises:
         ValueError: for fewer than two plants or different outputs, and as `identify` does.
     """
     if isinstance(plants, str) or not isinstance(plants, Sequence) or len(plants) < 2:
-        raise ValueError(f"a comparison needs at least two plants: got {plants!r}")
+        got = len(plants) if isinstance(plants, list | tuple) else repr(plants)
+        raise ValueError(f"a comparison needs at least two plants: got {got}")
     if options.keys() & {"prior", "likelihood"}:
         raise ValueError("plants are compared by a normal likelihood, without priors")
     chosen = [plant_from(plant) for plant in plants]
@@ -108,6 +110,13 @@ def compare_plants(
                 f"{', '.join(own)}; {chosen[0].definition.name!r} has {', '.join(outputs[0])}"
             )
     results = [identify(records, plant, **options) for plant in chosen]
+    if len({result.initial_state_known for result in results}) > 1:  # compared alike
+        results = [
+            identify(records, plant, **{**options, "initial_state": "free"})
+            if result.initial_state_known
+            else result
+            for plant, result in zip(chosen, results, strict=True)
+        ]
     first = _compared(results[0], None)
     compared = [first, *(_compared(result, first) for result in results[1:])]
     return Comparison(tuple(sorted(compared, key=lambda p: (not p.result.is_usable, p.bic))))

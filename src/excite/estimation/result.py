@@ -28,6 +28,9 @@ if TYPE_CHECKING:
     from xarray import DataTree
 
 
+IDENTIFICATION = "identification"  # kind of its run folders
+
+
 @dataclass(frozen=True)
 class Predicted:
     """One-step prediction of a record by an estimator that takes the plant as disturbed.
@@ -305,11 +308,12 @@ class Identification:
 
         Args:
             path: of the folder.
-            overwrite: whether a run folder at `path` is replaced.
+            overwrite: whether a run folder at `path` is replaced; your own files in it are kept.
             command: that made it.
 
         Raises:
-            ValueError: where `path` is not a run folder, or is one and `overwrite` is False.
+            ValueError: where `path` is not a run folder, is one and `overwrite` is False, or is
+                that of a campaign or a study.
         """
         information = {
             "coordinates": "logarithm of positive parameters, free ones over their scale",
@@ -317,14 +321,14 @@ class Identification:
             "information": self.information,
             "covariance": self.covariance,
         }
-        about = {"kind": "excite identification", "excite": __version__, "command": command}
+        about = {"kind": f"excite {IDENTIFICATION}", "excite": __version__, "command": command}
         contents = {
             "estimate": self.to_dict(),
             "information": information,
             "run": {**about, "plant": self.plant.to_dict()},
         }
         records = [(f.record, f.computed) for f in self.fitted]
-        write_run(Path(path), self.plant, records, contents, overwrite)
+        write_run(Path(path), self.plant, records, contents, overwrite, IDENTIFICATION)
 
     def to_dict(self) -> dict[str, object]:
         """The result as JSON-ready data; docs/reference/machine-readable.md lists its keys."""

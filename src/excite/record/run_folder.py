@@ -18,6 +18,7 @@ def write_run(
     records: Sequence[tuple[Record, Mapping[str, np.ndarray]]],
     contents: Mapping[str, object],
     overwrite: bool = False,
+    kind: str = "",
 ) -> None:
     """Writes a run folder, completely or not at all.
 
@@ -26,13 +27,18 @@ def write_run(
         plant: names the columns.
         records: each with values by output [sample, output], which get a file by their name.
         contents: JSON-ready, by the name of their file; `run` marks the folder.
-        overwrite: whether a run folder at `path` is replaced.
+        overwrite: whether a run folder at `path` is replaced; files that no run has are kept.
+        kind: of that run.
 
     Raises:
-        ValueError: where `path` is not a run folder, or is one and `overwrite` is False.
+        ValueError: where `path` is not a run folder, is one and `overwrite` is False, or is one of
+            another kind.
     """
-    outputs = names_of(plant.outputs)
-    with new_run_folder(path, overwrite) as folder:
+    outputs, own = (
+        names_of(plant.outputs),
+        {"record", "simulated", "residual", "predicted", "predicted_sd", *contents},
+    )
+    with new_run_folder(path, overwrite, kind, own) as folder:
         for i, (record, computed) in enumerate(records, 1):
             ending = "" if len(records) == 1 else f"_{i}"
             write_record(folder / f"record{ending}.csv", record, plant)

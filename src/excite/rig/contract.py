@@ -45,6 +45,11 @@ class Interval(NamedTuple):
     ci95_half: float
 
 
+def as_data(known: Mapping[str, Interval]) -> dict[str, dict[str, float]]:
+    """Intervals by name, as JSON-ready data."""
+    return {name: interval._asdict() for name, interval in known.items()}
+
+
 @dataclass(frozen=True)
 class Sample:
     """One sampling instant, for display while the experiment runs.

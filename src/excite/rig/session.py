@@ -34,7 +34,7 @@ from ..record.read import SIGNAL_ENDINGS
 from ..report.tables import html_table, text_table
 from ..safety import Supervision, Watch, allowed
 from .catalogue import HAS_JAX, RigOptions, rig_named
-from .contract import AbstractRig, Interval, Sample
+from .contract import AbstractRig, Interval, Sample, as_data
 from .guard import Guard, GuardedPlayer, beside
 from .loop import ENDS_OF_PROGRAM, Outcome, Stop, interruptible, run_loop
 from .player import AbstractPlayer, PolicyPlayer, SignalPlayer, step_seconds
@@ -91,7 +91,7 @@ class RunResult:
 
     def to_dict(self) -> dict[str, object]:
         """The result as JSON-ready data, as `excite run --json` prints it."""
-        live = {name: interval._asdict() for name, interval in self.live_estimate.items()}
+        live = as_data(self.live_estimate)
         return {"file": str(self.path), "live_estimate": live, **self.outcome.to_dict()}
 
     @property

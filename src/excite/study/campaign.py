@@ -50,7 +50,7 @@ from ..policy import Policy, mismatch, read_policy
 from ..policy.file import shipped_policies
 from ..record import Record
 from ..report.tables import html_table, text_table
-from ..rig.contract import Interval
+from ..rig.contract import Interval, as_data
 from ..rig.loop import COMPLETE
 from ..safety import critical_levels
 from ..training.design import design
@@ -58,6 +58,7 @@ from ..training.redesign import Region
 from .discrimination import Discrimination, RivalLike, judged, rivals_from, with_experiment
 from .falsify import trained_in
 from .knowledge import (
+    contradicted,
     excluded,
     intervals_in,
     intervals_of_prior,
@@ -101,7 +102,6 @@ _SHORT = 20  # samples of a round that tells rivals apart
 _PADDED = 8  # rounds for which identification and the fits of rivals are compiled, or 16, 24, ...
 _PLANTS = 32  # drawn to predict what a campaign reaches
 _FEWER = 8  # where a signal is redesigned for each of them
-_CONTRADICTED = 1e-4  # chance of records by which they contradict a prior, over its parameters
 _HARDLY = 0.98  # what all rounds that are left must make of an interval, or none is played
 
 
@@ -130,7 +130,7 @@ class Round:
 
     def to_dict(self) -> dict[str, Any]:
         """The round as JSON-ready data."""
-        return {**dataclasses.asdict(self), "known": _as_data(self.known)}
+        return {**dataclasses.asdict(self), "known": as_data(self.known)}
 
 
 @dataclass(frozen=True)
@@ -268,7 +268,8 @@ class Campaign:
             require_whole("samples", samples, 1)
             if samples < self.steps:
                 raise ValueError(
-                    f"a budget of {samples} samples is shorter than a round of {self.steps}"
+                    f"a budget of {samples} samples is shorter than a round of {self.steps}: give "
+                    f"at least {self.steps} (--samples)"
                 )
         usual, _, usual_coast = trained_in(self.policy, self.plant)
         self.spread = Spread.of(usual if spread is None else spread)
@@ -295,7 +296,7 @@ class Campaign:
         self.reason, self.interrupted, self.prediction = "", "", ""
         self.haste, self.playing = 1.0, ""
         if self.prior is not None:
-            if told := excluded(self.plant, self._before, self.spread):
+            if told := excluded(self.plant, self._before, self.spread, "the prior"):
                 raise ValueError(f"{told}, or another prior")
             if max(shares_of(self.targets, self.known).values()) <= 1:
                 raise ValueError("every target is reached by the prior: ask for more")
@@ -413,8 +414,14 @@ class Campaign:
     @property
     def _whole_rounds(self) -> int:
         """Rounds of full length in the budget."""
-        most = self.most_rounds
-        return most if self.most_samples is None else min(most, self.most_samples // self.steps)
+        return self._rounds_after(0, 0)
+
+    def _rounds_after(self, rounds: int, samples: int) -> int:
+        """Rounds of full length that are left in the budget after so many."""
+        left = self.most_rounds - rounds
+        if self.most_samples is None:
+            return left
+        return min(left, (self.most_samples - samples) // self.steps)
 
     @property
     def is_undecided(self) -> bool:
@@ -457,9 +464,7 @@ class Campaign:
         """
         if self.result is None or unexplained(self.result):
             return ""
-        left = self.most_rounds - sum(r.ended in WHOLE for r in self.rounds)
-        if self.most_samples is not None:
-            left = min(left, (self.most_samples - self.num_samples) // self.steps)
+        left = self._rounds_after(sum(r.ended in WHOLE for r in self.rounds), self.num_samples)
         coming, now = None if self.next is None else self.next.chosen, self._region
         if coming is None:
             coming = candidate(
@@ -540,6 +545,10 @@ class Campaign:
             self.reason = f"unsafe: {ended if unsafe else 'a critical level was reached'}"
         elif told := self._contradicted():
             self.reason = f"the records contradict the prior of {', '.join(told)}"
+            with contextlib.suppress(ValueError):  # what is known then, the records tell alone
+                alone = self._identified(None)
+                self.result = alone if alone.is_usable else self.result
+            known = self.known
         elif shares and max(shares.values()) <= 1:
             self.reason = REACHED
         elif self.discrimination is not None and not self.discrimination.is_explained:
@@ -550,7 +559,12 @@ class Campaign:
             self.reason = f"the budget of {self.most_samples} samples is used up"
         if self.reason and self.result is not None and unexplained(self.result):
             self._look_for_causes(self.result)
-        missing = farthest(shares) if shares else f"there is no estimate yet ({status})"
+        missing = f"there is no estimate yet ({status})"
+        if shares:
+            is_more = (
+                max(shares.values()) <= 1
+            )  # played for other targets, or before this one ended
+            missing = "every target is reached already" if is_more else farthest(shares)
         decision = f"end: {self.reason}" if self.reason else f"go on: {missing}"
         if structure and not self.is_undecided:
             decision = f"{structure}; {decision}"
@@ -612,25 +626,10 @@ class Campaign:
                 )
 
     def _contradicted(self) -> list[str]:
-        """Parameters in which the records contradict the prior.
-
-        Where the residual is not white noise, they are asked without it. If the plant does not
-        explain them then either, they say nothing of the prior.
-        """
+        """Parameters in which the records contradict the prior."""
         if self.prior is None or self.result is None:
             return []
-        found = self.result
-        is_coloured = any(p < RARE for p in found.whiteness.values())
-        is_alone = is_coloured or bool(unexplained(found))
-        if is_alone:
-            try:
-                found = self._identified(None)
-            except ValueError:  # without the prior the records tell nothing
-                return []
-        if not found.is_usable or unexplained(found):
-            return []
-        chances = self.prior.chances(found.params, found.std_error, not is_alone)
-        return [name for name, chance in chances.items() if chance < _CONTRADICTED / len(chances)]
+        return contradicted(self.prior, self.result, lambda: self._identified(None))
 
     def _is_explained(self) -> bool:
         """Whether the residual is noise, of the declared size where there are rivals.
@@ -781,7 +780,7 @@ class Campaign:
             **({} if self.most_samples is None else {"most_samples": self.most_samples}),
             "coast": self.coast,
             "redesign": self.redesign,
-            "prior": _as_data(self._known_before(())),
+            "prior": as_data(self._known_before(())),
             "rivals": {} if self.discrimination is None else self.discrimination.plants,
             "structure": self.discrimination and self.discrimination.to_dict(),
             "warnings": list(self.warnings),
@@ -789,7 +788,7 @@ class Campaign:
             "reason": self.reason,
             "playing": self.playing,
             "interrupted": self.interrupted,
-            "estimate": _as_data(self.known),
+            "estimate": as_data(self.known),
             "num_samples": self.num_samples,
             "rounds": [r.to_dict() for r in self.rounds],
         }
@@ -913,11 +912,6 @@ def _halves(
         return values, half_intervals(quantities, plant, params, running)
 
     return jax.vmap(one)(params, first, later)
-
-
-def _as_data(known: Mapping[str, Interval]) -> dict[str, dict[str, float]]:
-    """What is known, as JSON-ready data."""
-    return {name: interval._asdict() for name, interval in known.items()}
 
 
 def _policy(given: str | Path | Policy | None, plant: PlantDescription) -> Policy | None:

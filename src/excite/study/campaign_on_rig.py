@@ -152,7 +152,7 @@ def campaign(
     for sentence in made.warnings:
         on_warning(sentence)
     with locked_folder(root, "this campaign", ["run.json", "campaign.json"]):
-        folder.resume(made, on_round)
+        folder.resume(made, on_round, on_warning)
         while not made.reason and not made.interrupted:
             count = len(made.rounds)
             if count and pause:
@@ -268,9 +268,15 @@ class _Folder:
             # One that is missing was not there when the folder was begun.
             other = [n for n, value in settings.items() if before.get(n, type(value)()) != value]
             if other:
+                name = {"plant_hash": "plant", "policy_hash": "policy"}.get(other[0], other[0])
+                shown = [before.get(name), settings.get(name)]
+                if name == "plant":
+                    shown = [read_json(file)["plant"], own["plant"]]
+                are = name == "policy" or shown[0] == shown[1]
+                told = "" if are else f" {shown[0]!r} and not {shown[1]!r}"
                 raise ValueError(
-                    f"{root} is another campaign, with {other[0]} {before.get(other[0])!r} and not "
-                    f"{settings[other[0]]!r}: choose another folder"
+                    f"{root} is another campaign, with {'another ' * are}{name}{told}: choose "
+                    "another folder"
                 )
         elif root.exists() and not (root.is_dir() and _names_in(root) <= _OWN):
             raise ValueError(f"{root} exists and is no campaign: choose another folder")
@@ -302,13 +308,24 @@ class _Folder:
         if made.result is not None and len(made.result.fitted) == len(made.rounds):
             made.result.save(self.path(len(made.rounds) - 1).with_suffix(""), overwrite=True)
 
-    def resume(self, made: Campaign, on_round: Callable[[Round], None]) -> None:
+    def resume(
+        self,
+        made: Campaign,
+        on_round: Callable[[Round], None],
+        on_warning: Callable[[str], None],
+    ) -> None:
         """Takes the rounds that were played before; one that was hardly begun is played again."""
         names: list[str] = []
         is_same = True
         if self.has_rounds:
             before = read_json(self.root / "campaign.json", "expected", "rounds", "targets")
             is_same = before["targets"] == made.to_dict()["targets"]
+            if not is_same:
+                asked = ", ".join(f"{name} to {to}" for name, to in before["targets"].items())
+                on_warning(
+                    f"the rounds so far were played for other targets ({asked}); what is told of "
+                    "them is by the new ones"
+                )
             made.prediction = str(before["expected"]) if is_same else ""
             names = [*(str(r["played"]) for r in before["rounds"]), str(before.get("playing", ""))]
         while _has_samples(path := self.path(len(made.rounds))):

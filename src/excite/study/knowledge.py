@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..description import HALF_95, Spread, SpreadLike, names_of, prior_sd_of, wrong_type
+from ..description import HALF_95, RARE, Spread, SpreadLike, names_of, prior_sd_of, wrong_type
 from ..estimation.identify import RecordLike, identify, plant_named_by, require_shipped
 from ..estimation.prior import Prior
 from ..estimation.prior_knowledge import PriorLike, prior_of_run, run_with_estimate, with_prior
@@ -36,6 +36,7 @@ KnownLike = RecordLike | Identification | Sequence[RecordLike | Identification]
 
 
 _LARGE = 2.0  # root mean square of a residual over the declared noise
+_CONTRADICTED = 1e-4  # chance of records by which they contradict a prior, over its parameters
 
 
 @dataclass(frozen=True)
@@ -144,10 +145,17 @@ def known_from(
         result = identify(records, own, prior=prior if before is None else before)
         if not result.is_usable:
             raise ValueError(f"the records give no estimate ({result.status})")
-        if before is not None and (told := before.contradicted(result.params, result.std_error)):
+        joint = before if prior is None else with_prior(own, prior, own.nominal, {}, {})[1]
+        told = [] if joint is None else contradicted(joint, result, lambda: identify(records, own))
+        if told and before is not None:
             raise ValueError(
                 f"the records contradict the earlier results in {', '.join(told)}: identify all "
                 "records together, and see whether the plant explains them"
+            )
+        if told:
+            raise ValueError(
+                f"the records contradict the prior of {', '.join(told)}: leave it out, or give a "
+                "wider one"
             )
     elif len(results) == 1 and isinstance(results[0], Identification):
         result = results[0]
@@ -157,6 +165,32 @@ def known_from(
     if told := excluded(own, region, reach):
         raise ValueError(told)
     return Knowledge(own, region, result, unexplained(result))
+
+
+def contradicted(
+    prior: Prior, result: Identification, alone: Callable[[], Identification]
+) -> list[str]:
+    """Parameters in which records contradict a prior with which they were identified.
+
+    Where the residual is not white noise, they are asked without it. If the plant does not
+    explain them then either, they say nothing of the prior.
+
+    Args:
+        prior: that is asked about.
+        result: from the records and the prior.
+        alone: identifies the records without it.
+    """
+    is_coloured = any(p < RARE for p in result.whiteness.values())
+    is_alone = is_coloured or bool(unexplained(result))
+    if is_alone:
+        try:
+            result = alone()
+        except ValueError:  # without the prior the records tell nothing
+            return []
+    if not result.is_usable or unexplained(result):
+        return []
+    chances = prior.chances(result.params, result.std_error, not is_alone)
+    return [name for name, chance in chances.items() if chance < _CONTRADICTED / len(chances)]
 
 
 def unexplained(result: Identification | None) -> tuple[str, ...]:
@@ -221,6 +255,8 @@ def _plant_name(part: Identification | str | Path) -> str:
     if isinstance(part, Identification):
         return part.plant.name
     path = run_with_estimate(Path(part)) / "estimate.json"
+    if not path.is_file():
+        raise ValueError(f"{part} has no estimate: give a run folder of `excite identify`")
     return EstimateSummary.read(path, "identify the records again").plant
 
 
@@ -230,8 +266,10 @@ def _is_result(part: object) -> bool:
     return is_folder or isinstance(part, Identification)
 
 
-def excluded(plant: AbstractPlant, region: Region, spread: Spread) -> str:
-    """A sentence where the spread excludes an estimate; else nothing."""
+def excluded(
+    plant: AbstractPlant, region: Region, spread: Spread, what: str = "the estimate"
+) -> str:
+    """A sentence where the spread excludes an estimate, or the mean of a prior; else nothing."""
     sd = 1 / np.sqrt(np.diag(np.asarray(region.information)))
     for i, parameter in enumerate(plant.definition.parameters):
         value, nominal = float(region.center[i]), float(plant.nominal[i])
@@ -239,7 +277,7 @@ def excluded(plant: AbstractPlant, region: Region, spread: Spread) -> str:
         slack = 4 * sd[i] * (value if parameter.positive else parameter.scale)
         if not lower - slack <= value <= upper + slack:
             return (
-                f"the spread {spread} excludes the estimate of {parameter.name}, {value:.4g} "
+                f"the spread {spread} excludes {what} of {parameter.name}, {value:.4g} "
                 f"{parameter.unit}: it allows {lower:.4g} to {upper:.4g}; give a wider spread"
             )
     return ""

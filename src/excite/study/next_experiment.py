@@ -34,7 +34,7 @@ from ..policy import Policy, mismatch, read_policy
 from ..progress import SHOWN, Progress
 from ..record import Record, require_record_path, write_record
 from ..report.tables import html_table, text_table
-from ..rig.contract import Interval
+from ..rig.contract import Interval, as_data
 from ..simulation import response, run_episode
 from ..training.design import designed_record
 from ..training.redesign import JUDGES, Region, first_signals, redesigned
@@ -102,7 +102,7 @@ class Candidate:
         return {
             "name": self.name,
             "num_steps": len(self.inputs),
-            "after": {name: interval._asdict() for name, interval in self.after.items()},
+            "after": as_data(self.after),
             "samples_until_every_target": self.samples if np.isfinite(self.samples) else None,
             "nearness": self.nearness if np.isfinite(self.nearness) else None,
         }
@@ -307,7 +307,7 @@ class NextExperiment:
         """What is known, predicted and decided, as JSON-ready data."""
         return {
             "plant": self.plant.description.name,
-            "known": {name: interval._asdict() for name, interval in self.known.items()},
+            "known": as_data(self.known),
             "targets": {t.name: str(t) for t in self.targets},
             "candidates": [c.to_dict() for c in self.candidates],
             "chosen": None if self.chosen is None else self.chosen.name,
@@ -432,8 +432,11 @@ def next_experiment(
     if found is not None:
         mismatch(found, own.description)
         played = ("policy" if isinstance(policy, Policy) else f"policy {policy}", found)
-    now = intervals_in(own, region, ())
-    usual = {name: interval.ci95_half / 2 for name, interval in now.items()}
+    now, within = given.of(()), intervals_in(own, region, ())
+    usual = {  # of a parameter that the records do not tell, half of what the spread tells
+        name: (own if np.isfinite(own) else within[name].ci95_half) / 2
+        for name, (_, own) in now.items()
+    }
     targets = targets_from(own, usual if target is None else target)
     for quantity in others_of(own, targets):
         require_defined(quantity, own, own.Params(*region.center))

@@ -40,7 +40,7 @@ from ..plant.catalogue import PlantLike, plant_from
 from ..progress import SHOWN, Progress
 from ..report.numbers import number
 from ..report.tables import html_table, text_table
-from ..rig.contract import Interval
+from ..rig.contract import Interval, as_data
 from ..simulation import Experiment, run_episode
 from ..training.redesign import JUDGES, POINTS, Region
 from .knowledge import KnownLike, intervals_in, known_before, known_from
@@ -177,27 +177,23 @@ class Selection:
 
     def to_dict(self) -> dict[str, Any]:
         """What is known, predicted and chosen, as JSON-ready data."""
-
-        def plain(known: Mapping[str, Interval]) -> dict[str, dict[str, float]]:
-            return {name: interval._asdict() for name, interval in known.items()}
-
         return {
             "plant": self.plant.description.name,
             "targets": {t.name: str(t) for t in self.targets},
-            "known": plain(self.known),
+            "known": as_data(self.known),
             "experiments": [
                 {
                     "name": o.name,
                     "num_steps": o.num_steps,
                     "cost": o.cost,
                     "nearness": o.nearness if np.isfinite(o.nearness) else None,
-                    "after": plain(o.after),
+                    "after": as_data(o.after),
                     "count": o.count,
                 }
                 for o in self.options
             ],
             "order": list(self.order),
-            "after": plain(self.after),
+            "after": as_data(self.after),
             "cost": self.cost,
             "decision": self.decision,
             "warnings": list(self.warnings),
