@@ -161,6 +161,7 @@ def campaign(
         click.echo(made)
         if made.interrupted:
             click.echo(f"{made.interrupted}: rerun the same command to resume", err=True)
+        click.echo(f"campaign: {options['out']}")
     if plot is not None and made.result is not None:
         from ..record.figure import save
 

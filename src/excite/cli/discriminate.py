@@ -97,4 +97,6 @@ def discriminate(
         show_json(found.to_dict())
     else:
         click.echo(found)
+        if options["out"] is not None and found.inputs is not None:
+            click.echo(f"signal: {options['out']}")
     click.get_current_context().exit(1 if found.chosen is None and found.inputs is None else 0)

@@ -118,4 +118,6 @@ def next_experiment(
         show_json(found.to_dict())
     else:
         click.echo(found)
+        if options["out"] is not None:
+            click.echo(f"signal: {options['out']}")
     click.get_current_context().exit(1 if found.chosen is None else 0)
