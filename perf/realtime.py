@@ -74,10 +74,8 @@ def guard_step(policy: Policy, size: float) -> str:
     """A step of the guard alone: a plant at rest, or outputs at a part of their scales."""
     guard = Guard.from_dict(guard_of(policy, policy.plant))
     at_rest = SignalPlayer(np.tile(guard.rules.rest, (200, 1)))
-    player, outputs = (
-        GuardedPlayer(at_rest, guard),
-        size * np.array([o.scale for o in policy.plant.outputs]),
-    )
+    player = GuardedPlayer(at_rest, guard)
+    outputs = size * np.array([o.scale for o in policy.plant.outputs])
 
     def step(i: int) -> None:
         player.applied(player(i, outputs))

@@ -524,6 +524,8 @@ def test_records_that_contradict_the_prior_end_the_campaign(sd):
     assert campaign.reason == "the records contradict the prior of J_p"
     estimate, half = told.known["J_p"]  # of the records alone
     assert abs(estimate - TRUE["J_p"]) < 2 * half < 0.1 * TRUE["J_p"]
+    known = campaign.knowledge()[1]
+    assert known[0, 0] > 1  # after one sample of the records alone
 
 
 @pytest.mark.science  # compiles the redesign

@@ -96,6 +96,7 @@ def test_the_initial_state_is_known_for_all_plants_or_for_none():
     found = ex.compare_plants(record, ["aero2", "aero2_lag"])
     assert {p.result.initial_state_known for p in found.plants} == {False}
     assert [p.name for p in found.plants] == ["aero2", "aero2_lag"]
+    assert str(found).startswith("plants, likeliest first; initial state free\n")
     unknowns = {p.name: p.num_unknowns for p in found.plants}
     assert unknowns["aero2"] == 3 + 2 + 1  # parameters, states, noise
 

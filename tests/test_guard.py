@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import json
+import pickle
 from collections.abc import Mapping
 
 import jax
@@ -90,6 +91,32 @@ def test_a_program_from_a_file_can_only_do_arithmetic():
             Program.from_text(text)
     with pytest.raises(ValueError, match="unknown type 'object'"):
         Program.from_dict(json.loads(json.dumps(whole).replace('"float64"', '"object"')))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("num_inputs", 10**9),
+        ("operations", [["add", [0, 0, 0], 1, {}]]),  # the third would be written to
+        ("operations", [["add", [0, 7], 1, {}]]),
+        ("operations", [["transpose", [0], 1, {"order": [0]}]]),
+        ("operations", [["convert_element_type", [0], 1, {"new_dtype": "object"}]]),
+    ],
+)
+def test_a_damaged_program_is_refused(name, value):
+    whole = program_of(lambda x: jnp.sin(x) + 1.0, np.ones(2)).to_dict()
+    with pytest.raises(ValueError, match="a plant's program"):
+        Program.from_dict({**whole, name: value, "result": 0})
+
+
+def test_a_program_may_have_other_numbers_and_can_be_pickled():
+    def function(x):
+        return (x > 0).astype(jnp.int8).astype(float) + jnp.arange(3, dtype=jnp.uint32)
+
+    x = np.array([-1.0, 0.5, 2.0])
+    program = program_of(function, x)
+    np.testing.assert_array_equal(program(x), function(x))
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(program))(x), function(x))
 
 
 @pytest.mark.slow

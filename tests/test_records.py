@@ -618,7 +618,7 @@ def test_a_run_is_never_replaced_by_one_of_another_kind(tmp_path):
     path = tmp_path / "run"
     with new_run_folder(path) as folder:
         write_json(folder / "run.json", {"kind": "excite campaign"})
-    told = "holds a campaign, which is never replaced by a study; choose another name"
+    told = r"holds another kind of run \(campaign\); choose another name"
     with pytest.raises(ValueError, match=told):
         require_free_run_folder(path, True, "study")
     with pytest.raises(ValueError, match=told), new_run_folder(path, True, "study"):
@@ -629,13 +629,37 @@ def test_a_run_is_never_replaced_by_one_of_another_kind(tmp_path):
 def test_files_of_others_in_a_run_folder_that_is_replaced_are_kept(tmp_path):
     path = tmp_path / "run"
     finished_run(path)
-    for name in ("record_2.csv", "record.json", "notes.txt", "records.csv"):
+    own = r"record(_\d+)?\.(csv|json)|run\.json"
+    for name in ("record_2.csv", "record.json", "notes.txt", "records.csv", "run.sh"):
         (path / name).write_text("old")
-    with new_run_folder(path, True, own=["record", "run"]) as folder:
+    (path / "record").mkdir()
+    (path / "record" / "mine.csv").write_text("old")
+    (tmp_path / "link").symlink_to(path)
+    with new_run_folder(tmp_path / "link", True, own=own) as folder:
         (folder / "record.json").write_text("new")
-    assert {p.name: p.read_text() for p in path.iterdir()} == {
-        "record.json": "new", "notes.txt": "old", "records.csv": "old"
+    assert {p.name: p.read_text() for p in path.rglob("*") if p.is_file()} == {
+        "record.json": "new", "notes.txt": "old", "records.csv": "old", "run.sh": "old",
+        "mine.csv": "old",
     }  # fmt: skip
+    assert {p.name for p in tmp_path.iterdir()} == {"run", "link"}
+
+
+def test_where_a_run_cannot_be_replaced_nothing_is_lost(tmp_path, monkeypatch):
+    path = tmp_path / "run"
+    finished_run(path)
+    (path / "notes.txt").write_text("old")
+    rename = Path.rename
+
+    def fails(self: Path, target: Path) -> Path:
+        if target == path and self.parent == tmp_path:
+            raise OSError(13, "Permission denied")
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", fails)
+    refused = pytest.raises(ValueError, match=r"cannot be replaced \(Permission denied\)$")
+    with refused, new_run_folder(path, True, own="run.json") as folder:
+        (folder / "run.json").write_text("{}")
+    assert {p.name for p in path.iterdir()} == {"run.json", "notes.txt"}
 
 
 def test_a_run_that_fails_leaves_the_one_that_it_was_to_replace(tmp_path):

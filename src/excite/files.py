@@ -223,19 +223,19 @@ def require_free_run_folder(path: Path, overwrite: bool, kind: str = "") -> None
         return
     if not (path / "run.json").is_file():
         raise ValueError(f"{path} exists and is no run folder; choose another name")
-    found = str(read_json(path / "run.json").get("kind", "")).removeprefix("excite ")
-    if kind and found != kind:
-        raise ValueError(
-            f"{path} holds a {found or 'run'}, which is never replaced by a {kind}; choose another "
-            "name"
-        )
+    if kind:
+        marker = read_json(path / "run.json", advice="choose another name, or delete the folder")
+        found = str(marker.get("kind", "")).removeprefix("excite ")
+        if found != kind:
+            told = f"another kind of run ({found})" if found else "a run of an unknown kind"
+            raise ValueError(f"{path} holds {told}; choose another name")
     if not overwrite:
         raise ValueError(f"{path} holds a run; choose another name or add --overwrite")
 
 
 @contextlib.contextmanager
 def new_run_folder(
-    path: Path, overwrite: bool = False, kind: str = "", own: Collection[str] | None = None
+    path: Path, overwrite: bool = False, kind: str = "", own: str = ""
 ) -> Iterator[Path]:
     """A folder to fill; it appears at `path` when everything in it is written.
 
@@ -243,11 +243,11 @@ def new_run_folder(
         path: of the folder.
         overwrite: whether a run folder there is replaced.
         kind: see `require_free_run_folder`.
-        own: names of the files of such a run, without number and ending: others are kept; default
-            all are replaced.
+        own: regular expression of the names of files of such a run: others, and all folders, are
+            kept; default nothing is.
     """
     require_free_run_folder(path, overwrite, kind)
-    path = path.absolute()
+    path = path.resolve()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         unfinished = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
@@ -257,13 +257,29 @@ def new_run_folder(
         yield unfinished
         unfinished.chmod(0o755)
         if path.exists():
-            for other in path.iterdir():
-                if own is not None and re.sub(r"(_\d+)?\.\w+$", "", other.name) not in own:
-                    other.rename(unfinished / other.name)
-            shutil.rmtree(path)
-        unfinished.rename(path)
+            _replace(path, unfinished, own)
+        else:
+            unfinished.rename(path)
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
+
+
+def _replace(path: Path, by: Path, own: str) -> None:
+    """Puts a folder in the place of another one; nothing is lost where that fails."""
+    aside = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
+    before = aside / path.name
+    try:
+        path.rename(before)
+        by.rename(path)
+        for other in before.iterdir():
+            if own and (other.is_dir() or not re.fullmatch(own, other.name)):
+                other.rename(path / other.name)
+    except OSError as error:
+        if before.exists() and not path.exists():
+            before.rename(path)
+        where = f"; what it held is in {before}" if before.exists() else ""
+        raise ValueError(f"{path}: cannot be replaced ({error.strerror}){where}") from None
+    shutil.rmtree(aside, ignore_errors=True)
 
 
 _LOCKED_BYTE = 2**30  # beyond the end of a file: on Windows, nobody can read a locked byte

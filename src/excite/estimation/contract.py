@@ -140,7 +140,7 @@ def stack_experiments(
         "dt": None if dt is None else stacked(dt, longest),
         "next_inputs": None if next_inputs is None else stacked(next_inputs, longest),
     }
-    arrays = jax.tree.map(jnp.asarray, arrays)  # twice as fast as jax.device_put
+    arrays = jax.device_put(arrays) if xp is np else arrays
     return Experiments(**arrays, initial_state_known=initial_state_known)
 
 

@@ -18,7 +18,7 @@ from .result import Identification
 
 _FORMS = "normal:MEAN:SD, lognormal:MEDIAN:SD or uniform:LOWEST:HIGHEST"
 _ALLOWED = f"a dict by parameter ({_FORMS}), a run folder, a result, a Prior, or several"
-_ADVICE = "give a run folder of `excite identify`, or a file .json with `mean` and `covariance`"
+_ADVICE = "give a run folder of `excite identify`, or a file (JSON) with `mean` and `covariance`"
 
 PriorLike: TypeAlias = Mapping[str, str] | str | Path | Identification | Prior
 """Distributions by parameter ("normal:0.022:5%"), an earlier run, or a joint distribution."""
@@ -185,11 +185,12 @@ def prior_of_run(plant: AbstractPlant, given: Identification | str | Path) -> Pr
         if not (path / "estimate.json").is_file():
             raise ValueError(f"{path} has no estimate: {_ADVICE}")
         return _from_run(plant, EstimateSummary.read(path / "estimate.json", _ADVICE), str(path))
-    if path.is_file() and path.suffix != ".json":
-        raise ValueError(f"prior {str(path)!r} is no run folder and no file .json: {_ADVICE}")
     if not path.exists():
         raise ValueError(f"prior {str(path)!r} is no run folder and no file; it may be {_ALLOWED}")
-    data = read_json(path, "mean", "covariance", advice=_ADVICE)
+    try:
+        data = read_json(path, "mean", "covariance")
+    except ValueError:
+        raise ValueError(f"{path} is no file with a mean and a covariance: {_ADVICE}") from None
     if not isinstance(data["mean"], dict):
         raise ValueError(f"{path}: mean must be an object by parameter: got {data['mean']!r}")
     _require_names(plant, list(data["mean"]))

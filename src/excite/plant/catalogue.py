@@ -405,8 +405,6 @@ def with_sensor(
                 raise unknown(f"{plant.definition.name} output", name, outputs)
             value = as_number(f"{what} of {name!r}", value)
             if not (math.isfinite(value) and value >= 0):
-                raise ValueError(
-                    f"{what} of {name!r} must be zero or positive: got {value:g}"
-                )
+                raise ValueError(f"{what} of {name!r} must be zero or positive: got {value:g}")
             numbers[what][outputs.index(name)] = value
     return plant.changed(sensor=Sensor(*map(floats, numbers.values())))

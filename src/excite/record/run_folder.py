@@ -27,17 +27,16 @@ def write_run(
         plant: names the columns.
         records: each with values by output [sample, output], which get a file by their name.
         contents: JSON-ready, by the name of their file; `run` marks the folder.
-        overwrite: whether a run folder at `path` is replaced; files that no run has are kept.
+        overwrite: whether a run folder at `path` is replaced; your own files in it are kept.
         kind: of that run.
 
     Raises:
         ValueError: where `path` is not a run folder, is one and `overwrite` is False, or is one of
             another kind.
     """
-    outputs, own = (
-        names_of(plant.outputs),
-        {"record", "simulated", "residual", "predicted", "predicted_sd", *contents},
-    )
+    outputs = names_of(plant.outputs)
+    tables = r"(simulated|residual|predicted|predicted_sd)(_\d+)?\.csv"
+    own = rf"record(_\d+)?\.(csv|json)|{tables}|({'|'.join(contents)})\.json"
     with new_run_folder(path, overwrite, kind, own) as folder:
         for i, (record, computed) in enumerate(records, 1):
             ending = "" if len(records) == 1 else f"_{i}"

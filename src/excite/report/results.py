@@ -140,7 +140,8 @@ def compared_plants(result: Data) -> tuple[str, Table]:
         if held_out:
             row += [number(held_out_fit(own, name), 4) for name in outputs]
         rows.append(row)
-    return "plants, likeliest first", (header, rows)
+    states = " or ".join(sorted({own.initial_state for own in found}))
+    return f"plants, likeliest first; initial state {states}", (header, rows)
 
 
 def _columns(outputs: list[str], what: str) -> list[str]:

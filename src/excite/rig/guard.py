@@ -187,10 +187,12 @@ class Guard:
 
     def _computes(self, points: np.ndarray, past: np.ndarray) -> bool:
         """Whether the programs are for these points: as many as the filter has."""
+        if (self.advance.num_inputs, self.output.num_inputs) != (2, 1):
+            return False
         try:
             with np.errstate(all="ignore"):
                 states, outputs = self.advance(points, past), self.output(points)
-        except (ValueError, IndexError):
+        except (ValueError, IndexError, TypeError):
             return False
         shape = len(points), self.rules.num_states
         return states.shape == shape and outputs.shape[:1] == shape[:1]

@@ -8,6 +8,7 @@ computer. A program from a file can only do arithmetic on arrays.
 from __future__ import annotations
 
 import base64
+import contextlib
 import json
 import zlib
 from collections.abc import Callable, Mapping
@@ -21,6 +22,7 @@ import numpy as np
 Numpy = Callable[..., Any]
 
 _LONGEST = 10_000_000  # bytes of a program: a file of a few bytes cannot fill the memory
+_MOST_INPUTS = 10
 
 
 def _integer_pow(y: int) -> Numpy:
@@ -161,12 +163,19 @@ class Program:
     @cached_property
     def _steps(self) -> tuple[list[np.ndarray], list[tuple[Numpy, list[int]]], int]:
         """Constants, what is done with inputs and constants in turn, and the result's place."""
-        numbers = [*range(self.num_inputs), *self.constants, *(o.gives for o in self.operations)]
-        place = {number: i for i, number in enumerate(numbers)}
-        steps = [
-            (function_of(o.name, o.settings), [place[i] for i in o.takes]) for o in self.operations
-        ]
+        place = {number: i for i, number in enumerate([*range(self.num_inputs), *self.constants])}
+        steps = []
+        for o in self.operations:
+            function, takes = function_of(o.name, o.settings), [place[i] for i in o.takes]
+            if isinstance(function, np.ufunc) and len(takes) != function.nin:
+                raise TypeError(f"{o.name} of {len(takes)} values")
+            steps.append((function, takes))
+            place[o.gives] = len(place)
         return list(self.constants.values()), steps, place[self.result]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Its fields; `_steps` cannot be pickled, and is made again."""
+        return {name: value for name, value in vars(self).items() if name != "_steps"}
 
     def to_text(self) -> str:
         """The program in few letters: its JSON, compressed."""
@@ -218,9 +227,11 @@ class Program:
                 for name, takes, gives, settings in data["operations"]
             )
             read = cls(int(data["num_inputs"]), constants, operations, int(data["result"]))
+            if not 0 <= read.num_inputs <= _MOST_INPUTS:
+                raise ValueError(f"a plant's program has {read.num_inputs} inputs")
             read._steps  # noqa: B018  what is damaged is found now
             return read
-        except (KeyError, TypeError, AttributeError) as error:
+        except (KeyError, TypeError, AttributeError, OverflowError) as error:
             raise ValueError(f"a plant's program is damaged ({error!r})") from None
 
 
@@ -231,6 +242,7 @@ def _known(name: str) -> str:
 
 
 def _dtype(name: str) -> str:
-    if name not in ("float64", "float32", "int64", "int32", "bool"):
-        raise ValueError(f"a plant's program has numbers of the unknown type {name!r}")
-    return name
+    with contextlib.suppress(TypeError):
+        if np.dtype(name).kind in "biuf":
+            return name
+    raise ValueError(f"a plant's program has numbers of the unknown type {name!r}")

@@ -295,6 +295,7 @@ class Campaign:
         self.next: NextExperiment | None = None
         self.reason, self.interrupted, self.prediction = "", "", ""
         self.haste, self.playing = 1.0, ""
+        self._counts_prior = True
         if self.prior is not None:
             if told := excluded(self.plant, self._before, self.spread, "the prior"):
                 raise ValueError(f"{told}, or another prior")
@@ -546,8 +547,9 @@ class Campaign:
         elif told := self._contradicted():
             self.reason = f"the records contradict the prior of {', '.join(told)}"
             with contextlib.suppress(ValueError):  # what is known then, the records tell alone
-                alone = self._identified(None)
-                self.result = alone if alone.is_usable else self.result
+                if (alone := self._identified(None)).is_usable:
+                    self.result, self._counts_prior = alone, False
+            self.reason += ", which the estimate still counts" * self._counts_prior
             known = self.known
         elif shares and max(shares.values()) <= 1:
             self.reason = REACHED
@@ -559,12 +561,12 @@ class Campaign:
             self.reason = f"the budget of {self.most_samples} samples is used up"
         if self.reason and self.result is not None and unexplained(self.result):
             self._look_for_causes(self.result)
-        missing = f"there is no estimate yet ({status})"
-        if shares:
-            is_more = (
-                max(shares.values()) <= 1
-            )  # played for other targets, or before this one ended
-            missing = "every target is reached already" if is_more else farthest(shares)
+        if not shares:
+            missing = f"there is no estimate yet ({status})"
+        elif max(shares.values()) <= 1:  # the next round was played for other targets
+            missing = "every target is reached already"
+        else:
+            missing = farthest(shares)
         decision = f"end: {self.reason}" if self.reason else f"go on: {missing}"
         if structure and not self.is_undecided:
             decision = f"{structure}; {decision}"
@@ -860,7 +862,7 @@ class Campaign:
             raise ValueError("the campaign has no estimate yet")
         params = self.plant.Params(*self.result.params.values())
         before, parts = jnp.zeros((len(params), len(params))), []
-        if self.prior is not None:  # otherwise the plant may be a rival's
+        if self.prior is not None and self._counts_prior:  # otherwise the plant may be a rival's
             before = self._of_prior.information
         for record in self.records:
             inputs = jnp.asarray(record.inputs[:-1])

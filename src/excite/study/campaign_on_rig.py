@@ -268,16 +268,11 @@ class _Folder:
             # One that is missing was not there when the folder was begun.
             other = [n for n, value in settings.items() if before.get(n, type(value)()) != value]
             if other:
-                name = {"plant_hash": "plant", "policy_hash": "policy"}.get(other[0], other[0])
-                shown = [before.get(name), settings.get(name)]
-                if name == "plant":
-                    shown = [read_json(file)["plant"], own["plant"]]
-                are = name == "policy" or shown[0] == shown[1]
-                told = "" if are else f" {shown[0]!r} and not {shown[1]!r}"
-                raise ValueError(
-                    f"{root} is another campaign, with {'another ' * are}{name}{told}: choose "
-                    "another folder"
-                )
+                name = other[0]
+                told = f"{name} {before.get(name)!r} and not {settings[name]!r}"
+                if name.endswith("_hash"):
+                    told = f"another {name.removesuffix('_hash')}"
+                raise ValueError(f"{root} is another campaign, with {told}: choose another folder")
         elif root.exists() and not (root.is_dir() and _names_in(root) <= _OWN):
             raise ValueError(f"{root} exists and is no campaign: choose another folder")
         return cls(root, settings, command)
@@ -323,8 +318,8 @@ class _Folder:
             if not is_same:
                 asked = ", ".join(f"{name} to {to}" for name, to in before["targets"].items())
                 on_warning(
-                    f"the rounds so far were played for other targets ({asked}); what is told of "
-                    "them is by the new ones"
+                    f"the rounds so far were played for other targets ({asked}); the tables "
+                    "compare them with the new ones"
                 )
             made.prediction = str(before["expected"]) if is_same else ""
             names = [*(str(r["played"]) for r in before["rounds"]), str(before.get("playing", ""))]

@@ -145,8 +145,13 @@ def known_from(
         result = identify(records, own, prior=prior if before is None else before)
         if not result.is_usable:
             raise ValueError(f"the records give no estimate ({result.status})")
+        found = result
+
+        def alone() -> Identification:
+            return identify(records, own, start=dict(found.params), causes=False)
+
         joint = before if prior is None else with_prior(own, prior, own.nominal, {}, {})[1]
-        told = [] if joint is None else contradicted(joint, result, lambda: identify(records, own))
+        told = [] if joint is None else contradicted(joint, result, alone)
         if told and before is not None:
             raise ValueError(
                 f"the records contradict the earlier results in {', '.join(told)}: identify all "

@@ -433,9 +433,8 @@ def next_experiment(
         mismatch(found, own.description)
         played = ("policy" if isinstance(policy, Policy) else f"policy {policy}", found)
     now, within = given.of(()), intervals_in(own, region, ())
-    usual = {  # of a parameter that the records do not tell, half of what the spread tells
-        name: (own if np.isfinite(own) else within[name].ci95_half) / 2
-        for name, (_, own) in now.items()
+    usual = {  # of a parameter of which the spread tells more, half of that
+        name: min(interval.ci95_half, within[name].ci95_half) / 2 for name, interval in now.items()
     }
     targets = targets_from(own, usual if target is None else target)
     for quantity in others_of(own, targets):
