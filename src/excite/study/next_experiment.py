@@ -398,7 +398,7 @@ def next_experiment(
         plant: a name, `path/to/file.py:ClassName`, a plant or its class; default that of the
             record, the result or the run folder.
         target: half of a 95 % interval by quantity, as for `Campaign`; default half of what it is
-            now, for each parameter.
+            now, for each parameter; of one of which the spread tells much more, half of that.
         prior: as for `identify`, where records are given.
         policy: to compare with; its name or file.
         spread: of the parameters before the records.
@@ -433,9 +433,9 @@ def next_experiment(
         mismatch(found, own.description)
         played = ("policy" if isinstance(policy, Policy) else f"policy {policy}", found)
     now, within = given.of(()), intervals_in(own, region, ())
-    usual = {  # of a parameter of which the spread tells more, half of that
-        name: min(interval.ci95_half, within[name].ci95_half) / 2 for name, interval in now.items()
-    }
+    usual = {}
+    for name, (_, half) in now.items():  # what the spread tells of it may be much more
+        usual[name] = (half if half <= 2 * within[name].ci95_half else within[name].ci95_half) / 2
     targets = targets_from(own, usual if target is None else target)
     for quantity in others_of(own, targets):
         require_defined(quantity, own, own.Params(*region.center))
