@@ -1,6 +1,7 @@
 """Sensitivities against differences, information against NumPy, and its laws."""
 
 import functools
+import re
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 from catalogue import FEW_AND_ALL, PLANTS
 
+import excite as ex
 from excite.estimation import ARX, NLS, stack_experiments
 from excite.excitation import Multisine
 from excite.information import (
@@ -254,3 +256,13 @@ def test_single_precision_is_refused_in_a_sentence():
             with pytest.raises(ValueError, match="need double precision: call jax"):
                 call()
     assert experiment_information(plant, plant.nominal, inputs_of("aero2")).dtype == np.float64
+
+
+def test_an_output_beyond_its_critical_level_is_told():
+    safe = ex.information("aero2", "chirp", steps=100)
+    assert safe.warnings == ()
+    loud = ex.information("aero2", "square", options={"amplitude": 24.0}, steps=100)
+    assert re.search(r"^pitch reaches \S+ times its critical level: on a rig", loud.warnings[0])
+    unstable = {"J_p": 0.0232, "K_pu": 100.0}  # thousands of turns
+    with pytest.raises(ValueError, match=r"pitch reaches .*: its information cannot be trusted"):
+        ex.information("aero2", "square", options={"amplitude": 24.0}, params=unstable, steps=100)

@@ -338,7 +338,8 @@ class PlantDescription:
             names = [part.name for part in parts]
             may_lack = kind in ("inputs", "constants")
             _require(bool(parts) or may_lack, f"plant {self.name!r} has no {kind}")
-            _require(len(set(names)) == len(names), f"{kind} of {self.name!r} repeat a name")
+            twice = next((name for name in names if names.count(name) > 1), None)
+            _require(twice is None, f"{kind} of {self.name!r} repeat the name {twice!r}")
         columns = {"time", *names_of(self.inputs)}
         _require(
             columns.isdisjoint(names_of(self.outputs)) and "time" not in names_of(self.inputs),

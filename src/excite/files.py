@@ -489,6 +489,8 @@ def tensors_from_bytes(
         ValueError: one sentence for content that is truncated, changed, or of another format.
     """
     kind = file_format.rpartition(" ")[0]
+    if not content:
+        raise ValueError(f"{where}: truncated, or no {kind} file (it is empty)")
     try:
         tensors = safetensors.numpy.load(content)
         metadata = json.loads(_split(content)[0]).get(_ABOUT) or {}

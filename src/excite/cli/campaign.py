@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -144,7 +146,8 @@ def campaign(
     from ..study.campaign_on_rig import campaign as campaigned
     from .run import EXIT_CODES
 
-    with progress_bar(f"campaign on {plant}") as progress:
+    stdout = sys.stderr if as_json else sys.stdout  # drivers of a rig may print
+    with progress_bar(f"campaign on {plant}") as progress, contextlib.redirect_stdout(stdout):
         made = campaigned(
             plant,
             merged(targets),

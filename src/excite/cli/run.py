@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -125,13 +126,14 @@ def _run_and_show(as_json: bool, **options: Any) -> int:
     from ..rig.session import run as run_on_rig
     from .live_view import LiveView
 
-    view = LiveView()
+    view, stdout = LiveView(), sys.stderr if as_json else sys.stdout
     try:
-        result = run_on_rig(
-            **options,
-            on_sample=view,
-            on_warning=lambda sentence: click.echo(f"warning: {sentence}", err=True),
-        )
+        with contextlib.redirect_stdout(stdout):  # drivers of a rig may print
+            result = run_on_rig(
+                **options,
+                on_sample=view,
+                on_warning=lambda sentence: click.echo(f"warning: {sentence}", err=True),
+            )
     except RigError as error:
         raise RunFailedError(f"the rig failed: {error}") from error
     finally:
@@ -143,7 +145,7 @@ def _run_and_show(as_json: bool, **options: Any) -> int:
     elif isinstance(result, DryRun):
         show_table(result.title, result.header, result.rows())
     else:
-        _show(result, options["plant"])
+        _show(result, options["plant"] or _plant_of(options["rig"]))
     if isinstance(result, DryRun) or result.outcome.is_complete:
         return 0
     return EXIT_CODES.get(result.outcome.reason, 1)
@@ -154,6 +156,15 @@ def _prepare() -> None:
         prepare_jax()
     except ImportError:
         click.echo("JAX is not installed: the live estimate and the filter are off", err=True)
+
+
+def _plant_of(rig: str) -> str | None:
+    """The plant of a rig that is given by a file (JSON), as it is typed; None for others."""
+    if not rig.endswith(".json"):
+        return None
+    from ..plant.catalogue import known_plant, word_in_command
+
+    return word_in_command(known_plant(rig))
 
 
 def _show(result: RunResult, plant: str | None) -> None:

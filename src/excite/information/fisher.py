@@ -27,6 +27,7 @@ from ..plant.static import require_sensor_noise
 from ..record import Record
 from ..record.table import data_frame
 from ..report.results import information_html, information_text, wrapped
+from ..safety import critical_levels
 from ..simulation import Experiment, predicted, require_likelihood, response, run_episode
 from .identifiability import Structure, practically, structure
 
@@ -35,6 +36,8 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 Information = Float[Array, "param param"]
+
+_DIVERGED = 100.0  # times its critical level: an output that a plant's equations do not describe
 
 
 def require_noise(plant: AbstractPlant) -> None:
@@ -234,7 +237,8 @@ class InformationResult:
         verdict: sentences: what cannot be identified, and how certain the rest is.
         inputs: of the experiment [input units].
         excitation: its name.
-        warnings: a sentence where a policy was trained on another plant.
+        warnings: sentences, where a policy was trained on another plant, and where an output
+            reaches its critical level.
     """
 
     plant: PlantDescription
@@ -323,7 +327,7 @@ def information(
 
     Raises:
         ValueError: as `simulate`, for a sensor without noise, which sets no bound, and for a
-            response that is not finite.
+            response that is not finite, or far beyond a critical level.
         TypeError: for an argument of another type.
     """
     if initial_state not in ("auto", "known", "free"):
@@ -335,12 +339,22 @@ def information(
     elsewhere = isinstance(excitation, Record) and not excitation.starts_at_initial_state
     known = initial_state == "known" or (initial_state == "auto" and not elsewhere)
     e = experiment
-    inputs = run_episode(e.plant, e.params, e.excitation, e.num_steps, e.key).inputs
+    run = run_episode(e.plant, e.params, e.excitation, e.num_steps, e.key)
+    inputs, levels = run.inputs, critical_levels(e.plant.description)
+    near, beyond = np.max(np.abs(run.outputs), axis=0) / levels, []
+    for output, size in zip(e.plant.definition.outputs, near, strict=True):
+        told = f"{output.name} reaches {float(size):.3g} times its critical level"
+        if _DIVERGED < size < np.inf:
+            raise ValueError(
+                f"{told}: its information cannot be trusted; a smaller amplitude may help"
+            )
+        if size >= 1:
+            beyond.append(f"{told}: on a rig, the experiment would end there")
     result = best_possible(
         e.plant, e.params, inputs, initial_state_known=known,
         structure=structure(e.plant, e.params, initial_state_known=known),
     )  # fmt: skip
-    return replace(result, excitation=e.name, warnings=e.warnings)
+    return replace(result, excitation=e.name, warnings=(*e.warnings, *beyond))
 
 
 def best_possible(

@@ -107,7 +107,8 @@ class RunResult:
             unit, factor = display_unit(output.unit)
             level = output.critical_level
             limit = "" if level is None else f" (critical level {factor * level:g})"
-            rows.append([f"largest |{output.name}|", f"{factor * largest:.4g} {unit}{limit}"])
+            shown = f"{factor * largest:.4g} {unit}{limit}" if outcome.num_samples else "–"
+            rows.append([f"largest |{output.name}|", shown])
         if late := outcome.late_ms_percentiles:
             shown = ", ".join(f"{p} %: {v:.3g}" for p, v in late.items())
             rows.append(["readings late, ms", f"{shown}; {outcome.num_missed} deadlines missed"])
