@@ -19,6 +19,7 @@ from ..description import (
     PlantDescription,
     as_number,
     first_line,
+    listed,
     names_of,
     told,
     unknown,
@@ -236,9 +237,11 @@ def _plant_of_file(path: Path) -> AbstractPlant:
 
 def _complete(plant_class: type[AbstractPlant], where: str) -> AbstractPlant:
     """A plant of a class with its default numbers."""
+    if missing := sorted(plant_class.__abstractmethods__):
+        raise ValueError(f"{where} is not a complete plant: it has no {listed(missing)}")
     try:
         return plant_class()
-    except (TypeError, AttributeError) as error:  # a method or the definition is missing
+    except (TypeError, AttributeError) as error:  # the definition is missing
         raise ValueError(f"{where} is not a complete plant: {error}") from None
     except (ValueError, KeyboardInterrupt):
         raise

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..description import PlantDescription, SpreadLike, names_of, unknown
+from ..description import PlantDescription, SpreadLike, listed, names_of, unknown
 from ..files import class_at, is_class_word
 from .contract import AbstractRig
 from .fmu import FMURig
@@ -169,9 +169,13 @@ def rig_named(
 
 def _users_rig(path: Path, class_name: str, description: PlantDescription) -> AbstractRig:
     rig_class = class_at(path, class_name, AbstractRig, "rig")
+    if missing := sorted(rig_class.__abstractmethods__):
+        raise ValueError(
+            f"{class_name} in {path} is not a complete rig: it has no {listed(missing)}"
+        )
     try:
         rig: AbstractRig = rig_class()
-    except TypeError as error:  # a method of the contract is missing
+    except TypeError as error:  # it takes arguments
         raise ValueError(f"{class_name} in {path} is not a complete rig: {error}") from None
     if not hasattr(rig, "description"):
         rig.description = description
