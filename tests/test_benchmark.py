@@ -349,8 +349,8 @@ def test_a_run_folder_is_resumed_by_its_study_and_replaced_where_asked(tmp_path)
 def trained(folder: Path) -> tuple[Study, Path]:
     """A study with an agent, and a file of its run."""
     folder.mkdir()
-    for name in ("run.json", "study.json"):
-        (folder / name).write_text("{}")
+    (folder / "run.json").write_text('{"kind": "excite study"}')
+    (folder / "study.json").write_text("{}")
     kept = folder / "seeds" / "A" / "0" / "metrics.json"
     kept.parent.mkdir(parents=True)
     kept.write_text("{}")
