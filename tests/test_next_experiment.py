@@ -198,6 +198,7 @@ def test_what_is_not_allowed_is_one_sentence(options, words):
     assert words in str(error.value)
 
 
+@pytest.mark.slow
 def test_records_that_contradict_what_was_known_are_refused(tmp_path):
     # A strong prior makes the residual large, so that its size hides the contradiction.
     ex.identify(ex.simulate("aero2", "chirp", params={"J_p": 0.03}, seed=1)).save(tmp_path / "run")
