@@ -237,7 +237,7 @@ def _plant_of_file(path: Path) -> AbstractPlant:
 
 def _complete(plant_class: type[AbstractPlant], where: str) -> AbstractPlant:
     """A plant of a class with its default numbers."""
-    if missing := sorted(plant_class.__abstractmethods__):
+    if missing := sorted(getattr(plant_class, "__abstractmethods__", ())):
         raise ValueError(f"{where} is not a complete plant: it has no {listed(missing)}")
     try:
         return plant_class()
