@@ -350,6 +350,7 @@ def test_a_policy_is_an_excitation_like_any_other(run, policy, tmp_path):
     for command in ("simulate", "information"):
         told = run(command, *words[1:4], "--noise", "pitch=0.001", "--json")
         shown = json.loads(told.out)
+        assert len(shown["warnings"]) == (2 if command == "information" else 1)  # its level
         assert told.err == "".join(f"warning: {sentence}\n" for sentence in shown["warnings"])
         assert shown["num_steps"] == 40  # the policy's
     assert "warning" in json.loads(record.with_suffix(".json").read_text())["provenance"]

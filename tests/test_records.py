@@ -620,10 +620,10 @@ def test_a_run_is_never_replaced_by_one_of_another_kind(tmp_path):
         write_json(folder / "run.json", {"kind": "excite campaign"})
     told = r"holds another kind of run \(campaign\); choose another name"
     with pytest.raises(ValueError, match=told):
-        require_free_run_folder(path, True, "study")
-    with pytest.raises(ValueError, match=told), new_run_folder(path, True, "study"):
+        require_free_run_folder(path, True, "excite study")
+    with pytest.raises(ValueError, match=told), new_run_folder(path, True, "excite study"):
         pass
-    require_free_run_folder(path, True, "campaign")
+    require_free_run_folder(path, True, "excite campaign")
 
 
 def test_files_of_others_in_a_run_folder_that_is_replaced_are_kept(tmp_path):

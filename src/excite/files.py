@@ -212,7 +212,7 @@ def require_free_run_folder(path: Path, overwrite: bool, kind: str = "") -> None
     Args:
         path: of the folder.
         overwrite: whether a run folder there is replaced.
-        kind: of that run, as its marker says; default any.
+        kind: of that run, as its marker has it ("excite study"); default any.
     """
     for parent in path.absolute().parents:
         if parent.exists():
@@ -225,9 +225,10 @@ def require_free_run_folder(path: Path, overwrite: bool, kind: str = "") -> None
         raise ValueError(f"{path} exists and is no run folder; choose another name")
     if kind:
         marker = read_json(path / "run.json", advice="choose another name, or delete the folder")
-        found = str(marker.get("kind", "")).removeprefix("excite ")
+        found = str(marker.get("kind", ""))
         if found != kind:
-            told = f"another kind of run ({found})" if found else "a run of an unknown kind"
+            name = found.removeprefix("excite ")
+            told = f"another kind of run ({name})" if found else "a run of an unknown kind"
             raise ValueError(f"{path} holds {told}; choose another name")
     if not overwrite:
         raise ValueError(f"{path} holds a run; choose another name or add --overwrite")

@@ -29,9 +29,10 @@ def benchmark(
 ) -> None:
     """Former name of `excite study run`, for a study without agents."""
     from ..files import require_free_run_folder
+    from ..study.run import KIND
 
     if out is not None:
-        require_free_run_folder(out, overwrite, "study")
+        require_free_run_folder(out, overwrite, KIND)
     chosen = study_in(study).changed(episodes=episodes, seed=seed, estimators=estimators)
     if chosen.agents or chosen.clairvoyant:
         what = "agents to train" if chosen.agents else "signals to design"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +24,7 @@ from .options import (
     plot_option,
     progress_bar,
     show_json,
+    stdout_for,
 )
 
 
@@ -146,8 +145,7 @@ def campaign(
     from ..study.campaign_on_rig import campaign as campaigned
     from .run import EXIT_CODES
 
-    stdout = sys.stderr if as_json else sys.stdout  # drivers of a rig may print
-    with progress_bar(f"campaign on {plant}") as progress, contextlib.redirect_stdout(stdout):
+    with progress_bar(f"campaign on {plant}") as progress, stdout_for(as_json):
         made = campaigned(
             plant,
             merged(targets),

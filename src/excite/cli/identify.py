@@ -224,11 +224,11 @@ def identify(
     has its initial state.
     """
     from ..estimation.identify import identify as verb
-    from ..estimation.result import IDENTIFICATION
+    from ..estimation.result import KIND
     from ..files import require_free_run_folder
 
     if out is not None:
-        require_free_run_folder(out, options["overwrite"], IDENTIFICATION)
+        require_free_run_folder(out, options["overwrite"], KIND)
     if posterior is not None:
         from ..estimation.posterior import require_extra
         from ..files import require_new_file

@@ -367,6 +367,11 @@ def _interrupts() -> Iterator[list[int]]:
         signal.signal(signal.SIGINT, usual)
 
 
+def stdout_for(as_json: bool) -> contextlib.AbstractContextManager[object]:
+    """Within it, what the driver of a rig prints goes to stderr where stdout is for JSON."""
+    return contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext()
+
+
 def show_json(value: object) -> None:
     """One JSON object on stdout."""
     from ..files import json_text

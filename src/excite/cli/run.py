@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +23,7 @@ from .options import (
     prepare_jax,
     show_json,
     show_table,
+    stdout_for,
 )
 
 if TYPE_CHECKING:
@@ -126,9 +126,9 @@ def _run_and_show(as_json: bool, **options: Any) -> int:
     from ..rig.session import run as run_on_rig
     from .live_view import LiveView
 
-    view, stdout = LiveView(), sys.stderr if as_json else sys.stdout
+    view = LiveView()
     try:
-        with contextlib.redirect_stdout(stdout):  # drivers of a rig may print
+        with stdout_for(as_json):
             result = run_on_rig(
                 **options,
                 on_sample=view,

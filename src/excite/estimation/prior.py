@@ -147,10 +147,6 @@ class Prior(eqx.Module):
             ends = np.where(np.array(self.logarithmic)[:, None], np.exp(ends), ends)
         return {name: (own[0], own[1]) for name, own in zip(self.names, ends.tolist(), strict=True)}
 
-    def contradicted(self, values: Mapping[str, float], sd: Mapping[str, float]) -> list[str]:
-        """Names of parameters in which the data contradict the distribution; see `verdict`."""
-        return [name for name, chance in self.chances(values, sd).items() if chance < RARE]
-
     def chances(
         self, values: Mapping[str, float], sd: Mapping[str, float], includes_prior: bool = True
     ) -> dict[str, float]:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from xarray import DataTree
 
 
-IDENTIFICATION = "identification"  # kind of its run folders
+KIND = "excite identification"  # of its run folders
 
 
 @dataclass(frozen=True)
@@ -321,14 +321,14 @@ class Identification:
             "information": self.information,
             "covariance": self.covariance,
         }
-        about = {"kind": f"excite {IDENTIFICATION}", "excite": __version__, "command": command}
+        about = {"kind": KIND, "excite": __version__, "command": command}
         contents = {
             "estimate": self.to_dict(),
             "information": information,
             "run": {**about, "plant": self.plant.to_dict()},
         }
         records = [(f.record, f.computed) for f in self.fitted]
-        write_run(Path(path), self.plant, records, contents, overwrite, IDENTIFICATION)
+        write_run(Path(path), self.plant, records, contents, overwrite, KIND)
 
     def to_dict(self) -> dict[str, object]:
         """The result as JSON-ready data; docs/reference/machine-readable.md lists its keys."""

@@ -16,7 +16,7 @@ import math
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -545,12 +545,7 @@ class Campaign:
         elif unsafe or near >= 1:
             self.reason = f"unsafe: {ended if unsafe else 'a critical level was reached'}"
         elif told := self._contradicted():
-            self.reason = f"the records contradict the prior of {', '.join(told)}"
-            with contextlib.suppress(ValueError):  # what is known then, the records tell alone
-                if (alone := self._identified(None)).is_usable:
-                    self.result, self._counts_prior = alone, False
-            self.reason += ", which the estimate still counts" * self._counts_prior
-            known = self.known
+            self.reason, known = told, self.known
         elif shares and max(shares.values()) <= 1:
             self.reason = REACHED
         elif self.discrimination is not None and not self.discrimination.is_explained:
@@ -627,11 +622,18 @@ class Campaign:
                     result, suspects=found.suspects, verdict=found.verdict
                 )
 
-    def _contradicted(self) -> list[str]:
-        """Parameters in which the records contradict the prior."""
+    def _contradicted(self) -> str:
+        """A sentence where the records contradict the prior, which then counts no more."""
         if self.prior is None or self.result is None:
-            return []
-        return contradicted(self.prior, self.result, lambda: self._identified(None))
+            return ""
+        alone = cache(lambda: self._identified(None))
+        if not (names := contradicted(self.prior, self.result, alone)):
+            return ""
+        with contextlib.suppress(ValueError):
+            if alone().is_usable:
+                self.result, self._counts_prior = alone(), False
+        still = ", which the estimate still counts" * self._counts_prior
+        return f"the records contradict the prior of {', '.join(names)}{still}"
 
     def _is_explained(self) -> bool:
         """Whether the residual is noise, of the declared size where there are rivals.

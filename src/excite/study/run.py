@@ -140,11 +140,11 @@ def run_study(
     folder = path_from("out", out)
     place: contextlib.AbstractContextManager[Path] = contextlib.nullcontext(folder)
     if overwrite:
-        require_free_run_folder(folder, overwrite, "study")
+        require_free_run_folder(folder, overwrite, KIND)
     if not what and engine == "local":
         machine = None
         if overwrite or not folder.exists():  # the folder appears when it is complete
-            place = new_run_folder(folder, overwrite, "study")
+            place = new_run_folder(folder, overwrite, KIND)
     replaced = overwrite and machine is not None
     if machine is not None and engine == "local":
         _require_trainer(chosen, None if replaced else folder)
