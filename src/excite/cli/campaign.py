@@ -84,6 +84,13 @@ from .options import (
     "policy's training, or 100.",
 )
 @click.option(
+    "--carry",
+    type=WholeNumber(1, 10_000),
+    metavar="N",
+    help="Play the safe input for N samples after a round while the next one is decided, and go "
+    "on from there; without it, and where no redesigned signal is safe, rounds begin at rest.",
+)
+@click.option(
     "--redesign/--no-redesign",
     default=True,
     help="Play signals redesigned for what is known, after the first round, where they need fewer "
@@ -107,8 +114,8 @@ from .options import (
     "--pause",
     type=Number(0),
     metavar="SECONDS",
-    help="Wait before every round but the first, so that the plant comes to rest; needed but for "
-    "a simulated rig or an FMU.",
+    help="Wait before every round from rest but the first, so that the plant comes to rest; needed "
+    "but for a simulated rig or an FMU.",
 )
 @click.option("--filter", is_flag=True, help="Predictive safety filter for this spread.")
 @click.option("--guard", is_flag=True, help="Brake where no declared plant explains a round.")
@@ -138,7 +145,8 @@ def campaign(
 ) -> None:
     """Play rounds of experiments on PLANT until its parameters are known as asked.
 
-    A round plays a policy or a designed signal from rest and ends as soon as enough is known.
+    A round plays a policy or a designed signal and ends as soon as enough is known. It begins at
+    rest, or with --carry where the last one ended.
     Exit code 1 where the campaign ends without every target.
     """
     from ..study.campaign import REACHED

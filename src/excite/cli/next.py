@@ -73,6 +73,13 @@ OF_TARGETS = (
     help="Experiments of this length for which the redesign looks ahead.",
 )
 @click.option(
+    "--carry",
+    type=WholeNumber(1, 10_000),
+    metavar="N",
+    help="Go on from the end of the last record, after N samples of the safe input; without it, "
+    "the experiment begins at rest.",
+)
+@click.option(
     "--coast",
     type=COAST,
     default=100,

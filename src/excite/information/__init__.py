@@ -7,6 +7,8 @@ parameters any experiment, or this one, can determine.
 from .fisher import Bound as Bound
 from .fisher import Information as Information
 from .fisher import InformationResult as InformationResult
+from .fisher import Past as Past
+from .fisher import Start as Start
 from .fisher import a_optimality as a_optimality
 from .fisher import best_possible as best_possible
 from .fisher import cramer_rao_bound as cramer_rao_bound
@@ -21,3 +23,4 @@ from .fisher import require_bound as require_bound
 from .fisher import require_noise as require_noise
 from .fisher import running_information as running_information
 from .fisher import sensitivity as sensitivity
+from .fisher import start_after as start_after

@@ -17,7 +17,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from ..description import Named, PlantDescription, names_of
 from ..excitation.catalogue import ExcitationLike
@@ -28,7 +28,7 @@ from ..record import Record
 from ..record.table import data_frame
 from ..report.results import information_html, information_text, wrapped
 from ..safety import critical_levels
-from ..simulation import Experiment, predicted, require_likelihood, response, run_episode
+from ..simulation import Experiment, predicted, require_likelihood, response, run_episode, step
 from .identifiability import Structure, practically, structure
 
 if TYPE_CHECKING:
@@ -97,6 +97,56 @@ def marginal_information(
     return R.T @ R
 
 
+class Start(eqx.Module):
+    """Where an experiment begins.
+
+    Attributes:
+        state: of the plant.
+        slope: its derivative with respect to relative changes of the parameters.
+    """
+
+    state: Float[Array, " state"]
+    slope: Float[Array, "state param"]
+
+    def after(self, change: Float[Array, " param"]) -> Float[Array, " state"]:
+        """The state of a plant whose parameters are changed."""
+        return self.state + self.slope @ change
+
+
+class Past(eqx.Module):
+    """What was played since rest, where an experiment begins without a rest.
+
+    Attributes:
+        inputs: from rest on; what follows the first `count` of them counts for nothing.
+        count: samples that were played.
+        pause: samples of the safe input with which the experiment begins, while it is decided.
+    """
+
+    inputs: Float[Array, "time input"]
+    count: Int[Array, ""]
+    pause: int = eqx.field(static=True)
+
+
+@eqx.filter_jit
+def start_after(plant: AbstractPlant, params: Params, past: Past) -> Start:
+    """Where a plant without input delay has come to; the pause does not count."""
+    size, num_params = relative_size(plant, params), len(params)
+    theta = jnp.stack([jnp.asarray(p, float) for p in params])
+
+    def end(change: Array) -> Float[Array, " state"]:
+        changed = plant.Params(*(theta + size * change))
+
+        def advance(state: Array, now: tuple) -> tuple[Array, None]:
+            k, input = now
+            return jnp.where(k < past.count, step(plant, state, input, changed), state), None
+
+        steps = jnp.arange(len(past.inputs)), past.inputs
+        return jax.lax.scan(advance, plant.initial_state, steps)[0]
+
+    at = jnp.zeros(num_params)
+    return Start(end(at), jax.jacfwd(end)(at))
+
+
 @eqx.filter_jit
 def experiment_information(
     plant: AbstractPlant,
@@ -105,6 +155,7 @@ def experiment_information(
     *,
     measured: Float[Array, "time+1 output"] | None = None,
     initial_state_known: bool = True,
+    start: Start | None = None,
 ) -> Information:
     """Relative Fisher information of an experiment with these inputs and this plant's sensor.
 
@@ -114,6 +165,7 @@ def experiment_information(
         measured: of a plant whose state is observed, which begins every step there.
         initial_state_known: False where the initial state must be estimated too; the
             experiment starts at the plant's initial state in either case.
+        start: where it begins, if not at rest; its first measurement is of what was before.
     """
     require_double_precision()
     theta = jnp.stack([jnp.asarray(p, float) for p in params])
@@ -132,9 +184,11 @@ def experiment_information(
 
     def outputs(change: Array) -> Array:
         moved = change[num_params:] if num_states else 0.0
-        return response(plant, changed(change), inputs, plant.initial_state + moved)
+        begin = plant.initial_state if start is None else start.after(change[:num_params])
+        return response(plant, changed(change), inputs, begin + moved)
 
     S = sensitivity(outputs, jnp.zeros(num_params + num_states))
+    S = S if start is None else S[1:]
     if initial_state_known:
         return fisher_information(S, plant.sensor.sd)
     return marginal_information(S, plant.sensor.sd, num_params)
@@ -142,7 +196,10 @@ def experiment_information(
 
 @eqx.filter_jit
 def running_information(
-    plant: AbstractPlant, params: Params, inputs: Float[Array, "time input"]
+    plant: AbstractPlant,
+    params: Params,
+    inputs: Float[Array, "time input"],
+    start: Start | None = None,
 ) -> Float[Array, "time param param"]:
     """`experiment_information` after each step, with a known initial state.
 
@@ -151,10 +208,13 @@ def running_information(
     theta, size = jnp.stack([jnp.asarray(p, float) for p in params]), relative_size(plant, params)
 
     def outputs(change: Array) -> Array:
-        return response(plant, plant.Params(*(theta + size * change)), inputs)
+        begin = None if start is None else start.after(change)
+        return response(plant, plant.Params(*(theta + size * change)), inputs, begin)
 
     weighted = sensitivity(outputs, jnp.zeros(len(theta))) / plant.sensor.sd[None, :, None]
     each = jnp.einsum("koi,koj->kij", weighted, weighted)
+    if start is not None:
+        return jnp.cumsum(each[1:], axis=0)
     return jnp.cumsum(each, axis=0)[1:]
 
 

@@ -93,6 +93,70 @@ class PolicyPlayer(AbstractPlayer):
         return {"policy_hash": self._policy.hash}
 
 
+class Sequel:
+    """Signals that go on from what is played, given while the experiment runs.
+
+    Before, between and after them the safe input is played.
+
+    Attributes:
+        num_steps: samples of the experiment at most.
+    """
+
+    def __init__(self, num_steps: int) -> None:
+        """No signal."""
+        self.num_steps = num_steps
+        self._end = self._begin = math.inf
+        self._inputs = np.zeros((0, 0))
+
+    def end(self, k: int) -> None:
+        """Ends what is played: the safe input follows from sample k on."""
+        self._end = min(self._end, k)
+
+    def begin(self, k: int, inputs: np.ndarray) -> None:
+        """Plays a signal [time, input] from sample k on."""
+        self._begin, self._end, self._inputs = k, k + len(inputs), inputs
+
+    def input(self, k: int) -> np.ndarray | None:
+        """What the signal is at sample k; None for the safe input."""
+        return self._inputs[k - int(self._begin)] if self._begin <= k < self._end else None
+
+    def has_ended_first(self, k: int) -> bool:
+        """Whether what was played first has ended before sample k."""
+        return k >= min(self._begin, self._end)
+
+
+class SequelPlayer(AbstractPlayer):
+    """A player, and what goes on from it."""
+
+    def __init__(self, first: AbstractPlayer, sequel: Sequel, safe_input: np.ndarray) -> None:
+        """A player before its first sample."""
+        self._first, self._sequel, self._safe_input = first, sequel, safe_input
+        self.num_steps = sequel.num_steps
+        self._is_first = True
+
+    def __call__(self, k: int, measured: np.ndarray) -> np.ndarray:
+        """The input of the player, of a signal after it, or the safe one."""
+        has_ended = k >= self._first.num_steps or self._sequel.has_ended_first(k)
+        self._is_first = not has_ended
+        if self._is_first:
+            return self._first(k, measured)
+        input = self._sequel.input(k)
+        return self._safe_input if input is None else input
+
+    def applied(self, input: np.ndarray) -> None:
+        """Passes the applied input to the player."""
+        if self._is_first:
+            self._first.applied(input)
+
+    def origin(self) -> Mapping[str, object]:
+        """That of the player."""
+        return self._first.origin()
+
+    def facts(self) -> Mapping[str, object]:
+        """Those of the player."""
+        return self._first.facts()
+
+
 def step_seconds(make: Callable[[], AbstractPlayer], num_outputs: int) -> float:
     """99th percentile of the time of one step of a player [s], from 200 steps without a rig."""
     player, took = make(), []

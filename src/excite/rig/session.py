@@ -37,7 +37,14 @@ from .catalogue import HAS_JAX, RigOptions, rig_named
 from .contract import AbstractRig, Interval, Sample, as_data
 from .guard import Guard, GuardedPlayer, beside
 from .loop import ENDS_OF_PROGRAM, Outcome, Stop, interruptible, run_loop
-from .player import AbstractPlayer, PolicyPlayer, SignalPlayer, step_seconds
+from .player import (
+    AbstractPlayer,
+    PolicyPlayer,
+    Sequel,
+    SequelPlayer,
+    SignalPlayer,
+    step_seconds,
+)
 from .recorder import Recorder
 
 if TYPE_CHECKING or HAS_JAX:
@@ -226,6 +233,7 @@ def run(
     on_sample: OnSample = lambda _: None,
     on_warning: Callable[[str], None] = lambda _: None,
     stop: Stop | None = None,
+    sequel: Sequel | None = None,
     live_estimate: bool = True,
 ) -> RunResult | DryRun:
     """One experiment on a rig: supervised, recorded as it happens, ended by the safe input.
@@ -266,6 +274,8 @@ def run(
             on another plant.
         stop: a request to end, which a program can make at any time; without it, signals
             (Ctrl-C) end the experiment.
+        sequel: signals that go on from what is played, given while the experiment runs; not with
+            a guard, which knows one policy.
         live_estimate: whether parameters are estimated while the experiment runs.
 
     Returns:
@@ -320,6 +330,8 @@ def run(
         on_warning(warning)
     if require_certificate:
         source.check_certificate(description, spread, filter)
+    if guard and sequel is not None:
+        raise ValueError("a guard knows one policy: it does not go with a sequel")
     watching = source.guard(description) if guard else None
     make = source.maker(description, known, steps, seed)
     prior = _required(known, "--filter") if filter else None
@@ -327,6 +339,8 @@ def run(
 
     def make_player() -> AbstractPlayer:
         player = make()
+        if sequel is not None:
+            player = SequelPlayer(player, sequel, opened.safe_input)
         if safety_filter is not None:
             player = FilteredPlayer(player, safety_filter)
         return player if watching is None else GuardedPlayer(player, watching)
@@ -404,7 +418,14 @@ class _Source:
             longest = self.policy.layout.num_steps
             make = functools.partial(PolicyPlayer, self.policy, steps)
         elif self.signal is not None:
-            inputs = read_signal(self.signal, description).inputs[:-1]
+            read = read_signal(self.signal, description)
+            about = read.metadata.get("provenance") or {}
+            if about.get("design") and read.metadata["starts_at_initial_state"] is False:
+                raise ValueError(
+                    f"{self.signal} goes on from the end of a record (--carry): it is not safe "
+                    "from rest"
+                )
+            inputs = read.inputs[:-1]
             longest, make = len(inputs), functools.partial(SignalPlayer, inputs[:steps])
         else:
             plant, given = _required(plant, "--excitation"), self.excitation or self.name

@@ -5,7 +5,8 @@ one is chosen. A round then plays from rest: a policy, or, where there is none, 
 safe for the whole spread; once there is an estimate or a prior, a signal redesigned for what is
 known, where that is better. It ends with its last sample, or as soon as the running estimate
 reaches every target and the free motion that would follow is predicted to be safe. After every
-round all records are identified together.
+round all records are identified together. Where the state is carried over, the safe input is played
+while the next round is decided, and a redesigned signal goes on from the state that it leads to.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ from ..estimation.prior import Prior, uniform_names
 from ..estimation.prior_knowledge import PriorLike, plants_of, with_prior
 from ..estimation.result import Identification
 from ..excitation import PolicyExcitation, Replay
-from ..information import require_noise, running_information
+from ..information import Past, require_noise, running_information, start_after
 from ..plant import AbstractPlant, Params
 from ..plant.catalogue import PlantLike, plant_from, require_inputs
 from ..policy import Policy, mismatch, read_policy
@@ -191,7 +192,8 @@ class Campaign:
         prior: what else was known of them.
         most_rounds, most_samples: the budget; samples are not limited where that is None.
         coast: samples of free motion after an end that must be safe.
-        records: of all rounds.
+        carry: samples of the safe input after which the next round goes on; None for rest.
+        records: of all rounds, from rest; one that went on is in the record of the one before.
         rounds: what each of them brought.
         result: estimate from all records; None before the first.
         reason: why the campaign ended; empty before its end.
@@ -215,6 +217,7 @@ class Campaign:
         rounds: int = 10,
         samples: int | None = None,
         coast: int | None = None,
+        carry: int | None = None,
         redesign: bool = True,
         rivals: Sequence[RivalLike] = (),
         prior: PriorLike | Sequence[PriorLike] | None = None,
@@ -239,6 +242,9 @@ class Campaign:
                 could take more does not begin.
             coast: samples after a round's end in which the plant must be safe; default that of the
                 policy's training, or 100.
+            carry: samples of the safe input in which a round is decided. The next one then goes
+                on from the state that they lead to, with a redesigned signal that is safe from
+                there. Default is rest before every round, as where there is no such signal.
             redesign: whether signals are redesigned for later rounds, and played where they reach
                 the targets with fewer samples than what was played first; see `next_experiment`.
             rivals: other plants of which one may be the true one, as for `discriminate`. Signals
@@ -275,6 +281,11 @@ class Campaign:
         self.spread = Spread.of(usual if spread is None else spread)
         self.coast = coast if coast is not None else usual_coast or COAST
         require_whole("coast", self.coast, 0)
+        if carry is not None:
+            require_whole("carry", carry, 1, 10_000)
+            if not redesign:
+                raise ValueError("carry needs redesigned signals: others begin at rest")
+        self.carry, self._is_at_rest = carry, True
         self.redesign = redesign
         self.prior = None if prior is None else self._normal(prior, bool(rivals))
         self.discrimination: Discrimination | None = None
@@ -369,8 +380,44 @@ class Campaign:
             )
         return made.excitation
 
+    @property
+    def continues(self) -> bool:
+        """Whether the next round begins where the last one ended, and not at rest.
+
+        It must begin at the last sample of the record that was told, and the next record that is
+        told is that of both.
+        """
+        return self._past is not None
+
+    def rest(self) -> None:
+        """The plant has come to rest: the next round begins there."""
+        if not self._is_at_rest:
+            self._is_at_rest, self.next = True, None
+
+    @property
+    def longest(self) -> int:
+        """Samples of an experiment, of which a round may go on where another one ended."""
+        if self.carry is None:
+            return self.steps
+        longest = min(_PADDED, self.most_rounds) * (self.steps + self.carry)
+        return longest if self.most_samples is None else min(longest, self.most_samples)
+
+    @property
+    def _past(self) -> Past | None:
+        """What was played since rest, where the next round goes on from there."""
+        if self.carry is None or self._is_at_rest or self.is_undecided:
+            return None
+        played, room = self.records[-1].inputs[:-1], self.longest
+        if len(played) + self.carry + self.steps > room:
+            return None
+        rest = np.zeros((room - len(played), played.shape[1]))
+        inputs = jnp.asarray(np.concatenate([played, rest]))
+        return Past(inputs, jnp.asarray(len(played)), self.carry)
+
     def ask(self) -> Policy | Replay | None:
-        """What to play in the next round, from rest; None once the campaign has ended.
+        """What to play in the next round; None once the campaign has ended.
+
+        It begins at rest, unless it `continues`.
 
         That is the policy or a robust signal; after the first estimate, a signal redesigned for
         what is known, where that is better. No signal is redesigned where the plant does not
@@ -391,6 +438,9 @@ class Campaign:
             return self.discrimination.excitation
         if self.redesign and self.next is None:
             self.next = self._next()
+            if self.continues and (self.next is None or self.next.chosen is None):
+                self.rest()
+                self.next = self._next()
         chosen = None if self.next is None else self.next.chosen
         is_other = self.plant.description.hash != self.declared.description.hash
         if self.next is not None and chosen is None and is_other:
@@ -405,11 +455,12 @@ class Campaign:
             self.reason = told
             return None
         self.playing = self._opening_name if chosen is None else chosen.name
+        self.playing += ", without rest" * self.continues
         return self.opening if chosen is None else chosen.excitation
 
     def _fits(self, played: int) -> bool:
         """Whether the budget has samples for another round after so many."""
-        longest = _SHORT if self.is_undecided else self.steps
+        longest = _SHORT if self.is_undecided else self.steps + (self.carry or 0)
         return self.most_samples is None or played + longest <= self.most_samples
 
     @property
@@ -419,10 +470,11 @@ class Campaign:
 
     def _rounds_after(self, rounds: int, samples: int) -> int:
         """Rounds of full length that are left in the budget after so many."""
-        left = self.most_rounds - rounds
+        left, pause = self.most_rounds - rounds, self.carry or 0
         if self.most_samples is None:
             return left
-        return min(left, (self.most_samples - samples) // self.steps)
+        samples_left = self.most_samples - samples + pause * (rounds == 0)
+        return min(left, samples_left // (self.steps + pause))
 
     @property
     def is_undecided(self) -> bool:
@@ -445,10 +497,11 @@ class Campaign:
         return self.redesign and self.prior is not None and self.policy is not None
 
     def _candidates(self, region: Region) -> list[Candidate]:
-        """What could be played, given what is known: the opening, and a redesigned signal."""
+        """What could be played, given what is known: a redesigned signal, or from rest others."""
+        opening = None if self.continues else (self._opening_name, self.opening)
         return candidates(
-            self.plant, region, self.targets, (self._opening_name, self.opening),
-            num_steps=self.steps, coast=self.coast, seed=len(self.rounds),
+            self.plant, region, self.targets, opening,
+            num_steps=self.steps, coast=self.coast, seed=len(self.rounds), past=self._past,
         )  # fmt: skip
 
     @property
@@ -473,7 +526,9 @@ class Campaign:
                 self.steps, self.coast, len(self.rounds),
             )  # fmt: skip
         params, inputs = self.plant.Params(*now.center), jnp.asarray(coming.inputs)
-        gained = running_information(self.plant, params, inputs)[-1]
+        past = self._past
+        start = None if past is None else start_after(self.plant, params, past)
+        gained = running_information(self.plant, params, inputs, start)[-1]
         noise = float(np.nanmin(noise_factors(self.plant, self.result)))  # the intervals know it
         gained = gained / max(noise, 1e-3) ** 2
         then = Region(now.center, now.information + left * gained)
@@ -502,7 +557,8 @@ class Campaign:
         """Takes the record of a round, identifies, and decides whether another one follows.
 
         Args:
-            record: of the round, from rest, its file or its DataFrame.
+            record: of the round, from rest, its file or its DataFrame. Of one that continues,
+                that of the rounds before it, too, since rest.
             ended: why the round ended.
             unsafe: whether it ended because a level was near, or no declared plant explains it.
             goes_on: whether the next record exists already, so that reached targets end nothing.
@@ -522,12 +578,16 @@ class Campaign:
         interval, dt = float(np.median(np.diff(record.time))), float(self.plant.dt)
         if not 0.9 < interval / dt < 1.1:
             raise ValueError(f"a round is sampled every {dt:g} s: got one of {interval:g} s")
+        before = 0
+        if self._goes_on(record):
+            before = len(self.records.pop().time) - 1
         self.records.append(record)
+        self._is_at_rest = self.carry is None
         played, structure = played or self.playing or self._opening_name, ""
         others = self.discrimination is not None and any(self.discrimination.fitted_beside)
         if self.is_undecided or others:  # these are fitted to all records, too
             structure = self._compare()
-        count, status = len(record.time) - 1, structure
+        count, status = len(record.time) - 1 - before, structure
         if not self.is_undecided:
             status = self._identify()
             is_doubtful = status != Status.SUCCESSFUL.sentence or not self._is_explained()
@@ -570,6 +630,20 @@ class Campaign:
         self.next, self.playing = None, ""
         return told
 
+    def _goes_on(self, record: Record) -> bool:
+        """Whether a record is the last one, and more."""
+        if self.carry is None or not self.records:
+            return False
+        last = self.records[-1]
+        count = len(last.time)
+        return len(record.time) > count and all(
+            np.array_equal(*pair, equal_nan=True)
+            for pair in (
+                (record.outputs[:count], last.outputs),
+                (record.inputs[: count - 1], last.inputs[:-1]),
+            )
+        )
+
     def _compare(self) -> str:
         """Compares the rivals; the plant is the one that is chosen. Returns the decision."""
         if self.discrimination is None:
@@ -605,6 +679,8 @@ class Campaign:
     def _room(self, steps: int) -> tuple[int, int]:
         """Number and length of records for which programs are compiled: whole rounds of `steps`."""
         longest = max(len(record.time) for record in self.records) - 1
+        if self.carry is not None and not self.is_undecided:
+            return len(self.records), self.longest + 1 + self.plant.has_feedthrough
         count = _PADDED * math.ceil(len(self.records) / _PADDED)
         return count, steps * math.ceil(longest / steps) + 1 + self.plant.has_feedthrough
 
@@ -687,7 +763,7 @@ class Campaign:
         """A judge of the next round while it runs; see `Monitor`."""
         before, room = self.prior if self.result is None else self.result, 1 / self.haste
         return Monitor(
-            self.plant, before, self.targets, self.steps, self.coast, waits, self.spread, room
+            self.plant, before, self.targets, self.longest, self.coast, waits, self.spread, room
         )
 
     @cached_property
@@ -783,6 +859,7 @@ class Campaign:
             "most_rounds": self.most_rounds,
             **({} if self.most_samples is None else {"most_samples": self.most_samples}),
             "coast": self.coast,
+            **({} if self.carry is None else {"carry": self.carry}),
             "redesign": self.redesign,
             "prior": as_data(self._known_before(())),
             "rivals": {} if self.discrimination is None else self.discrimination.plants,

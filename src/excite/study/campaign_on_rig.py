@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import contextlib
+import copy
+import itertools
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
+
+import numpy as np
 
 from .. import __version__
 from ..description import (
@@ -25,16 +30,19 @@ from ..files import csv_text, json_ready, locked_folder, read_json, write_bytes,
 from ..plant.catalogue import PlantLike
 from ..policy import Policy, guard_of
 from ..progress import SHOWN, Progress
-from ..record import read_record
+from ..record import Record, read_record
 from ..rig.catalogue import RigOptions, rig_named
 from ..rig.contract import AbstractRig, Sample
 from ..rig.fmu import FMURig
-from ..rig.loop import interruptible
+from ..rig.loop import COMPLETE, Stop, interruptible
+from ..rig.player import Sequel
 from ..rig.session import RunResult, run
 from ..rig.simulated import SimulatedRig
 from ..safety import Trip
+from ..simulation import simulate
 from .campaign import REACHED, WHOLE, Campaign, Round
 from .discrimination import RivalLike
+from .monitor import Monitor
 from .targets import TargetLike
 
 _OWN = {"campaign.json", "run.json", ".lock"}  # files of a campaign without rounds
@@ -53,6 +61,7 @@ def campaign(
     rounds: int = 10,
     samples: int | None = None,
     coast: int | None = None,
+    carry: int | None = None,
     redesign: bool = True,
     rivals: Sequence[RivalLike] = (),
     prior: PriorLike | Sequence[PriorLike] | None = None,
@@ -70,7 +79,8 @@ def campaign(
 ) -> Campaign:
     """Plays rounds of experiments on a rig until the parameters are known as asked.
 
-    Every round begins at rest and is recorded in the folder `out`. Rerun with the same arguments
+    Every round is recorded in the folder `out`; it begins at rest, or with `carry` where the last
+    one ended, in the same record. Rerun with the same arguments
     to resume an interrupted campaign: nothing is played twice.
 
         >>> import excite as ex, tempfile
@@ -82,7 +92,8 @@ def campaign(
 
     Args:
         plant: as for `Campaign`, and so are `target`, `policy`, `steps`, `spread`, `rounds`,
-            `samples`, `coast`, `redesign`, `rivals` and `prior`.
+            `samples`, `coast`, `carry`, `redesign`, `rivals` and `prior`. In real time, a decision
+            that takes longer than `carry` samples is played from rest.
         rig: a name, `FILE.fmu`, `FILE.json`, `path/to/file.py:ClassName` or a rig, as for `run`.
         out: folder of the campaign.
         address: board identifier of the Quanser rig.
@@ -92,8 +103,9 @@ def campaign(
         filter: adds a predictive safety filter for parameters within the spread.
         guard: ends a round that no declared plant explains, as for `run`. Guard and filter know
             one plant: rounds that tell rivals apart are played without them.
-        pause: before every round but the first, so that the plant comes to rest [s]. A simulated
-            rig and an FMU begin at rest by themselves; for any other rig it must be given.
+        pause: before every round from rest but the first, so that the plant comes to rest [s]. A
+            simulated rig and an FMU begin at rest by themselves; for any other rig it must be
+            given.
         command: stored in the folder, to repeat the campaign.
         progress: called with a text, how much is done, and the total.
         on_round: called after every round.
@@ -104,9 +116,11 @@ def campaign(
             reaches, or a folder of another campaign.
         TypeError: for an argument of another type.
     """
+    if guard and carry is not None:
+        raise ValueError("a guard knows a policy, which begins at rest: it does not go with carry")
     made = Campaign(
         plant, target, policy=policy, steps=steps, spread=spread, rounds=rounds, samples=samples,
-        coast=coast,
+        coast=coast, carry=carry,
         redesign=redesign and not guard,  # a guard knows its policy
         rivals=rivals, prior=prior,
     )  # fmt: skip
@@ -168,13 +182,16 @@ def campaign(
             for sentence in made.warnings:
                 if sentence not in warned:
                     on_warning(sentence)
-            played, signals = _played(
-                made, asked, opened(count), folder.path(count), filter, guard,
+            if carry is not None and opened(count).is_real_time and not made.is_undecided:
+                _rehearse(made)
+            experiment = _Experiment(made, folder, on_round)
+            played, signals = experiment.play(
+                asked, opened(count), filter, guard,
                 lambda count=count: progress(f"round {count + 1}", count, rounds),
             )  # fmt: skip
-            outcome, warned = played.outcome, made.warnings
-            if _has_samples(folder.path(count)):
-                on_round(made.tell(played.record, outcome.reason, outcome.trip in _UNSAFE))
+            outcome = played.outcome
+            if experiment.is_late:
+                on_warning(f"a decision took longer than {carry} samples: give more (--carry)")
             for sentence in made.warnings:
                 if sentence not in warned:
                     on_warning(sentence)
@@ -182,6 +199,7 @@ def campaign(
                 made.interrupted = outcome.reason
             elif signals and not made.reason:
                 made.interrupted = signals[0]
+            made.rest()
             folder.write(made)
             folder.save_round(made)
     progress("done", rounds, rounds)
@@ -197,41 +215,132 @@ def _paused(seconds: float) -> str:
     return stop.reason
 
 
-def _played(
-    made: Campaign,
-    asked: Policy | Replay,
-    rig: AbstractRig,
-    path: Path,
-    filter: bool,
-    guard: bool,
-    on_begin: Callable[[], None],
-) -> tuple[RunResult, list[str]]:
-    """One round on a rig, which ends as soon as enough is known, and signals that came."""
-    is_decided = not made.is_undecided
-    monitor = made.monitor(waits=not rig.is_real_time) if is_decided else None
-    on_begin()
-    with interruptible() as stop:
+def _rehearse(made: Campaign) -> None:
+    """Decides about a simulated round, so that no decision waits for a compilation."""
+    own = copy.copy(made)
+    own.records, own.rounds = list(made.records), list(made.rounds)
+    params = None if own.result is None else dict(own.result.params)
+    with contextlib.suppress(ValueError):
+        own.tell(simulate(own.plant, own.opening, params=params, seed=0))
+        own.reason = ""
+        own.ask()
 
-        def judge(sample: Sample) -> None:
-            if monitor is not None and monitor(sample):
-                stop.ask(REACHED)
 
-        try:
-            played = run(
-                rig, asked if isinstance(asked, Policy) else None, plant=made.plant,
-                excitation=asked if isinstance(asked, Replay) else None,
-                steps=len(asked.inputs) if isinstance(asked, Replay) else None,
-                out=path, overwrite=path.exists(),
-                filter=filter and is_decided, guard=guard and is_decided, spread=made.spread,
-                on_sample=judge,
-                stop=stop, live_estimate=False,
-            )  # fmt: skip
-        finally:
-            with contextlib.suppress(Exception):  # the record is complete
-                if monitor is not None:
-                    monitor.close()
-    signals = [reason for reason in stop.asked if reason != REACHED]
-    return cast("RunResult", played), signals  # without dry_run
+def _length(asked: Policy | Replay) -> int:
+    return asked.layout.num_steps if isinstance(asked, Policy) else len(asked.inputs)
+
+
+class _Experiment:
+    """One or more rounds on a rig: all but the first go on where the last one ended.
+
+    Attributes:
+        is_late: whether it ended because a decision came too late.
+    """
+
+    def __init__(self, made: Campaign, folder: _Folder, on_round: Callable[[Round], None]) -> None:
+        self._made, self._folder, self._on_round = made, folder, on_round
+        self._path, self._first = folder.path(len(made.rounds)), len(made.rounds)
+        self._stop, self._pool = Stop(), ThreadPoolExecutor(1)
+        self._monitor: Monitor | None = None
+        self._sequel: Sequel | None = None
+        self._waits, self._end, self._ended = True, 0, COMPLETE
+        self._decision: Future[np.ndarray | None] | None = None
+        self.is_late = False
+
+    def play(
+        self,
+        asked: Policy | Replay,
+        rig: AbstractRig,
+        filter: bool,
+        guard: bool,
+        on_begin: Callable[[], None],
+    ) -> tuple[RunResult, list[str]]:
+        """Plays the rounds, each until enough is known, and tells the campaign of them.
+
+        Returns:
+            How the experiment ended, and signals that came.
+        """
+        made, path = self._made, self._path
+        is_decided, self._waits = not made.is_undecided, not rig.is_real_time
+        self._monitor = made.monitor(self._waits) if is_decided else None
+        if made.carry is not None and is_decided:
+            self._sequel, self._end = Sequel(made.longest), _length(asked)
+        on_begin()
+        with interruptible() as self._stop:
+            try:
+                played = run(
+                    rig, asked if isinstance(asked, Policy) else None, plant=made.plant,
+                    excitation=asked if isinstance(asked, Replay) else None,
+                    steps=len(asked.inputs) if isinstance(asked, Replay) else None,
+                    out=path, overwrite=path.exists(),
+                    filter=filter and is_decided, guard=guard and is_decided, spread=made.spread,
+                    on_sample=self._judge, stop=self._stop, sequel=self._sequel,
+                    live_estimate=False,
+                )  # fmt: skip
+            finally:
+                with contextlib.suppress(Exception):  # the record is complete
+                    if self._monitor is not None:
+                        self._monitor.close()
+                self._pool.shutdown()  # a decision that came too late is told all the same
+        outcome = cast("RunResult", played).outcome  # without dry_run
+        if self._decision is not None and outcome.error is None:
+            self._decision.result()  # raises its error
+        is_unsafe = outcome.trip in _UNSAFE
+        if _has_samples(path) and not made.reason:
+            record = read_record(path, made.declared.description)
+            if is_unsafe or self._is_new(record):
+                self._on_round(made.tell(record, outcome.reason, is_unsafe))
+        signals = [s for s in self._stop.asked if s not in WHOLE]
+        return cast("RunResult", played), signals
+
+    def _is_new(self, record: Record) -> bool:
+        """Whether a record has more than the rounds that were told, and the pause after them."""
+        told = sum(r.num_samples for r in self._made.rounds[self._first :])
+        return not told or len(record.time) - 1 > told + (self._made.carry or 0)
+
+    def _judge(self, sample: Sample) -> None:
+        """Takes a sample, with which a round may end, or the next one be decided."""
+        is_enough = self._monitor is not None and self._monitor(sample)
+        if self._sequel is None:
+            if is_enough:
+                self._stop.ask(REACHED)
+            return
+        if self._decision is None and sample.k < self._end and is_enough:
+            self._end, self._ended = sample.k + 1, REACHED
+            self._sequel.end(sample.k + 1)
+        elif self._decision is None and sample.k == self._end:
+            self._decision = self._pool.submit(self._decide, sample.k, self._ended)
+            self._pool.submit(self._folder.save_round, self._made)
+        if self._decision is not None:
+            self._go_on(self._sequel, self._decision, sample.k)
+
+    def _go_on(self, sequel: Sequel, decision: Future[np.ndarray | None], k: int) -> None:
+        """Plays what was decided once the pause is over; without a decision the experiment ends."""
+        begin = self._end + cast("int", self._made.carry)
+        is_last = k + 1 == begin
+        if self._waits or decision.done():
+            inputs = decision.result()
+            if inputs is None:
+                self._stop.ask(REACHED if self._made.reason == REACHED else COMPLETE)
+            elif is_last:
+                sequel.begin(begin, inputs)
+                self._end, self._ended, self._decision = begin + len(inputs), COMPLETE, None
+        elif is_last:
+            self.is_late = True
+            self._stop.ask(COMPLETE)
+
+    def _decide(self, count: int, ended: str) -> np.ndarray | None:
+        """Tells of the round that ended after so many samples; the signal that goes on, if any."""
+        made = self._made
+        record = read_record(self._path, made.declared.description, rows=slice(count + 1))
+        self._on_round(made.tell(record, ended))
+        if self._monitor is not None:
+            self._monitor.enough = 1 / made.haste
+        asked = made.ask()
+        self._folder.write(made)
+        if not (made.continues and isinstance(asked, Replay)):
+            return None
+        return np.asarray(asked.inputs)[made.carry :]
 
 
 def _names_in(folder: Path) -> set[str]:
@@ -300,8 +409,22 @@ class _Folder:
 
     def save_round(self, made: Campaign) -> None:
         """The run folder of what the rounds so far tell together."""
-        if made.result is not None and len(made.result.fitted) == len(made.rounds):
+        if made.result is not None and len(made.result.fitted) == len(made.records):
             made.result.save(self.path(len(made.rounds) - 1).with_suffix(""), overwrite=True)
+
+    def _ends(
+        self, first: int, total: int, before: Sequence[Mapping[str, Any]], carry: int | None
+    ) -> list[int]:
+        """Samples in a record after which its rounds ended: the first one, and those that went on.
+
+        What follows the last of them is a round, too, unless it is but the pause after it.
+        """
+        if carry is None:
+            return [total]
+        later = (i for i in range(first + 1, len(before)) if self.path(i).exists())
+        counts = [int(r["num_samples"]) for r in before[first : next(later, len(before))]]
+        ends = list(itertools.accumulate(counts))
+        return ends if ends and total <= ends[-1] + carry else [*ends, total]
 
     def resume(
         self,
@@ -311,27 +434,38 @@ class _Folder:
     ) -> None:
         """Takes the rounds that were played before; one that was hardly begun is played again."""
         names: list[str] = []
+        before: list[dict[str, Any]] = []
         is_same = True
         if self.has_rounds:
-            before = read_json(self.root / "campaign.json", "expected", "rounds", "targets")
-            is_same = before["targets"] == made.to_dict()["targets"]
+            kept = read_json(self.root / "campaign.json", "expected", "rounds", "targets")
+            before = kept["rounds"]
+            is_same = kept["targets"] == made.to_dict()["targets"]
             if not is_same:
-                asked = ", ".join(f"{name} to {to}" for name, to in before["targets"].items())
+                asked = ", ".join(f"{name} to {to}" for name, to in kept["targets"].items())
                 on_warning(
                     f"the rounds so far were played for other targets ({asked}); the tables "
                     "compare them with the new ones"
                 )
-            made.prediction = str(before["expected"]) if is_same else ""
-            names = [*(str(r["played"]) for r in before["rounds"]), str(before.get("playing", ""))]
+            made.prediction = str(kept["expected"]) if is_same else ""
+            names = [*(str(r["played"]) for r in before), str(kept.get("playing", ""))]
         while _has_samples(path := self.path(len(made.rounds))):
-            record = read_record(path, made.declared.description)
-            ended = record.metadata.get("ended") or {"reason": "interrupted", "trip": "none"}
-            trip = Trip[str(ended["trip"]).upper()]
-            count = len(made.rounds)
-            goes_on, name = _has_samples(self.path(count + 1)), "".join(names[count : count + 1])
-            on_round(made.tell(record, str(ended["reason"]), trip in _UNSAFE, goes_on, name))
-            if not self.path(count).with_suffix("").is_dir():  # killed before it was written
-                self.save_round(made)
-            if not is_same:  # rounds that ended at other targets did not end too early
-                made.haste = 1.0
+            record, first = read_record(path, made.declared.description), len(made.rounds)
+            outcome = record.metadata.get("ended") or {"reason": "interrupted", "trip": "none"}
+            ends = self._ends(first, len(record.time) - 1, before, made.carry)
+            for end in ends:
+                count = len(made.rounds)
+                is_last = end == len(record.time) - 1
+                part = record
+                if not is_last:
+                    part = read_record(path, made.declared.description, rows=slice(end + 1))
+                told = before[count]["ended"] if count < len(before) else outcome["reason"]
+                unsafe = is_last and Trip[str(outcome["trip"]).upper()] in _UNSAFE
+                goes_on = end != ends[-1] or _has_samples(self.path(count + 1))
+                name = "".join(names[count : count + 1])
+                on_round(made.tell(part, str(told), unsafe, goes_on, name))
+                if not self.path(count).with_suffix("").is_dir():  # killed before it was written
+                    self.save_round(made)
+                if not is_same:  # rounds that ended at other targets did not end too early
+                    made.haste = 1.0
+        made.rest()
         self.write(made)

@@ -32,6 +32,9 @@ class Monitor:
     """Judges a round while it runs: whether it can end, because enough is known.
 
     Call it with every sample, in a loop of your own or as `on_sample` of `ex.run`.
+
+    Attributes:
+        enough: largest share of the allowed intervals that ends the round.
     """
 
     def __init__(
@@ -61,7 +64,7 @@ class Monitor:
         start, prior = plant.nominal, None
         if before is not None:
             _, prior, start = with_prior(plant, before, start, {}, {})
-        self._plant, self._targets, self._share = plant, targets, enough
+        self._plant, self._targets, self.enough = plant, targets, enough
         self._others = others_of(plant, targets)
         self._is_later, self._num_outputs = before is not None, len(plant.definition.outputs)
         own = NLS(prior=prior)
@@ -92,7 +95,7 @@ class Monitor:
         larger, so that a later round leaves room for one standard error of it.
         """
         room = 1 / math.sqrt(2 * count * self._num_outputs) if self._is_later else 0.0
-        return self._share * (1 - room)
+        return self.enough * (1 - room)
 
     def _known(self, estimate: Estimate) -> dict[str, Interval]:
         """What is known of every parameter and target.

@@ -27,18 +27,19 @@ from ..description import (
 from ..environment.falsification import nearness
 from ..estimation.prior_knowledge import PriorLike
 from ..excitation import AbstractExcitation, Coast, PolicyExcitation, Replay
-from ..information import running_information
-from ..plant import AbstractPlant
+from ..information import Past, running_information, start_after
+from ..plant import AbstractPlant, Params
 from ..plant.catalogue import PlantLike
 from ..policy import Policy, mismatch, read_policy
 from ..progress import SHOWN, Progress
 from ..record import Record, require_record_path, write_record
 from ..report.tables import html_table, text_table
 from ..rig.contract import Interval, as_data
+from ..safety import safe_input
 from ..simulation import response, run_episode
 from ..training.design import designed_record
 from ..training.redesign import JUDGES, Region, first_signals, redesigned
-from .knowledge import KnownLike, intervals_in, known_from
+from .knowledge import Knowledge, KnownLike, intervals_in, known_from
 from .quantities import (
     AbstractQuantity,
     estimates,
@@ -129,6 +130,7 @@ def candidates(
     coast: int,
     ahead: int = 1,
     seed: int = 0,
+    past: Past | None = None,
 ) -> list[Candidate]:
     """What could be played next: a given excitation, and a signal redesigned for the region.
 
@@ -136,11 +138,12 @@ def candidates(
         plant: with the sensor of the experiment.
         region: plants that are possible.
         targets: by parameter.
-        opening: name of a policy or a signal, and itself; None for none.
-        num_steps: of the experiment.
+        opening: name of a policy or a signal from rest, and itself; None for none.
+        num_steps: of the experiment, without its pause.
         coast: samples of free motion after it that must be safe too.
         ahead: experiments for which the redesign looks ahead; the first of them is the candidate.
         seed: of its starts, and of the noise.
+        past: what was played before the redesigned signal; None for a signal from rest.
     """
     found, starts = [], first_signals(plant, ahead, num_steps, seed)
     if opening is not None:
@@ -149,9 +152,13 @@ def candidates(
         inputs = jnp.asarray(np.resize(found[0].inputs, (num_steps, found[0].inputs.shape[1])))
         starts = jnp.concatenate([starts, jnp.broadcast_to(inputs, (1, *starts.shape[1:]))])
     asked = over_targets(plant, plant.Params(*region.center), targets)
-    made = redesigned(plant, region, jnp.asarray(asked), starts, coast)
-    replay = Replay(made.inputs[0])
-    redesign = candidate(plant, region, targets, REDESIGNED, replay, num_steps, coast, seed)
+    made = redesigned(plant, region, jnp.asarray(asked), starts, coast, past=past)
+    pause = 0 if past is None else past.pause
+    before = jnp.tile(jnp.asarray(safe_input(plant.definition)), (pause, 1))
+    replay = Replay(jnp.concatenate([before, made.inputs[0]]))
+    redesign = candidate(
+        plant, region, targets, REDESIGNED, replay, pause + num_steps, coast, seed, past
+    )
     is_found = bool(jnp.isfinite(made.shares).any())
     return [*found, redesign if is_found else replace(redesign, nearness=np.inf)]
 
@@ -165,13 +172,17 @@ def candidate(
     num_steps: int,
     coast: int,
     seed: int,
+    past: Past | None = None,
 ) -> Candidate:
-    """What an excitation would bring, in this many samples or as many as it has."""
+    """What an excitation would bring, in this many samples or as many as it has.
+
+    It begins at rest, or as a signal where another experiment has come to.
+    """
     own = PolicyExcitation.of(given) if isinstance(given, Policy) else given
     length = given.layout.num_steps if isinstance(given, Policy) else len(given.inputs)
     key = jax.random.key(seed)
     quantities = quantities_of(plant, targets)
-    outlook = _outlook(plant, region, own, min(num_steps, length), coast, key, quantities)
+    outlook = _outlook(plant, region, own, min(num_steps, length), coast, key, quantities, past)
     inputs, values, halves, size = map(np.asarray, outlook)
     after = {
         q.name: Interval(float(value), float(half))
@@ -193,6 +204,7 @@ def _outlook(
     coast: int,
     key: Array,
     quantities: Sequence[AbstractQuantity],
+    past: Past | None,
 ) -> tuple[
     Float[Array, "time input"],
     Float[Array, " quantity"],
@@ -203,10 +215,18 @@ def _outlook(
     whole, length = Coast.after(excitation, num_steps, coast)
     plants = region.plants(plant, JUDGES)
     keys = jax.random.split(key, JUDGES + 1)
-    runs = jax.vmap(lambda own, key: run_episode(plant, own, whole, length, key))(plants, keys)
-    inputs, params = runs.inputs[0, :num_steps], plant.Params(*region.center)
-    information = region.information[None] + running_information(plant, params, inputs)
-    sizes = jax.vmap(lambda outputs: nearness(plant, outputs))(runs.outputs)
+
+    def run(own: Params, key: Array) -> tuple[Array, Array]:
+        state = plant.initial_state if past is None else start_after(plant, own, past).state
+        there = eqx.tree_at(lambda at_rest: at_rest.initial_state, plant, state)
+        episode = run_episode(there, own, whole, length, key)
+        return episode.inputs, episode.outputs
+
+    played, outputs = jax.vmap(run)(plants, keys)
+    inputs, params = played[0, :num_steps], plant.Params(*region.center)
+    start = None if past is None else start_after(plant, params, past)
+    information = region.information[None] + running_information(plant, params, inputs, start)
+    sizes = jax.vmap(lambda own: nearness(plant, own))(outputs)
     values, _ = slopes(quantities, plant, params)
     halves = half_intervals(quantities, plant, params, information)
     return inputs, values, halves, jnp.max(sizes)
@@ -226,6 +246,7 @@ class NextExperiment:
         warnings: sentences, where the plant does not explain the records.
         nearness: largest output over its critical level on the possible plants, where the inputs
             of the chosen one are played as a signal: of a policy, without its reactions.
+        past: what was played before, where it goes on from the last record; None from rest.
     """
 
     plant: AbstractPlant
@@ -235,6 +256,7 @@ class NextExperiment:
     chosen: Candidate | None
     warnings: tuple[str, ...] = ()
     nearness: float = 0.0
+    past: Past | None = None
 
     @property
     def decision(self) -> str:
@@ -264,12 +286,16 @@ class NextExperiment:
         params = estimates(self.known, self.plant)
         inputs = jnp.asarray(self.chosen.inputs)
         about = {"design": "next experiment", "candidate": self.chosen.name}
-        return designed_record(self.plant, inputs, response(self.plant, params, inputs), about)
+        state = None if self.past is None else start_after(self.plant, params, self.past).state
+        outputs = response(self.plant, params, inputs, state)
+        return designed_record(self.plant, inputs, outputs, about, self.past is None)
 
     def save(self, path: str | Path, overwrite: bool = False) -> None:
         """Writes the inputs to be played (.csv, .mat); `excite run --input` plays the file.
 
-        Of a policy these are the inputs on the estimated plant; played as a policy, it reacts.
+        A signal that goes on from a record is for a loop of your own, and not for `excite run`,
+        which begins at rest. Of a policy these are the inputs on the estimated plant; played as a
+        policy, it reacts.
 
         Raises:
             ValueError: for another ending, a file that exists, unless `overwrite`, where no
@@ -374,13 +400,14 @@ def next_experiment(
     spread: SpreadLike = "factor:3",
     steps: int | None = None,
     ahead: int = 1,
+    carry: int | None = None,
     coast: int = COAST,
     seed: int = 0,
     out: str | Path | None = None,
     overwrite: bool = False,
     progress: Progress = SHOWN,
 ) -> NextExperiment:
-    """Which experiment to make next, from rest, and what it will bring.
+    """Which experiment to make next, and what it will bring.
 
     A signal is redesigned for the plants that the records leave possible, and compared with a
     policy where one is given. The one that reaches every target first is chosen, of those that
@@ -404,6 +431,9 @@ def next_experiment(
         spread: of the parameters before the records.
         steps: samples of the experiment; default those of the policy, or 200.
         ahead: experiments of this length for which the redesign looks ahead.
+        carry: samples of the safe input after the end of the last record, while you decide. The
+            signal begins with them, in the state that is predicted there. Default is rest. Not
+            with a policy, and not with `ahead`.
         coast: samples after the experiment in which the plant must be safe too.
         seed: of the redesign's starts, and of the noise.
         out: file of the inputs (.csv, .mat); `excite run --input` plays it.
@@ -420,6 +450,11 @@ def next_experiment(
     require_whole("seed", seed, 0, LARGEST_SEED)
     if steps is not None:
         require_whole("steps", steps, 2)
+    if carry is not None:
+        require_whole("carry", carry, 1, 10_000)
+        if policy is not None or ahead > 1:
+            other = "policy" if policy is not None else "ahead"
+            raise ValueError(f"{other} is for experiments from rest: it does not go with carry")
     if out is not None:
         require_record_path(Path(out), overwrite)
     found = (
@@ -441,10 +476,12 @@ def next_experiment(
         require_defined(quantity, own, own.Params(*region.center))
     now = given.of(others_of(own, targets))
     length = steps or (played[1].layout.num_steps if played else 200)
+    past = None if carry is None else _past(given, carry)
     progress("redesigning", 1, 2)
     made = candidates(
-        own, region, targets, played, num_steps=length, coast=coast, ahead=ahead, seed=seed
-    )
+        own, region, targets, played,
+        num_steps=length, coast=coast, ahead=ahead, seed=seed, past=past,
+    )  # fmt: skip
     progress("done", 2, 2)
     best = best_of(made, targets)
     nearness = 0.0 if best is None else best.nearness
@@ -452,7 +489,26 @@ def next_experiment(
         replay = Replay(jnp.asarray(best.inputs))
         as_signal = candidate(own, region, targets, best.name, replay, length, coast, seed)
         nearness = as_signal.nearness
-    result = NextExperiment(own, now, targets, tuple(made), best, given.warnings, nearness)
+    result = NextExperiment(own, now, targets, tuple(made), best, given.warnings, nearness, past)
     if out is not None:
         result.save(out, overwrite)
     return result
+
+
+def _past(given: Knowledge, carry: int) -> Past:
+    """What was played in the last record; ValueError where its state cannot be predicted."""
+    if given.result is None:
+        raise ValueError("carry goes on from a record: give it as the last one, and not its run")
+    if given.plant.delay(given.plant.nominal) is not None:
+        raise ValueError("carry is for plants without input delay")
+    record, dt = given.result.fitted[-1].record, float(given.plant.dt)
+    where = record.source or "the last record"
+    if not record.starts_at_initial_state:
+        raise ValueError(
+            f"{where} does not say that it begins at rest (starts_at_initial_state): from "
+            "another record the state after its end is not predicted"
+        )
+    if not np.allclose(np.diff(record.time), dt, rtol=0.1, atol=0.0):
+        raise ValueError(f"{where} is not sampled every {dt:g} s throughout, as carry needs it")
+    played = jnp.asarray(record.inputs[:-1])
+    return Past(played, jnp.asarray(len(played)), carry)

@@ -305,18 +305,20 @@ def designed_record(
     inputs: Float[Array, "time input"],
     outputs: Float[Array, "sample output"],
     found: Mapping[str, object],
+    from_rest: bool = True,
 ) -> Record:
     """A designed input with a noise-free response, as it is written to a file.
 
     Args:
         plant: whose sampling time holds.
         inputs: in their units.
-        outputs: of the response, from rest.
+        outputs: of the response.
         found: how the input was found, JSON-ready.
+        from_rest: whether that begins at rest.
     """
     time = np.arange(len(outputs)) * float(plant.dt)
     origin = {
-        "starts_at_initial_state": True,
+        "starts_at_initial_state": from_rest,
         "provenance": {"excite": __version__, "simulated": True, **found},
     }
     return Record.of_episode(time, np.asarray(inputs), np.asarray(outputs), origin)

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, PyTree
 from scipy.stats import chi2
 
 from ..environment.falsification import nearness
-from ..information import experiment_information
+from ..information import Past, Start, experiment_information, start_after
 from ..plant import AbstractPlant, Params
 from ..safety import safe_input
 from ..simulation import response
@@ -113,8 +113,11 @@ def redesigned(
     starts: Float[Array, "start round time input"],
     coast: int,
     settings: GradientSettings = SEARCH,
+    past: Past | None = None,
 ) -> Redesigned:
-    """Signals of the coming rounds, each from rest, that bring the parameters to their goals.
+    """Signals of the coming rounds that bring the parameters to their goals.
+
+    Each round begins at rest, or the only one where another experiment has come to.
 
     The criterion is A-optimality in units of the goals: the logarithm of the root of the summed
     squares of standard deviation over goal, on average over the plants of the region
@@ -128,36 +131,54 @@ def redesigned(
         starts: of the search, side by side.
         coast: samples after a round's end in which it must be safe too.
         settings: of the search by Adam, and of its penalty of outputs near a level.
+        past: what was played before the one round, in whose pause this signal is decided; None
+            for rounds from rest.
     """
-    rest = jnp.tile(jnp.asarray(safe_input(plant.definition)), (coast, 1))
-    points, judges = region.plants(plant, POINTS), region.plants(plant, JUDGES)
+    safe, pause = jnp.asarray(safe_input(plant.definition)), 0 if past is None else past.pause
+    before, rest = jnp.tile(safe, (pause, 1)), jnp.tile(safe, (coast, 1))
 
-    def uncertainty(params: Params, inputs: Float[Array, "round time input"]) -> Array:
-        gained = jax.vmap(lambda own: experiment_information(plant, params, own))(inputs)
+    def begun(params: Params) -> Start | None:
+        return None if past is None else start_after(plant, params, past)
+
+    points, judges = (
+        (found, jax.vmap(begun)(found))
+        for found in (region.plants(plant, POINTS), region.plants(plant, JUDGES))
+    )
+
+    def uncertainty(
+        params: Params, start: Start | None, inputs: Float[Array, "round time input"]
+    ) -> Array:
+        def information(own: Float[Array, "time input"]) -> Array:
+            whole = jnp.concatenate([before, own])
+            return experiment_information(plant, params, whole, start=start)
+
+        gained = jax.vmap(information)(inputs)
         covariance = jnp.linalg.inv(region.information + jnp.sum(gained, axis=0))
         return 0.5 * jnp.log(jnp.einsum("gi,ij,gj->", asked, covariance, asked))
 
-    def outputs(params: Params, own: Float[Array, "time input"]) -> Array:
-        return response(plant, params, jnp.concatenate([own, rest]))
+    def outputs(params: Params, start: Start | None, own: Float[Array, "time input"]) -> Array:
+        state = None if start is None else start.state
+        return response(plant, params, jnp.concatenate([before, own, rest]), state)
 
-    def beyond(params: Params, own: Float[Array, "time input"]) -> Array:
-        return mean_excess(plant, outputs(params, own), settings.margin)
+    def beyond(params: Params, start: Start | None, own: Float[Array, "time input"]) -> Array:
+        return mean_excess(plant, outputs(params, start, own), settings.margin)
 
     def loss(inputs: Float[Array, "round time input"], _: None) -> tuple[Array, None]:
-        unknown = jax.vmap(uncertainty, (0, None))(points, inputs)
-        over = jax.vmap(jax.vmap(beyond, (None, 0)), (0, None))(points, inputs)
+        unknown = jax.vmap(uncertainty, (0, 0, None))(*points, inputs)
+        over = jax.vmap(jax.vmap(beyond, (None, None, 0)), (0, 0, None))(*points, inputs)
         return jnp.mean(unknown) + settings.penalty_weight * jnp.mean(over), None
 
     def largest(inputs: Array) -> Array:
         def of(own: Array) -> Array:
-            return jax.vmap(lambda params: nearness(plant, outputs(params, own)))(judges)
+            played = jax.vmap(outputs, (0, 0, None))(*judges, own)
+            return jax.vmap(lambda outputs: nearness(plant, outputs))(played)
 
         return jnp.max(jax.vmap(of)(inputs))
 
     def from_start(start: Array) -> tuple[Array, Array, Array]:
         found = searched(plant, loss, start, None, settings)
         inputs, size = loudest_safe(plant, largest, found)
-        unknown = jnp.mean(jax.vmap(uncertainty, (0, None))(points, inputs))
+        unknown = jnp.mean(jax.vmap(uncertainty, (0, 0, None))(*points, inputs))
         return inputs, jnp.where(size < SAFE, jnp.exp(unknown), jnp.inf), size
 
     inputs, shares, sizes = jax.vmap(from_start)(starts)

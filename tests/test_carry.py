@@ -1,0 +1,293 @@
+"""Experiments that go on where another one ended: their state, signals, players and campaigns."""
+
+import json
+import shutil
+import time
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from commands import excite
+
+import excite as ex
+from excite.environment.falsification import nearness
+from excite.excitation import Replay
+from excite.information import Past, experiment_information, running_information, start_after
+from excite.plant import Aero2
+from excite.plant.extension import extended
+from excite.record import Record
+from excite.rig.player import Sequel, SequelPlayer, SignalPlayer
+from excite.simulation import response
+from excite.study.campaign import REACHED, Campaign
+from excite.study.next_experiment import next_experiment
+
+PLANT = Aero2()
+TRUE = {"J_p": 0.025, "K_pu": 0.0110, "D_p": 0.0011}
+SQUARE = 8.0 * np.sign(np.sin(np.arange(30) + 0.5))[:, None]
+
+
+def past(pause: int = 5) -> Past:
+    """After 30 samples, with room for more, which must not count."""
+    room = np.concatenate([SQUARE, np.full((12, 1), 9.0)])
+    return Past(jnp.asarray(room), jnp.asarray(30), pause)
+
+
+# ------------------------------------------------------------------------- state and information
+
+
+def test_the_state_after_an_experiment_is_that_of_its_simulation():
+    params = PLANT.Params(**TRUE)
+    start = start_after(PLANT, params, past())
+    whole = response(PLANT, params, jnp.asarray(np.concatenate([SQUARE, np.zeros((40, 1))])))
+    on = response(PLANT, params, jnp.zeros((40, 1)), start.state)
+    np.testing.assert_allclose(on, whole[30:], rtol=0, atol=1e-13)
+    for i, name in enumerate(TRUE):
+        moved = [
+            start_after(PLANT, PLANT.Params(**{**TRUE, name: TRUE[name] * (1 + h)}), past()).state
+            for h in (1e-6, -1e-6)
+        ]
+        slope = (moved[0] - moved[1]) / 2e-6
+        np.testing.assert_allclose(start.slope[:, i], slope, rtol=1e-6, atol=1e-9)
+
+
+def test_the_information_of_two_parts_is_that_of_the_whole_experiment():
+    params, later = PLANT.Params(**TRUE), jnp.asarray(-SQUARE[:17])
+    first, start = jnp.asarray(SQUARE), start_after(PLANT, params, past())
+    whole = running_information(PLANT, params, jnp.concatenate([first, later]))
+    gained = running_information(PLANT, params, later, start)
+    np.testing.assert_allclose(whole[29][None] + gained, whole[30:], rtol=1e-9)
+    other = experiment_information(PLANT, params, later, start=start)
+    np.testing.assert_allclose(other, gained[-1], rtol=1e-9)
+
+
+@pytest.fixture(scope="module")
+def known() -> Record:
+    return ex.simulate("aero2", "chirp", steps=60, params=TRUE, seed=1)
+
+
+@pytest.mark.science  # compiles the redesign
+def test_a_signal_that_goes_on_is_safe_and_predicted_as_the_whole_experiment(known):
+    found = next_experiment(known, target={"D_p": "0.2%"}, steps=30, carry=8, coast=20)
+    (made,) = found.candidates
+    assert found.chosen is made
+    assert len(made.inputs) == 38
+    assert not made.inputs[:8].any()
+    assert np.ptp(made.inputs[8:]) > 1
+    params = PLANT.Params(*(found.known[name].estimate for name in TRUE))
+    whole = jnp.concatenate([known.inputs[:-1], made.inputs, np.zeros((20, 1))])
+    outputs = response(PLANT, params, whole)
+    assert nearness(PLANT, outputs[60:]) <= made.nearness < 0.99
+    np.testing.assert_allclose(found.record.outputs, outputs[60:99], atol=1e-9)
+    assert found.record.metadata["starts_at_initial_state"] is False
+    from_rest = nearness(PLANT, response(PLANT, params, whole[60:]))
+    assert abs(from_rest - nearness(PLANT, outputs[60:])) > 0.01  # the state counts
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"carry": 0}, "carry must be a whole number from 1 to 10000: got 0"),
+        ({"carry": 5, "ahead": 2}, "ahead is for experiments from rest: it does not go with carry"),
+        ({"carry": 5, "policy": "aero2"}, "policy is for experiments from rest"),
+    ],
+)
+def test_what_does_not_go_on_is_one_sentence(known, options, words):
+    with pytest.raises(ValueError, match=words):
+        next_experiment(known, **options)
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"metadata": {}}, "does not say that it begins at rest"),
+        ({"plant": extended(PLANT, ["delay"])}, "carry is for plants without input delay"),
+        ({"time": np.cumsum([0.0, *[0.1] * 30, 0.3, *[0.1] * 29])}, "is not sampled every 0.1 s"),
+    ],
+)
+def test_a_record_whose_end_is_not_predicted_is_one_sentence(known, changed, words):
+    plant = changed.pop("plant", "aero2")
+    record = Record(**{**vars(known), **changed})
+    with pytest.raises(ValueError, match=words):
+        next_experiment(record, plant, {"D_p": "2%"}, carry=5)
+
+
+def test_a_signal_that_goes_on_is_not_played_from_rest(tmp_path, known):
+    about = {**known.metadata, "starts_at_initial_state": False, "provenance": {"design": "next"}}
+    Record(**{**vars(known), "metadata": about}).save(tmp_path / "next.csv")
+    file, out = tmp_path / "next.csv", tmp_path / "out.csv"
+    done = excite("run", "--plant", "aero2", "--input", file, "--fast", "--out", out)
+    assert done.returncode == 2
+    assert "goes on from the end of a record (--carry): it is not safe from rest" in done.stderr
+    assert not (tmp_path / "out.csv").exists()
+
+
+# ------------------------------------------------------------------------------------ players
+
+
+def test_after_a_player_signals_are_played_and_the_safe_input_between():
+    def played(sequel: Sequel, count: int) -> list[float]:
+        player = SequelPlayer(SignalPlayer(np.full((4, 1), 1.0)), sequel, np.array([9.0]))
+        assert player.num_steps == 20
+        return [float(player(k, np.zeros(1))[0]) for k in range(count)]
+
+    whole, cut, followed = Sequel(20), Sequel(20), Sequel(20)
+    assert played(whole, 6) == [1, 1, 1, 1, 9, 9]
+    cut.end(2)
+    assert played(cut, 4) == [1, 1, 9, 9]
+    followed.end(2)
+    followed.begin(5, np.array([[3.0], [4.0]]))
+    assert played(followed, 9)[4:] == [9, 3, 4, 9, 9]
+    followed.end(6)
+    assert played(followed, 9)[4:] == [9, 3, 9, 9, 9]
+
+
+# ---------------------------------------------------------------------------------- campaigns
+
+
+def carried(**options) -> Campaign:
+    """A campaign without a policy; its robust signal takes a minute, and is another one here."""
+    usual = {"policy": "none", "steps": 60, "coast": 20, "rounds": 4, "carry": 8}
+    campaign = Campaign("aero2", {"D_p": "0.5%"}, **{**usual, **options})
+    campaign.opening = Replay(jnp.asarray(SQUARE))
+    return campaign
+
+
+def asked_of(campaign: Campaign) -> np.ndarray:
+    """The signal that is to be played next."""
+    asked = campaign.ask()
+    assert isinstance(asked, Replay)
+    return np.asarray(asked.inputs)
+
+
+def measured(inputs: np.ndarray) -> Record:
+    """From rest, with the same noise at the same sample."""
+    y = np.asarray(response(PLANT, PLANT.Params(**TRUE), jnp.asarray(inputs)))
+    y = y + 2e-4 * np.random.default_rng(0).normal(size=(500, 1))[: len(y)]
+    return Record(0.1 * np.arange(len(y)), np.concatenate([inputs, np.zeros((1, 1))]), y)
+
+
+@pytest.mark.science  # compiles the redesign
+def test_a_later_round_goes_on_where_the_last_one_ended():
+    campaign = carried()
+    assert not campaign.continues
+    inputs = asked_of(campaign)
+    first = campaign.tell(measured(inputs))
+    asked = asked_of(campaign)
+    assert campaign.continues
+    assert campaign.playing == "redesigned, without rest"
+    assert asked.shape == (68, 1)
+    assert not asked[:8].any()
+    inputs = np.concatenate([inputs, asked])
+    second = campaign.tell(measured(inputs))
+    assert (first.num_samples, second.num_samples, campaign.num_samples) == (30, 68, 98)
+    assert [len(r.time) for r in campaign.records] == [99]
+    assert first.nearness < 1
+    assert second.nearness < 1
+    assert campaign.reason == REACHED
+    assert abs(campaign.known["D_p"].estimate - TRUE["D_p"]) < 0.01 * TRUE["D_p"]
+    samples, halves = campaign.knowledge()
+    assert len(samples) == 98
+    assert halves[-1, 2] <= 0.005 * campaign.known["D_p"].estimate
+
+
+@pytest.mark.science
+def test_after_a_rest_a_round_begins_there():
+    campaign = carried()
+    inputs = asked_of(campaign)
+    campaign.tell(measured(inputs))
+    campaign.rest()
+    assert not campaign.continues
+    asked = asked_of(campaign)
+    assert campaign.playing == "redesigned"
+    assert asked.shape == (60, 1)
+    campaign.tell(measured(asked))
+    assert [len(r.time) for r in campaign.records] == [31, 61]
+    assert [r.num_samples for r in campaign.rounds] == [30, 60]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"carry": 0}, "carry must be a whole number from 1 to 10000: got 0"),
+        ({"redesign": False}, "carry needs redesigned signals: others begin at rest"),
+    ],
+)
+def test_a_campaign_that_cannot_go_on_is_one_sentence(options, words):
+    with pytest.raises(ValueError, match=words):
+        carried(**options)
+
+
+def test_a_guard_does_not_go_on(tmp_path):
+    with pytest.raises(ValueError, match="it does not go with carry"):
+        ex.campaign("aero2", {"D_p": "1%"}, policy="aero2", guard=True, carry=9, out=tmp_path / "c")
+    assert not (tmp_path / "c").exists()
+
+
+@pytest.fixture
+def opening(monkeypatch):
+    """The first signal of campaigns on rigs, without its design."""
+    monkeypatch.setattr(Campaign, "opening", Replay(jnp.asarray(SQUARE)))
+    monkeypatch.setattr(Campaign, "require_reachable", lambda _: None)
+
+
+def played(folder, **options):
+    usual = {"policy": "none", "steps": 40, "coast": 20, "rounds": 5, "carry": 8, "fast": True}
+    target = {"J_p": "0.05%", "K_pu": "0.05%", "D_p": "0.2%"}
+    return ex.campaign("aero2", target, out=folder, seed=5, **{**usual, **options})
+
+
+@pytest.mark.science  # compiles the redesign
+def test_rounds_without_rest_are_one_record_and_are_resumed(tmp_path, opening):
+    made = played(tmp_path / "c")
+    assert made.reason == REACHED
+    assert len(made.rounds) > 1
+    assert {r.played for r in made.rounds[1:]} == {"redesigned, without rest"}
+    assert max(r.nearness for r in made.rounds) < 1
+    assert [p.name for p in sorted((tmp_path / "c").glob("*.csv"))] == [
+        "knowledge.csv", "round-01.csv",
+    ]  # fmt: skip
+    assert (tmp_path / "c" / "round-02").is_dir()  # the run folder of what both rounds tell
+    record = ex.read_record(tmp_path / "c" / "round-01.csv")
+    total = sum(r.num_samples for r in made.rounds)
+    assert total <= len(record.time) - 1 <= total + 8
+    again = played(tmp_path / "c")
+    assert again.to_dict() == made.to_dict()
+    # Killed while the second round was played: it is told as far as it went, and none is repeated.
+    shutil.copytree(tmp_path / "c", tmp_path / "k")
+    (tmp_path / "k" / "knowledge.csv").unlink()
+    about = json.loads((tmp_path / "k" / "campaign.json").read_text())
+    about.update(rounds=about["rounds"][:1], reason="", playing="redesigned, without rest")
+    (tmp_path / "k" / "campaign.json").write_text(json.dumps(about))
+    csv = (tmp_path / "k" / "round-01.csv").read_bytes().splitlines(keepends=True)
+    first = made.rounds[0].num_samples
+    (tmp_path / "k" / "round-01.csv").write_bytes(b"".join(csv[: first + 20]))
+    sidecar = json.loads((tmp_path / "k" / "round-01.json").read_text())
+    del sidecar["ended"]
+    (tmp_path / "k" / "round-01.json").write_text(json.dumps(sidecar))
+    on = played(tmp_path / "k")
+    assert [r.num_samples for r in on.rounds[:2]] == [first, 18]
+    assert on.rounds[0].to_dict() == made.rounds[0].to_dict()
+    assert on.rounds[1].ended == "interrupted"
+    assert on.rounds[1].played == "redesigned, without rest"
+    assert (tmp_path / "k" / "round-03.csv").exists()
+    assert not (tmp_path / "k" / "round-02.csv").exists()
+    assert on.rounds[2].played == "redesigned"
+    assert on.reason == REACHED
+
+
+@pytest.mark.science
+def test_a_decision_that_comes_too_late_ends_the_experiment(tmp_path, opening, monkeypatch):
+    usual = Campaign.ask
+
+    def slow(self):
+        if len(self.rounds) == 1:
+            time.sleep(1.5)
+        return usual(self)
+
+    monkeypatch.setattr(Campaign, "ask", slow)
+    told = []
+    made = played(tmp_path / "c", fast=False, carry=3, rounds=2, pause=0.1, on_warning=told.append)
+    assert "a decision took longer than 3 samples: give more (--carry)" in told
+    assert (tmp_path / "c" / "round-02.csv").exists()
+    assert [r.played for r in made.rounds] == ["robust", "redesigned"]
+    assert all(r.nearness < 1 for r in made.rounds)
