@@ -487,7 +487,7 @@ class Campaign:
             return None
         if self.result is not None and (unexplained(self.result) or self.result.held):
             return None
-        made = self._candidates(self._region)
+        made = self._candidates(self._region, self._past)
         best = best_of(made, self.targets)
         return NextExperiment(self.plant, self.known, self.targets, tuple(made), best)
 
@@ -496,12 +496,12 @@ class Campaign:
         """Whether the first round may play a signal for the prior in place of the policy."""
         return self.redesign and self.prior is not None and self.policy is not None
 
-    def _candidates(self, region: Region) -> list[Candidate]:
+    def _candidates(self, region: Region, past: Past | None = None) -> list[Candidate]:
         """What could be played, given what is known: a redesigned signal, or from rest others."""
-        opening = None if self.continues else (self._opening_name, self.opening)
+        opening = None if past is not None else (self._opening_name, self.opening)
         return candidates(
             self.plant, region, self.targets, opening,
-            num_steps=self.steps, coast=self.coast, seed=len(self.rounds), past=self._past,
+            num_steps=self.steps, coast=self.coast, seed=len(self.rounds), past=past,
         )  # fmt: skip
 
     @property
@@ -772,7 +772,8 @@ class Campaign:
 
         With a policy, every round plays it. Without one, or where that reaches too little, all
         rounds after the first play what is redesigned for each plant, and with a prior the first
-        one what is redesigned for it.
+        one what is redesigned for it. With `carry` each of them is taken to bring what the second
+        one brings, which goes on from the first.
         """
         redesigns = self._may_redesign_first or (self.redesign and self._whole_rounds > 1)
         if self.policy is None:
@@ -808,7 +809,7 @@ class Campaign:
         asked = [t.quantity for t in self.targets]
         outlook = _halves(
             self.plant, episodes.params, first, later, self._whole_rounds, asked,
-            self._of_prior.information,
+            self._of_prior.information, redesigns and self.carry is not None,
         )  # fmt: skip
         values, halves = map(np.asarray, outlook)
         shares = {
@@ -825,7 +826,8 @@ class Campaign:
         """What would be played on a plant after the first round; that again where nothing is."""
         gained = running_information(self.plant, params, first)[-1]
         region = Region(jnp.stack(list(params)), self._before.information + gained)
-        made = self._candidates(region)[-1]
+        past = None if self.carry is None else Past(first, jnp.asarray(len(first)), self.carry)
+        made = self._candidates(region, past)[-1]
         return jnp.asarray(made.inputs if made.is_safe else np.resize(first, made.inputs.shape))
 
     def require_reachable(self) -> None:
@@ -970,6 +972,7 @@ def _halves(
     rounds: int,
     quantities: Sequence[AbstractQuantity],
     known: Float[Array, "param param"],
+    carries: bool,
 ) -> tuple[Float[Array, "plant quantity"], Float[Array, "plant sample quantity"]]:
     """Values, and half of each interval after every sample of all rounds.
 
@@ -981,11 +984,14 @@ def _halves(
         rounds: of the campaign.
         quantities: that are asked.
         known: information before the first round.
+        carries: whether each other round goes on from the state after the first one.
     """
 
     def one(params: Params, first: Array, later: Array) -> tuple[Array, Array]:
         opened = known[None] + running_information(plant, params, first)
-        each = running_information(plant, params, later)
+        past = Past(first, jnp.asarray(len(first)), 0)
+        start = start_after(plant, params, past) if carries else None
+        each = running_information(plant, params, later, start)
         before = opened[-1][None] + jnp.arange(rounds - 1)[:, None, None] * each[-1][None]
         others = (before[:, None] + each[None]).reshape((rounds - 1) * len(each), *each.shape[1:])
         values, _ = slopes(quantities, plant, params)
