@@ -2,11 +2,11 @@
 
     python results/campaign/carried.py --out results/campaign/carried.json
 
-Whole campaigns of `aero2` without a policy, on the simulated rig without jitter, with the parameters
-anywhere within 30 % of their nominal values and known to 20 % (one standard deviation) before. Rounds have
-40 samples; without rest, 10 samples of the safe input before them count too. Both ways see the
-same plants. The nearness is that of the true outputs, pauses and 100 samples of free motion after
-every record included. Campaigns that are in the file already are kept.
+Whole campaigns of `aero2` without a policy, on the simulated rig without jitter. The parameters are
+anywhere within 30 % of their nominal values, and known to 20 % (one standard deviation) before.
+Rounds have 40 samples; without rest, 10 samples of the safe input before them count, too. Both
+ways see the same plants. The nearness is that of the true outputs, with pauses and 100 samples of
+free motion after every record. Campaigns that are in the file already are kept.
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@
     python results/campaign/compare.py --sd 0.002 --out results/campaign/compare_noisy.json
 
 Parameters anywhere within the spread of the policy's training, by default `aero2-wide` with a
-factor of three. All methods see the same plants, and every round begins at rest. A target is
-reached at the first sample at which the relative standard error of every parameter (Cramér-Rao
+factor of three. All methods see the same plants, and every round begins at rest, unless it is said
+to go on. A target is reached at the first sample at which the relative standard error of every parameter (Cramér-Rao
 bound at the true parameters) is below it. What a method decides between rounds follows from
 estimates of noisy records.
 
@@ -14,6 +14,7 @@ estimates of noisy records.
   classical one whose options were tuned, `loop-NAME` around a position loop
 - redesign: a robust signal of 25 samples, then signals of 25, 50, 50, ... samples, each
   redesigned for what is known
+- the same without rest: 10 samples of the safe input, then a signal that goes on from there
 
 Rows of the same plants that are in the file already are kept, those of another policy are not.
 """
@@ -35,7 +36,7 @@ from excite.estimation import NLS, Experiments, Status
 from excite.excitation import PolicyExcitation, Replay
 from excite.excitation.catalogue import excitation_named
 from excite.files import write_json
-from excite.information import running_information
+from excite.information import Past, running_information
 from excite.plant import draw_params
 from excite.plant.catalogue import plant_from, with_sensor
 from excite.safety import safe_input
@@ -46,6 +47,7 @@ from excite.training.redesign import Region, first_signals, redesigned
 
 MOST, SEED = 480, 4000  # samples of a campaign
 SHORT, LONG = 25, 50  # rounds of the redesign alone
+PAUSE = 10  # samples before one that goes on
 
 
 @eqx.filter_jit
@@ -97,9 +99,12 @@ class Known:
         self.sizes.append(float(near))
         self.key, own = jax.random.split(self.key)
         self.rounds.append((inputs, measured(self.plant, self.params, inputs, own)))
-        if is_last:
-            return
-        most = -(-MOST // min(self.length, LONG)) + 1
+        if not is_last:
+            self.estimate()
+
+    def estimate(self):
+        """The region that the rounds leave possible."""
+        most = 1 if self.length > MOST else -(-MOST // min(self.length, LONG)) + 1
         (_, inputs), (_, outputs) = (x.shape for x in self.rounds[0])
         sizes = (0, inputs), (1, outputs), (1, outputs)
         pads = [np.zeros((most, self.length + n, width)) for n, width in sizes]
@@ -152,6 +157,35 @@ def by_redesign(begin, plant, first, coast):
             if not np.isfinite(made.shares).any():
                 break
             known.play(made.inputs[0], coast)
+        yield known
+
+
+def without_rest(begin, plant, first, coast):
+    """The same, where each signal goes on from the state after the last one."""
+    starts = {n: first_signals(plant, 1, n) for n in (SHORT, LONG)}
+    rest = jnp.tile(jnp.asarray(safe_input(plant.definition)), (PAUSE, 1))
+    room = MOST + PAUSE + LONG
+    for known in begin(room):
+        asked = jnp.eye(len(plant.nominal)) / known.target
+        noise = jax.random.normal(known.key, (room + 1, len(plant.definition.outputs)))
+        noise = plant.sensor.noise_sd[None] * noise.at[0].set(0.0)
+        whole, rounds = first, 1
+        while True:
+            gained, near = learnt(plant, known.params, whole, coast)
+            known.information = [np.asarray(gained)]
+            known.sizes.append(float(near))
+            if known.is_done:
+                break
+            outputs = response(plant, known.params, whole)
+            known.rounds = [(whole, outputs + noise[: len(outputs)])]
+            known.estimate()
+            filled = jnp.concatenate([whole, jnp.tile(rest[:1], (room - len(whole), 1))])
+            past = Past(filled, jnp.asarray(len(whole)), PAUSE)
+            n = SHORT if rounds == 1 else LONG
+            made = redesigned(plant, known.region, asked, starts[n], coast, past=past)
+            if not np.isfinite(made.shares).any():
+                break
+            whole, rounds = jnp.concatenate([whole, rest, made.inputs[0]]), rounds + 1
         yield known
 
 
@@ -236,6 +270,9 @@ def main():
     methods = {"campaign": lambda: by_campaign(begin, plant, policy, coast)}
     if "robust" in kinds:
         methods["redesign alone"] = lambda: by_redesign(
+            begin, plant, design("robust", SHORT).inputs, coast
+        )
+        methods["redesign alone, without rest"] = lambda: without_rest(
             begin, plant, design("robust", SHORT).inputs, coast
         )
     for kind, length in itertools.product(kinds, lengths):
