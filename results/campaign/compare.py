@@ -5,9 +5,9 @@
 
 Parameters anywhere within the spread of the policy's training, by default `aero2-wide` with a
 factor of three. All methods see the same plants, and every round begins at rest, unless it is said
-to go on. A target is reached at the first sample at which the relative standard error of every parameter (Cramér-Rao
-bound at the true parameters) is below it. What a method decides between rounds follows from
-estimates of noisy records.
+to go on. A target is reached at the first sample at which the relative standard error of every
+parameter (Cramér-Rao bound at the true parameters) is below it. What a method decides between
+rounds follows from estimates of noisy records.
 
 - campaign: the policy, then the better of policy and redesigned signal, as `excite campaign`
 - repeated: one signal again and again, safe for the whole spread: designed by gradient, or a
