@@ -1,6 +1,7 @@
 """Experiments that go on where another one ended: their state, signals, players and campaigns."""
 
 import json
+import math
 import shutil
 import time
 
@@ -16,10 +17,13 @@ from excite.information import Past, experiment_information, running_information
 from excite.plant import Aero2
 from excite.plant.extension import extended
 from excite.record import Record
+from excite.rig.contract import Sample
 from excite.rig.player import Sequel, SequelPlayer, SignalPlayer
 from excite.simulation import response
 from excite.study.campaign import REACHED, Campaign
+from excite.study.monitor import Monitor
 from excite.study.next_experiment import next_experiment
+from excite.study.targets import targets_from
 
 PLANT = Aero2()
 TRUE = {"J_p": 0.025, "K_pu": 0.0110, "D_p": 0.0011}
@@ -117,7 +121,7 @@ def test_a_signal_that_goes_on_is_not_played_from_rest(tmp_path, known):
     file, out = tmp_path / "next.csv", tmp_path / "out.csv"
     done = excite("run", "--plant", "aero2", "--input", file, "--fast", "--out", out)
     assert done.returncode == 2
-    assert "goes on from the end of a record (--carry): it is not safe from rest" in done.stderr
+    assert "goes on from the end of a record (--carry): not from rest" in done.stderr
     assert not (tmp_path / "out.csv").exists()
 
 
@@ -205,6 +209,54 @@ def test_after_a_rest_a_round_begins_there():
     assert [r.num_samples for r in campaign.rounds] == [30, 60]
 
 
+def test_a_rival_with_delay_is_played_from_rest():
+    campaign = carried()
+    campaign.tell(measured(SQUARE))
+    assert campaign.continues
+    campaign.plant = extended(PLANT, ["delay"])
+    assert not campaign.continues
+
+
+def test_the_pause_is_safe_as_the_coast():
+    assert carried(coast=20, carry=30).coast == 30
+
+
+@pytest.mark.slow
+def test_a_part_of_a_record_is_not_told_as_a_round_from_rest():
+    campaign = carried()
+    campaign.tell(measured(SQUARE))
+    campaign.playing = "redesigned, without rest"
+    other = measured(-SQUARE)
+    with pytest.raises(ValueError, match="tell the record of everything since rest"):
+        campaign.tell(other)
+    campaign.rest()
+    assert campaign.tell(other).num_samples == 30
+
+
+@pytest.mark.slow
+def test_a_round_that_goes_on_is_judged_with_the_input_that_is_held(monkeypatch):
+    for at_once, played in ((True, 0.0), (False, 7.0)):
+        before = {"J_p": "lognormal:0.024:5%"}
+        monitor = Monitor(
+            PLANT, before, targets_from(PLANT, {"D_p": "1%"}), 20, 5, True, 0.3, math.inf,
+            ends_at_once=at_once,
+        )  # fmt: skip
+        judged: list[np.ndarray] = []
+
+        def after(*_, own=monitor, told=judged) -> float:
+            told.append(own._inputs[:, 0].copy())
+            return 0.0
+
+        monkeypatch.setattr(monitor, "_after", after)
+        for k in range(12):
+            y = np.asarray(measured(SQUARE).outputs[k])
+            monitor(Sample(PLANT.description, 20, k, 0.1 * k, y, np.full(1, 7.0)))
+        monitor.close()
+        assert judged[-1][11] == played
+        assert judged[-1][10] == 7.0
+        assert not judged[-1][12:].any()
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -252,6 +304,11 @@ def test_rounds_without_rest_are_one_record_and_are_resumed(tmp_path, opening):
     assert total <= len(record.time) - 1 <= total + 8
     again = played(tmp_path / "c")
     assert again.to_dict() == made.to_dict()
+    page = ex.report(tmp_path / "c")
+    assert page.count("<svg") == 2  # what was known, and one record
+    for other in (None, 5):
+        with pytest.raises(ValueError, match=f"is another campaign, with carry 8 and not {other}"):
+            played(tmp_path / "c", carry=other)
     # Killed while the second round was played: it is told as far as it went, and none is repeated.
     shutil.copytree(tmp_path / "c", tmp_path / "k")
     (tmp_path / "k" / "knowledge.csv").unlink()
@@ -273,6 +330,29 @@ def test_rounds_without_rest_are_one_record_and_are_resumed(tmp_path, opening):
     assert not (tmp_path / "k" / "round-02.csv").exists()
     assert on.rounds[2].played == "redesigned"
     assert on.reason == REACHED
+    # Killed before the first round was written down: it is one round, with its pause.
+    shutil.copytree(tmp_path / "k", tmp_path / "e")
+    for path in (tmp_path / "e").glob("round-03*"):
+        path.unlink() if path.is_file() else shutil.rmtree(path)
+    about.update(rounds=[], playing="robust")
+    (tmp_path / "e" / "campaign.json").write_text(json.dumps(about))
+    (tmp_path / "e" / "round-01.csv").write_bytes(b"".join(csv[: first + 6]))
+    early = played(tmp_path / "e")
+    assert [r.num_samples for r in early.rounds[:1]] == [first + 4]
+    assert (tmp_path / "e" / "round-02.csv").exists()
+    # A trip in the pause counts, although the round was written down as complete.
+    about.update(rounds=[made.rounds[0].to_dict()])
+    shutil.rmtree(tmp_path / "e")
+    shutil.copytree(tmp_path / "k", tmp_path / "e")
+    for path in (tmp_path / "e").glob("round-03*"):
+        path.unlink() if path.is_file() else shutil.rmtree(path)
+    (tmp_path / "e" / "campaign.json").write_text(json.dumps(about))
+    (tmp_path / "e" / "round-01.csv").write_bytes(b"".join(csv[: first + 6]))
+    sidecar["ended"] = {"reason": "a level", "trip": "level"}
+    (tmp_path / "e" / "round-01.json").write_text(json.dumps(sidecar))
+    tripped = played(tmp_path / "e")
+    assert [r.num_samples for r in tripped.rounds] == [first, 4]
+    assert tripped.reason == "unsafe: a level"
 
 
 @pytest.mark.science

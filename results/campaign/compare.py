@@ -82,8 +82,9 @@ def estimated(plant, inputs, measured, valid, start):
 class Known:
     """What the records of one plant tell: a region, from the rounds so far."""
 
-    def __init__(self, plant, params, key, length, spread, target):
+    def __init__(self, plant, params, key, length, spread, target, most=None):
         """Nothing is known but the spread; `target` is the last standard error asked for."""
+        self.most = most or -(-MOST // min(length, LONG)) + 1  # records
         count = len(params)
         self.plant, self.params, self.key, self.target = plant, params, key, target
         self.rounds, self.length, self.sizes = [], length, []
@@ -104,10 +105,9 @@ class Known:
 
     def estimate(self):
         """The region that the rounds leave possible."""
-        most = 1 if self.length > MOST else -(-MOST // min(self.length, LONG)) + 1
         (_, inputs), (_, outputs) = (x.shape for x in self.rounds[0])
         sizes = (0, inputs), (1, outputs), (1, outputs)
-        pads = [np.zeros((most, self.length + n, width)) for n, width in sizes]
+        pads = [np.zeros((self.most, self.length + n, width)) for n, width in sizes]
         for i, (u, y) in enumerate(self.rounds):
             pads[0][i, : len(u)], pads[1][i, : len(y)], pads[2][i, : len(y)] = u, y, 1
         given = jnp.asarray(pads[0]), jnp.asarray(pads[1]), jnp.asarray(pads[2]) > 0
@@ -165,7 +165,7 @@ def without_rest(begin, plant, first, coast):
     starts = {n: first_signals(plant, 1, n) for n in (SHORT, LONG)}
     rest = jnp.tile(jnp.asarray(safe_input(plant.definition)), (PAUSE, 1))
     room = MOST + PAUSE + LONG
-    for known in begin(room):
+    for known in begin(room, most=1):
         asked = jnp.eye(len(plant.nominal)) / known.target
         noise = jax.random.normal(known.key, (room + 1, len(plant.definition.outputs)))
         noise = plant.sensor.noise_sd[None] * noise.at[0].set(0.0)
@@ -250,8 +250,8 @@ def main():
     keys = jax.random.split(jax.random.key(SEED), asked.plants)
     params = [draw_params(plant, key, spread) for key in keys]
 
-    def begin(length):
-        return [Known(plant, *each, length, spread, min(targets))
+    def begin(length, most=None):
+        return [Known(plant, *each, length, spread, min(targets), most)
                 for each in zip(params, keys, strict=True)]  # fmt: skip
 
     def design(kind, steps):

@@ -6,12 +6,14 @@ Campaigns run in real time on the simulated rig, one after the other. Each is ki
 moment of its first minute and started again with the same command, until it ends. So is one that
 is interrupted, as where a busy computer misses deadlines. After every end it is checked that no
 record of an earlier round has changed since, and at the last that each record is one round, that
-rounds follow each other without a gap, and that its targets are reached.
+rounds follow each other without a gap, and that its targets are reached. With --carry, a record may
+be of several rounds, and end with a pause.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import random
 import shutil
@@ -23,6 +25,8 @@ import excite as ex
 from excite.files import write_json
 
 TARGETS = "D_p=0.2%,J_p=0.2%"
+PRIOR = ["--prior", "J_p=lognormal:0.0232:20%", "--prior", "K_pu=lognormal:0.0125:20%",
+         "--prior", "D_p=lognormal:0.00104:20%"]  # fmt: skip
 LONGEST = 60.0
 
 
@@ -37,6 +41,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--carry", type=int, help="as for excite campaign, without a policy")
     parser.add_argument("--folder", type=Path, default=Path("runs/killed"))
     parser.add_argument("--out", type=Path)
     asked = parser.parse_args()
@@ -50,6 +55,8 @@ def main() -> None:
         command = [
             sys.executable, "-m", "excite", "campaign", "aero2", "--target", TARGETS,
             "--seed", str(len(campaigns)), "--out", str(folder),
+            *(["--carry", str(asked.carry), "--steps", "40", "--policy", "none", *PRIOR]
+              if asked.carry else []),
         ]  # fmt: skip
         kept: dict[str, bytes] = {}
         while True:
@@ -79,14 +86,19 @@ def main() -> None:
                 kept = now
                 continue
             lengths = [len(ex.read_record(folder / name).time) - 1 for name in now]
-            if list(now) != [f"round-{i + 1:02}.csv" for i in range(len(now))]:
+            first = [int(name[6:8]) - 1 for name in now]
+            counts = [r["num_samples"] for r in ended["rounds"]]
+            told = [sum(counts[i:j]) for i, j in itertools.pairwise([*first, len(counts)])]
+            if asked.carry is None and first != [*range(len(counts))]:
                 sys.exit(f"{folder}: rounds {list(now)}")
-            if [r["num_samples"] for r in ended["rounds"]] != lengths:
-                sys.exit(f"{folder}: the rounds are not the records")
+            if any(
+                not 0 <= n - t <= (asked.carry or 0) for n, t in zip(lengths, told, strict=True)
+            ):
+                sys.exit(f"{folder}: the rounds {counts} are not the records {lengths}")
             if (ended["reason"], process.returncode) != ("every target is reached", 0):
                 sys.exit(f"{folder}: {ended['reason']}, exit code {process.returncode}")
             campaigns.append({"reason": ended["reason"], "exit_code": process.returncode,
-                              "rounds": lengths})  # fmt: skip
+                              "rounds": counts if asked.carry else lengths})  # fmt: skip
             print(json.dumps(campaigns[-1]), told.decode()[-300:], flush=True)
             break
     table = {"targets": TARGETS, "kills": kills, "interrupted": interrupted, "campaigns": campaigns}

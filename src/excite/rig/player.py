@@ -96,7 +96,7 @@ class PolicyPlayer(AbstractPlayer):
 class Sequel:
     """Signals that go on from what is played, given while the experiment runs.
 
-    Before, between and after them the safe input is played.
+    After what is played first, between them and after them the safe input is played.
 
     Attributes:
         num_steps: samples of the experiment at most.
@@ -120,7 +120,7 @@ class Sequel:
         """What the signal is at sample k; None for the safe input."""
         return self._inputs[k - int(self._begin)] if self._begin <= k < self._end else None
 
-    def has_ended_first(self, k: int) -> bool:
+    def first_has_ended(self, k: int) -> bool:
         """Whether what was played first has ended before sample k."""
         return k >= min(self._begin, self._end)
 
@@ -136,7 +136,7 @@ class SequelPlayer(AbstractPlayer):
 
     def __call__(self, k: int, measured: np.ndarray) -> np.ndarray:
         """The input of the player, of a signal after it, or the safe one."""
-        has_ended = k >= self._first.num_steps or self._sequel.has_ended_first(k)
+        has_ended = k >= self._first.num_steps or self._sequel.first_has_ended(k)
         self._is_first = not has_ended
         if self._is_first:
             return self._first(k, measured)

@@ -419,16 +419,13 @@ class _Source:
             make = functools.partial(PolicyPlayer, self.policy, steps)
         elif self.signal is not None:
             read = read_signal(self.signal, description)
-            about = read.metadata.get("provenance") or {}
-            if about.get("design") and read.metadata["starts_at_initial_state"] is False:
-                raise ValueError(
-                    f"{self.signal} goes on from the end of a record (--carry): it is not safe "
-                    "from rest"
-                )
+            _require_from_rest(read, self.name)
             inputs = read.inputs[:-1]
             longest, make = len(inputs), functools.partial(SignalPlayer, inputs[:steps])
         else:
             plant, given = _required(plant, "--excitation"), self.excitation or self.name
+            if isinstance(given, Record):
+                _require_from_rest(given, "this record")
             excitation, _ = excitation_and_origin(given, self.options, plant)
             length = experiment_length(excitation, self.name, steps, isinstance(given, Record))
             key = excitation_key(seed)
@@ -436,6 +433,13 @@ class _Source:
         if steps is not None and steps > longest:
             raise ValueError(f"{self.name} was made for {longest} steps; --steps asks for {steps}")
         return make
+
+
+def _require_from_rest(signal: Record, name: str) -> None:
+    """Raises ValueError for a designed signal that goes on from the end of a record."""
+    is_designed = "design" in (signal.metadata.get("provenance") or {})
+    if is_designed and signal.metadata.get("starts_at_initial_state") is False:
+        raise ValueError(f"{name} goes on from the end of a record (--carry): not from rest")
 
 
 def _required(plant: AbstractPlant | None, option: str) -> AbstractPlant:

@@ -25,7 +25,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ..description import (
     RARE,
@@ -44,7 +44,7 @@ from ..estimation.prior import Prior, uniform_names
 from ..estimation.prior_knowledge import PriorLike, plants_of, with_prior
 from ..estimation.result import Identification
 from ..excitation import PolicyExcitation, Replay
-from ..information import Past, require_noise, running_information, start_after
+from ..information import Past, Start, require_noise, running_information, start_after
 from ..plant import AbstractPlant, Params
 from ..plant.catalogue import PlantLike, plant_from, require_inputs
 from ..policy import Policy, mismatch, read_policy
@@ -95,6 +95,7 @@ REACHED = "every target is reached"
 WHOLE = (COMPLETE, REACHED)  # ends of rounds that count in the budget
 
 DISCRIMINATING, ROBUST, FOR_PRIOR = "signal for rivals", "robust", "signal for the prior"
+_ON = ", without rest"  # of a round that goes on
 NO_POLICY = "none"  # instead of a policy's name
 
 DESIGNED = 50  # samples of a round without a policy, unless another number is given
@@ -241,7 +242,7 @@ class Campaign:
             samples: of all rounds together at most, and so the time on the plant; a round that
                 could take more does not begin.
             coast: samples after a round's end in which the plant must be safe; default that of the
-                policy's training, or 100.
+                policy's training, or 100; at least `carry`.
             carry: samples of the safe input in which a round is decided. The next one then goes
                 on from the state that they lead to, with a redesigned signal that is safe from
                 there. Default is rest before every round, as where there is no such signal.
@@ -285,6 +286,7 @@ class Campaign:
             require_whole("carry", carry, 1, 10_000)
             if not redesign:
                 raise ValueError("carry needs redesigned signals: others begin at rest")
+            self.coast = max(self.coast, carry)
         self.carry, self._is_at_rest = carry, True
         self.redesign = redesign
         self.prior = None if prior is None else self._normal(prior, bool(rivals))
@@ -382,21 +384,22 @@ class Campaign:
 
     @property
     def continues(self) -> bool:
-        """Whether the next round begins where the last one ended, and not at rest.
+        """Whether what `ask` returned begins where the last round ended, and not at rest.
 
-        It must begin at the last sample of the record that was told, and the next record that is
-        told is that of both.
+        It must begin at the last sample of the record that was told. Its first `carry` samples are
+        the safe input, which is to be played while `ask` computes. The next record that is told
+        is that of all samples since rest.
         """
         return self._past is not None
 
     def rest(self) -> None:
         """The plant has come to rest: the next round begins there."""
         if not self._is_at_rest:
-            self._is_at_rest, self.next = True, None
+            self._is_at_rest, self.next, self.playing = True, None, ""
 
     @property
     def longest(self) -> int:
-        """Samples of an experiment, of which a round may go on where another one ended."""
+        """Most samples of one record, which is that of all rounds since rest."""
         if self.carry is None:
             return self.steps
         longest = min(_PADDED, self.most_rounds) * (self.steps + self.carry)
@@ -407,8 +410,10 @@ class Campaign:
         """What was played since rest, where the next round goes on from there."""
         if self.carry is None or self._is_at_rest or self.is_undecided:
             return None
-        played, room = self.records[-1].inputs[:-1], self.longest
-        if len(played) + self.carry + self.steps > room:
+        if self.plant.delay(self.plant.nominal) is not None:  # of a rival
+            return None
+        played, room, coming = self.records[-1].inputs[:-1], self.longest, self.carry + self.steps
+        if len(played) + coming > room or not self._fits(self.num_samples + self.carry):
             return None
         rest = np.zeros((room - len(played), played.shape[1]))
         inputs = jnp.asarray(np.concatenate([played, rest]))
@@ -436,6 +441,8 @@ class Campaign:
                 return None
             self.playing = DISCRIMINATING
             return self.discrimination.excitation
+        if not self.continues:
+            self.rest()
         if self.redesign and self.next is None:
             self.next = self._next()
             if self.continues and (self.next is None or self.next.chosen is None):
@@ -455,12 +462,12 @@ class Campaign:
             self.reason = told
             return None
         self.playing = self._opening_name if chosen is None else chosen.name
-        self.playing += ", without rest" * self.continues
+        self.playing += _ON * self.continues
         return self.opening if chosen is None else chosen.excitation
 
     def _fits(self, played: int) -> bool:
         """Whether the budget has samples for another round after so many."""
-        longest = _SHORT if self.is_undecided else self.steps + (self.carry or 0)
+        longest = _SHORT if self.is_undecided else self.steps
         return self.most_samples is None or played + longest <= self.most_samples
 
     @property
@@ -470,11 +477,10 @@ class Campaign:
 
     def _rounds_after(self, rounds: int, samples: int) -> int:
         """Rounds of full length that are left in the budget after so many."""
-        left, pause = self.most_rounds - rounds, self.carry or 0
+        left = self.most_rounds - rounds
         if self.most_samples is None:
             return left
-        samples_left = self.most_samples - samples + pause * (rounds == 0)
-        return min(left, samples_left // (self.steps + pause))
+        return min(left, (self.most_samples - samples) // self.steps)
 
     @property
     def is_undecided(self) -> bool:
@@ -581,6 +587,11 @@ class Campaign:
         before = 0
         if self._goes_on(record):
             before = len(self.records.pop().time) - 1
+        elif self.playing.endswith(_ON) and not played:
+            raise ValueError(
+                "this round goes on from the last one: tell the record of everything since rest, "
+                "or call rest() before ask()"
+            )
         self.records.append(record)
         self._is_at_rest = self.carry is None
         played, structure = played or self.playing or self._opening_name, ""
@@ -594,7 +605,7 @@ class Campaign:
             if self.discrimination is not None and not structure and is_doubtful:
                 structure = self._compare()  # the record may contradict an earlier choice
                 status = structure if self.is_undecided else self._identify()
-        sizes = np.abs(record.outputs) / critical_levels(d)[None]
+        sizes = np.abs(record.outputs[before:]) / critical_levels(d)[None]
         near = float(np.nanmax(sizes, initial=0.0))
         known = self.known if self.result is not None else {}  # a prior is no estimate
         shares = shares_of(self.targets, known)
@@ -760,11 +771,12 @@ class Campaign:
         return chosen and {name: chosen.estimate[name].estimate for name in names}
 
     def monitor(self, waits: bool = False) -> Monitor:
-        """A judge of the next round while it runs; see `Monitor`."""
+        """A judge of the next rounds until rest, while they run; see `Monitor`."""
         before, room = self.prior if self.result is None else self.result, 1 / self.haste
         return Monitor(
-            self.plant, before, self.targets, self.longest, self.coast, waits, self.spread, room
-        )
+            self.plant, before, self.targets, self.longest, self.coast, waits, self.spread, room,
+            ends_at_once=self.carry is None,
+        )  # fmt: skip
 
     @cached_property
     def expected(self) -> Expected:
@@ -801,15 +813,19 @@ class Campaign:
             made = self._candidates(self._before)[-1]
             if made.is_safe:
                 first = later = jnp.broadcast_to(jnp.asarray(made.inputs), first.shape)
+        goes_on = None
         if redesigns and self._whole_rounds > 1:
-            later = jnp.stack([
+            made = [
                 self._redesigned(jax.tree.map(lambda x, i=i: x[i], episodes.params), first[i])
                 for i in range(count)
-            ])  # fmt: skip
+            ]
+            later = jnp.stack([inputs for inputs, _ in made])
+            if self.carry is not None:
+                goes_on = jnp.asarray([is_safe for _, is_safe in made])
         asked = [t.quantity for t in self.targets]
         outlook = _halves(
             self.plant, episodes.params, first, later, self._whole_rounds, asked,
-            self._of_prior.information, redesigns and self.carry is not None,
+            self._of_prior.information, goes_on,
         )  # fmt: skip
         values, halves = map(np.asarray, outlook)
         shares = {
@@ -822,13 +838,17 @@ class Campaign:
 
     def _redesigned(
         self, params: Params, first: Float[Array, "time input"]
-    ) -> Float[Array, "step input"]:
-        """What would be played on a plant after the first round; that again where nothing is."""
+    ) -> tuple[Float[Array, "step input"], bool]:
+        """What would be played on a plant after the first round, and whether it was found.
+
+        Otherwise it is the first one again.
+        """
         gained = running_information(self.plant, params, first)[-1]
         region = Region(jnp.stack(list(params)), self._before.information + gained)
         past = None if self.carry is None else Past(first, jnp.asarray(len(first)), self.carry)
         made = self._candidates(region, past)[-1]
-        return jnp.asarray(made.inputs if made.is_safe else np.resize(first, made.inputs.shape))
+        again = np.resize(first, made.inputs.shape)
+        return jnp.asarray(made.inputs if made.is_safe else again), made.is_safe
 
     def require_reachable(self) -> None:
         """Predicts what is reached; ValueError where no plant of the spread reaches the targets."""
@@ -972,7 +992,7 @@ def _halves(
     rounds: int,
     quantities: Sequence[AbstractQuantity],
     known: Float[Array, "param param"],
-    carries: bool,
+    goes_on: Bool[Array, " plant"] | None,
 ) -> tuple[Float[Array, "plant quantity"], Float[Array, "plant sample quantity"]]:
     """Values, and half of each interval after every sample of all rounds.
 
@@ -984,13 +1004,18 @@ def _halves(
         rounds: of the campaign.
         quantities: that are asked.
         known: information before the first round.
-        carries: whether each other round goes on from the state after the first one.
+        goes_on: whether each other round begins in the state after the first one; None for rest.
     """
 
-    def one(params: Params, first: Array, later: Array) -> tuple[Array, Array]:
+    def one(
+        params: Params, first: Array, later: Array, goes_on: Array | None
+    ) -> tuple[Array, Array]:
         opened = known[None] + running_information(plant, params, first)
-        past = Past(first, jnp.asarray(len(first)), 0)
-        start = start_after(plant, params, past) if carries else None
+        start = None
+        if goes_on is not None:
+            on = start_after(plant, params, Past(first, jnp.asarray(len(first)), 0))
+            state = jnp.where(goes_on, on.state, plant.initial_state)
+            start = Start(state, jnp.where(goes_on, on.slope, 0.0))
         each = running_information(plant, params, later, start)
         before = opened[-1][None] + jnp.arange(rounds - 1)[:, None, None] * each[-1][None]
         others = (before[:, None] + each[None]).reshape((rounds - 1) * len(each), *each.shape[1:])
@@ -998,7 +1023,7 @@ def _halves(
         running = jnp.concatenate([opened, others])
         return values, half_intervals(quantities, plant, params, running)
 
-    return jax.vmap(one)(params, first, later)
+    return jax.vmap(one)(params, first, later, goes_on)
 
 
 def _policy(given: str | Path | Policy | None, plant: PlantDescription) -> Policy | None:

@@ -92,8 +92,8 @@ def campaign(
 
     Args:
         plant: as for `Campaign`, and so are `target`, `policy`, `steps`, `spread`, `rounds`,
-            `samples`, `coast`, `carry`, `redesign`, `rivals` and `prior`. In real time, a decision
-            that takes longer than `carry` samples is played from rest.
+            `samples`, `coast`, `carry`, `redesign`, `rivals` and `prior`. In real time, where a
+            decision takes longer than `carry` samples, the next round begins at rest.
         rig: a name, `FILE.fmu`, `FILE.json`, `path/to/file.py:ClassName` or a rig, as for `run`.
         out: folder of the campaign.
         address: board identifier of the Quanser rig.
@@ -108,7 +108,8 @@ def campaign(
             given.
         command: stored in the folder, to repeat the campaign.
         progress: called with a text, how much is done, and the total.
-        on_round: called after every round.
+        on_round: called after every round; with `carry` from another thread, while the experiment
+            goes on.
         on_warning: called with sentences about what is played.
 
     Raises:
@@ -155,7 +156,7 @@ def campaign(
         )
     name = rig if isinstance(rig, str) else type(rig).__name__
     settings = {"rig": name, "seed": seed, "fault": dict(by_name("fault", fault)), "filter": filter,
-                "guard": guard}  # fmt: skip
+                "guard": guard, "carry": carry}  # fmt: skip
     folder = _Folder.checked(root, made, settings, command)
     if not folder.has_rounds:
         designing = "designing the first signal, and " * (made.policy is None)
@@ -182,15 +183,13 @@ def campaign(
             for sentence in made.warnings:
                 if sentence not in warned:
                     on_warning(sentence)
-            if carry is not None and opened(count).is_real_time and not made.is_undecided:
+            own = opened(count)
+            if carry is not None and own.is_real_time and not made.is_undecided:
                 _rehearse(made)
-            experiment = _Experiment(made, folder, on_round)
-            played, signals = experiment.play(
-                asked, opened(count), filter, guard,
-                lambda count=count: progress(f"round {count + 1}", count, rounds),
-            )  # fmt: skip
+            experiment = _Experiment(made, folder, on_round, progress)
+            played, signals = experiment.play(asked, own, filter, guard)
             outcome = played.outcome
-            if experiment.is_late:
+            if experiment.is_late and not made.reason:
                 on_warning(f"a decision took longer than {carry} samples: give more (--carry)")
             for sentence in made.warnings:
                 if sentence not in warned:
@@ -217,6 +216,8 @@ def _paused(seconds: float) -> str:
 
 def _rehearse(made: Campaign) -> None:
     """Decides about a simulated round, so that no decision waits for a compilation."""
+    if len(made.rounds) + 1 >= made.most_rounds:
+        return
     own = copy.copy(made)
     own.records, own.rounds = list(made.records), list(made.rounds)
     params = None if own.result is None else dict(own.result.params)
@@ -237,14 +238,22 @@ class _Experiment:
         is_late: whether it ended because a decision came too late.
     """
 
-    def __init__(self, made: Campaign, folder: _Folder, on_round: Callable[[Round], None]) -> None:
+    def __init__(
+        self,
+        made: Campaign,
+        folder: _Folder,
+        on_round: Callable[[Round], None],
+        progress: Progress,
+    ) -> None:
         self._made, self._folder, self._on_round = made, folder, on_round
+        self._plant, self._progress = made.plant, progress
         self._path, self._first = folder.path(len(made.rounds)), len(made.rounds)
         self._stop, self._pool = Stop(), ThreadPoolExecutor(1)
         self._monitor: Monitor | None = None
         self._sequel: Sequel | None = None
         self._waits, self._end, self._ended = True, 0, COMPLETE
         self._decision: Future[np.ndarray | None] | None = None
+        self._saved: Future[None] | None = None
         self.is_late = False
 
     def play(
@@ -253,7 +262,6 @@ class _Experiment:
         rig: AbstractRig,
         filter: bool,
         guard: bool,
-        on_begin: Callable[[], None],
     ) -> tuple[RunResult, list[str]]:
         """Plays the rounds, each until enough is known, and tells the campaign of them.
 
@@ -265,7 +273,7 @@ class _Experiment:
         self._monitor = made.monitor(self._waits) if is_decided else None
         if made.carry is not None and is_decided:
             self._sequel, self._end = Sequel(made.longest), _length(asked)
-        on_begin()
+        self._progress(f"round {self._first + 1}", self._first, made.most_rounds)
         with interruptible() as self._stop:
             try:
                 played = run(
@@ -283,13 +291,16 @@ class _Experiment:
                         self._monitor.close()
                 self._pool.shutdown()  # a decision that came too late is told all the same
         outcome = cast("RunResult", played).outcome  # without dry_run
-        if self._decision is not None and outcome.error is None:
-            self._decision.result()  # raises its error
         is_unsafe = outcome.trip in _UNSAFE
+        if is_unsafe and made.reason == REACHED:
+            made.reason = f"unsafe: {outcome.reason}, although every target is reached"
         if _has_samples(path) and not made.reason:
             record = read_record(path, made.declared.description)
             if is_unsafe or self._is_new(record):
                 self._on_round(made.tell(record, outcome.reason, is_unsafe))
+        for done in (self._decision, self._saved):
+            if done is not None and outcome.error is None:
+                done.result()  # raises its error
         signals = [s for s in self._stop.asked if s not in WHOLE]
         return cast("RunResult", played), signals
 
@@ -310,7 +321,7 @@ class _Experiment:
             self._sequel.end(sample.k + 1)
         elif self._decision is None and sample.k == self._end:
             self._decision = self._pool.submit(self._decide, sample.k, self._ended)
-            self._pool.submit(self._folder.save_round, self._made)
+            self._saved = self._pool.submit(self._folder.save_round, self._made)
         if self._decision is not None:
             self._go_on(self._sequel, self._decision, sample.k)
 
@@ -319,7 +330,7 @@ class _Experiment:
         begin = self._end + cast("int", self._made.carry)
         is_last = k + 1 == begin
         if self._waits or decision.done():
-            inputs = decision.result()
+            inputs = None if decision.exception() else decision.result()
             if inputs is None:
                 self._stop.ask(REACHED if self._made.reason == REACHED else COMPLETE)
             elif is_last:
@@ -334,12 +345,16 @@ class _Experiment:
         made = self._made
         record = read_record(self._path, made.declared.description, rows=slice(count + 1))
         self._on_round(made.tell(record, ended))
+        self._folder.write_decisions(made)
         if self._monitor is not None:
             self._monitor.enough = 1 / made.haste
-        asked = made.ask()
-        self._folder.write(made)
-        if not (made.continues and isinstance(asked, Replay)):
+        asked, count = made.ask(), len(made.rounds)
+        self._folder.write_decisions(made)
+        # Another plant needs another monitor and filter.
+        is_same = made.plant.description.hash == self._plant.description.hash
+        if not (is_same and made.continues and isinstance(asked, Replay)):
             return None
+        self._progress(f"round {count + 1}", count, made.most_rounds)
         return np.asarray(asked.inputs)[made.carry :]
 
 
@@ -395,12 +410,16 @@ class _Folder:
         """Of the record of a round."""
         return self.root / f"round-{index + 1:02}.csv"
 
-    def write(self, made: Campaign) -> None:
-        """Settings, what every round brought, and at the end what was known and the estimate."""
+    def write_decisions(self, made: Campaign) -> None:
+        """Settings, and what every round brought."""
         about = {"excite": __version__, "settings": dict(self.settings)}
         write_json(self.root / "campaign.json", {**about, **made.to_dict()})
         marker = {"kind": "excite campaign", "excite": __version__, "command": self.command}
         write_json(self.root / "run.json", {**marker, "plant": made.plant.description.to_dict()})
+
+    def write(self, made: Campaign) -> None:
+        """The same, and at the end what was known and the estimate."""
+        self.write_decisions(made)
         if (made.reason or made.interrupted) and made.result is not None:
             samples, halves = made.knowledge()
             columns = {"sample": samples, **dict(zip(made.known, halves.T, strict=True))}
@@ -409,22 +428,23 @@ class _Folder:
 
     def save_round(self, made: Campaign) -> None:
         """The run folder of what the rounds so far tell together."""
-        if made.result is not None and len(made.result.fitted) == len(made.records):
+        lengths = [len(record.time) for record in made.records]
+        if made.result is not None and [len(f.record.time) for f in made.result.fitted] == lengths:
             made.result.save(self.path(len(made.rounds) - 1).with_suffix(""), overwrite=True)
 
     def _ends(
-        self, first: int, total: int, before: Sequence[Mapping[str, Any]], carry: int | None
+        self, first: int, total: int, before: Sequence[Mapping[str, Any]], pause: int | None
     ) -> list[int]:
         """Samples in a record after which its rounds ended: the first one, and those that went on.
 
         What follows the last of them is a round, too, unless it is but the pause after it.
         """
-        if carry is None:
+        if pause is None:
             return [total]
         later = (i for i in range(first + 1, len(before)) if self.path(i).exists())
         counts = [int(r["num_samples"]) for r in before[first : next(later, len(before))]]
         ends = list(itertools.accumulate(counts))
-        return ends if ends and total <= ends[-1] + carry else [*ends, total]
+        return ends if ends and total <= ends[-1] + pause else [*ends, total]
 
     def resume(
         self,
@@ -451,18 +471,20 @@ class _Folder:
         while _has_samples(path := self.path(len(made.rounds))):
             record, first = read_record(path, made.declared.description), len(made.rounds)
             outcome = record.metadata.get("ended") or {"reason": "interrupted", "trip": "none"}
-            ends = self._ends(first, len(record.time) - 1, before, made.carry)
+            unsafe = Trip[str(outcome["trip"]).upper()] in _UNSAFE
+            pause = 0 if unsafe and made.carry else made.carry
+            ends = self._ends(first, len(record.time) - 1, before, pause)
             for end in ends:
                 count = len(made.rounds)
                 is_last = end == len(record.time) - 1
                 part = record
                 if not is_last:
                     part = read_record(path, made.declared.description, rows=slice(end + 1))
-                told = before[count]["ended"] if count < len(before) else outcome["reason"]
-                unsafe = is_last and Trip[str(outcome["trip"]).upper()] in _UNSAFE
+                is_told = count < len(before) and made.carry is not None
+                told = before[count]["ended"] if is_told else outcome["reason"]
                 goes_on = end != ends[-1] or _has_samples(self.path(count + 1))
                 name = "".join(names[count : count + 1])
-                on_round(made.tell(part, str(told), unsafe, goes_on, name))
+                on_round(made.tell(part, str(told), unsafe and is_last, goes_on, name))
                 if not self.path(count).with_suffix("").is_dir():  # killed before it was written
                     self.save_round(made)
                 if not is_same:  # rounds that ended at other targets did not end too early

@@ -47,6 +47,7 @@ class Monitor:
         waits: bool,
         spread: SpreadLike,
         enough: float = 1.0,
+        ends_at_once: bool = True,
     ) -> None:
         """Compiles the estimator; this takes seconds.
 
@@ -60,11 +61,14 @@ class Monitor:
                 experiment, and the judgement follows some samples later.
             spread: of the parameters before the first round.
             enough: largest share of the allowed intervals that ends the round.
+            ends_at_once: whether the input of the sample ends with the round; otherwise it is
+                held until the next sample.
         """
         start, prior = plant.nominal, None
         if before is not None:
             _, prior, start = with_prior(plant, before, start, {}, {})
         self._plant, self._targets, self.enough = plant, targets, enough
+        self._ends_at_once = ends_at_once
         self._others = others_of(plant, targets)
         self._is_later, self._num_outputs = before is not None, len(plant.definition.outputs)
         own = NLS(prior=prior)
@@ -79,6 +83,8 @@ class Monitor:
         """Takes one more sample; whether every target is reached and ending now is safe."""
         self._live(sample)
         is_enough = False
+        if not self._ends_at_once:
+            self._inputs[sample.k] = sample.input
         if (estimate := self._live.estimate) is not None:
             known = self._known(estimate)
             is_enough = max(shares_of(self._targets, known).values()) <= self._enough(sample.k + 1)

@@ -436,7 +436,8 @@ def next_experiment(
             with a policy, and not with `ahead`.
         coast: samples after the experiment in which the plant must be safe too.
         seed: of the redesign's starts, and of the noise.
-        out: file of the inputs (.csv, .mat); `excite run --input` plays it.
+        out: file of the inputs (.csv, .mat); `excite run --input` plays it, but for one that goes
+            on from a record.
         overwrite: replaces an existing file.
         progress: called with a text, how much is done, and the total.
 

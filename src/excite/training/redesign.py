@@ -137,13 +137,15 @@ def redesigned(
     safe, pause = jnp.asarray(safe_input(plant.definition)), 0 if past is None else past.pause
     before, rest = jnp.tile(safe, (pause, 1)), jnp.tile(safe, (coast, 1))
 
-    def begun(params: Params) -> Start | None:
+    def start(params: Params) -> Start | None:
         return None if past is None else start_after(plant, params, past)
 
-    points, judges = (
-        (found, jax.vmap(begun)(found))
-        for found in (region.plants(plant, POINTS), region.plants(plant, JUDGES))
-    )
+    def begun(count: int) -> tuple[Params, Start | None]:
+        """Plants of the region, and where each of them begins."""
+        plants = region.plants(plant, count)
+        return plants, jax.vmap(start)(plants)
+
+    points, judges = begun(POINTS), begun(JUDGES)
 
     def uncertainty(
         params: Params, start: Start | None, inputs: Float[Array, "round time input"]

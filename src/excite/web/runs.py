@@ -368,8 +368,10 @@ def _campaign(run: Path) -> dict[str, object]:
 
 def _now_played(run: Path, content: Mapping[str, Any]) -> str:
     """What a campaign does whose process works in its folder."""
-    index = len(content["rounds"]) + 1
-    samples = len(_text(run, f"round-{index:02}.csv").splitlines()) - 2  # without names and start
+    told, index = content["rounds"], len(content["rounds"]) + 1
+    last = max((i for i in range(1, index + 1) if (run / f"round-{i:02}.csv").is_file()), default=1)
+    samples = len(_text(run, f"round-{last:02}.csv").splitlines()) - 2  # without names and start
+    samples -= sum(int(r["num_samples"]) for r in told[last - 1 :])  # of a round that goes on
     if samples < 1:
         return f"Round {index} is prepared."
     playing = content.get("playing") or "the last one begun"

@@ -35,7 +35,7 @@ halves = {name: values.to_numpy() for name, values in knowledge.items()}
 samples = halves["sample"].astype(int)
 knowledge_figure("", samples, halves, campaign["rounds"], campaign["allowed"])"""
 _ADVICE = "'excite campaign' writes it again"
-_SETTINGS = ("policy_hash", "spread", "most_rounds", "coast", "redesign")
+_SETTINGS = ("policy_hash", "spread", "most_rounds", "coast", "carry", "redesign")
 
 
 @dataclass(frozen=True)
@@ -47,17 +47,17 @@ class CampaignRun(Run):
         content: of `campaign.json`.
         knowledge: sample, and half of the 95 % interval after it by quantity; empty without an
             estimate.
-        records: of the rounds.
+        records: of the rounds, by the number of the first round in each.
     """
 
     marker: Marker
     content: Mapping[str, Any]
     knowledge: Mapping[str, np.ndarray]
-    records: Sequence[Record]
+    records: Mapping[int, Record]
 
     def section(self, name: str) -> Section:
         """The section of a campaign."""
-        d, c = self.marker.plant, self.content
+        d, c, records = self.marker.plant, self.content, [*self.records.values()]
         with understood(self.marker.folder / "campaign.json", _ADVICE):
             title = f"{d.name}: {outcome(c)}"
             expected = f"Expected before the first round: {c['expected']}."
@@ -72,20 +72,20 @@ class CampaignRun(Run):
                 Table(*rounds_table(c["rounds"]), name="Rounds and their decisions"),
                 *_rivals(c["structure"]),
                 Heading("Measured"),
-                signals_table(d, self.records) if self.records else Paragraph("Nothing yet."),
+                signals_table(d, records) if records else Paragraph("Nothing yet."),
                 *(
                     Figure(
                         episode_figure(d, record),
-                        f"{name}-round{i}",
-                        f"Round {i}: inputs and outputs.",
-                        f"records[{i - 1}].plot()",
+                        f"{name}-round{first}",
+                        f"Round {first}: inputs and outputs.",
+                        f"records[{i}].plot()",
                     )
-                    for i, record in enumerate(self.records[:_MAX_RECORDS], 1)
+                    for i, (first, record) in enumerate([*self.records.items()][:_MAX_RECORDS])
                 ),
                 Heading("Settings and provenance"),
                 facts(
                     [
-                        *((key, c[key]) for key in _SETTINGS),
+                        *((key, c[key]) for key in _SETTINGS if key in c),
                         *([("prior", _prior(c["prior"]))] if c.get("prior") else []),
                         *((key, value) for key, value in c["settings"].items() if key not in c),
                     ]
@@ -137,9 +137,10 @@ def read_campaign(marker: Marker) -> CampaignRun:
     with understood(folder / "campaign.json", _ADVICE):
         # It may be of an earlier command, with other targets.
         is_shown = content["estimate"] and {*content["allowed"]} <= {*knowledge}
-        count = len(content["rounds"])
-    paths = [folder / f"round-{i:02}.csv" for i in range(1, count + 1)]
-    records = [record_in(path, marker.plant) for path in paths]
+        paths = {i: folder / f"round-{i:02}.csv" for i in range(1, len(content["rounds"]) + 1)}
+    if content.get("carry"):  # a round that went on is in the record of the one before
+        paths = {i: path for i, path in paths.items() if i == 1 or path.exists()}
+    records = {i: record_in(path, marker.plant) for i, path in paths.items()}
     return CampaignRun(marker, content, knowledge if is_shown else {}, records)
 
 
