@@ -3,7 +3,7 @@
 import json
 import math
 import shutil
-import time
+from concurrent.futures import Future
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,9 +18,11 @@ from excite.plant import Aero2
 from excite.plant.extension import extended
 from excite.record import Record
 from excite.rig.contract import Sample
+from excite.rig.loop import COMPLETE
 from excite.rig.player import Sequel, SequelPlayer, SignalPlayer
 from excite.simulation import response
 from excite.study.campaign import REACHED, Campaign
+from excite.study.campaign_on_rig import _Experiment, _Folder
 from excite.study.monitor import Monitor
 from excite.study.next_experiment import next_experiment
 from excite.study.targets import targets_from
@@ -282,9 +284,9 @@ def opening(monkeypatch):
     monkeypatch.setattr(Campaign, "require_reachable", lambda _: None)
 
 
-def played(folder, **options):
+def played(folder, damping: str = "0.2%", **options):
     usual = {"policy": "none", "steps": 40, "coast": 20, "rounds": 5, "carry": 8, "fast": True}
-    target = {"J_p": "0.05%", "K_pu": "0.05%", "D_p": "0.2%"}
+    target = {"J_p": "0.05%", "K_pu": "0.05%", "D_p": damping}
     return ex.campaign("aero2", target, out=folder, seed=5, **{**usual, **options})
 
 
@@ -356,18 +358,36 @@ def test_rounds_without_rest_are_one_record_and_are_resumed(tmp_path, opening):
 
 
 @pytest.mark.science
-def test_a_decision_that_comes_too_late_ends_the_experiment(tmp_path, opening, monkeypatch):
-    usual = Campaign.ask
+def test_a_round_that_ended_too_early_is_followed_by_a_whole_one(tmp_path, opening, monkeypatch):
+    monkeypatch.setattr(Monitor, "__call__", lambda _, sample: sample.k >= 19)
+    made = played(tmp_path / "c", "0.01%", rounds=3)
+    assert [(r.num_samples, r.ended) for r in made.rounds] == [
+        (20, REACHED), (48, "complete"), (9, REACHED),
+    ]  # fmt: skip
+    assert made.round_rows()[0][-1].startswith("ended early by the running estimate; go on")
 
-    def slow(self):
-        if len(self.rounds) == 1:
-            time.sleep(1.5)
-        return usual(self)
 
-    monkeypatch.setattr(Campaign, "ask", slow)
-    told = []
-    made = played(tmp_path / "c", fast=False, carry=3, rounds=2, pause=0.1, on_warning=told.append)
-    assert "a decision took longer than 3 samples: give more (--carry)" in told
-    assert (tmp_path / "c" / "round-02.csv").exists()
-    assert [r.played for r in made.rounds] == ["robust", "redesigned"]
-    assert all(r.nearness < 1 for r in made.rounds)
+def test_a_decision_that_comes_too_late_ends_the_experiment(tmp_path):
+    def going_on(decision: Future, k: int) -> tuple[_Experiment, Sequel]:
+        folder = _Folder(tmp_path, {}, "")
+        experiment = _Experiment(carried(), folder, lambda _: None, lambda *_: None)
+        experiment._waits, experiment._end = False, 30
+        sequel = Sequel(200)
+        experiment._go_on(sequel, decision, k)
+        return experiment, sequel
+
+    pending, ready, ended = Future(), Future(), Future()
+    ready.set_result(np.full((5, 1), 3.0))
+    ended.set_result(None)
+    for k in range(30, 37):  # the pause is from 30 to 37
+        assert not going_on(pending, k)[0]._stop.reason
+        assert going_on(ready, k)[1].input(38) is None
+    late, sequel = going_on(pending, 37)
+    assert late.is_late
+    assert late._stop.reason == COMPLETE
+    assert sequel.input(38) is None
+    in_time, sequel = going_on(ready, 37)
+    assert not in_time.is_late
+    assert not in_time._stop.reason
+    assert [sequel.input(k) for k in (37, 38, 42, 43)] == [None, 3.0, 3.0, None]
+    assert going_on(ended, 31)[0]._stop.reason == COMPLETE

@@ -590,7 +590,7 @@ class Campaign:
         elif self.playing.endswith(_ON) and not played:
             raise ValueError(
                 "this round goes on from the last one: tell the record of everything since rest, "
-                "or call rest() before ask()"
+                "which begins with the same samples as the last one, or call rest() before ask()"
             )
         self.records.append(record)
         self._is_at_rest = self.carry is None
@@ -925,7 +925,8 @@ class Campaign:
         rows = []
         for i, r in enumerate(self.rounds, 1):
             is_told = r.ended == COMPLETE or r.ended in r.decision
-            decision = r.decision if is_told else f"{r.ended}; {r.decision}"
+            ended = "ended early by the running estimate" if r.ended == REACHED else r.ended
+            decision = r.decision if is_told else f"{ended}; {r.decision}"
             level = f"{100 * r.nearness:.0f} %"
             rows.append([str(i), r.played, str(r.num_samples), level, decision])
         return rows

@@ -25,6 +25,7 @@ from ..description import (
     wrong_type,
 )
 from ..estimation.prior_knowledge import PriorLike
+from ..estimation.result import Identification
 from ..excitation import Replay
 from ..files import csv_text, json_ready, locked_folder, read_json, write_bytes, write_json
 from ..plant.catalogue import PlantLike
@@ -253,7 +254,8 @@ class _Experiment:
         self._sequel: Sequel | None = None
         self._waits, self._end, self._ended = True, 0, COMPLETE
         self._decision: Future[np.ndarray | None] | None = None
-        self._saved: Future[None] | None = None
+        self._told: list[tuple[Path, Identification] | None] = []
+        self._is_hasty = False  # the last round ended too early
         self.is_late = False
 
     def play(
@@ -298,9 +300,11 @@ class _Experiment:
             record = read_record(path, made.declared.description)
             if is_unsafe or self._is_new(record):
                 self._on_round(made.tell(record, outcome.reason, is_unsafe))
-        for done in (self._decision, self._saved):
-            if done is not None and outcome.error is None:
-                done.result()  # raises its error
+        if self._decision is not None and outcome.error is None:
+            self._decision.result()  # raises its error
+        for told in self._told:  # written now, because it would make a real-time loop late
+            if told is not None:
+                told[1].save(told[0], overwrite=True)
         signals = [s for s in self._stop.asked if s not in WHOLE]
         return cast("RunResult", played), signals
 
@@ -316,12 +320,11 @@ class _Experiment:
             if is_enough:
                 self._stop.ask(REACHED)
             return
-        if self._decision is None and sample.k < self._end and is_enough:
+        if self._decision is None and sample.k < self._end and is_enough and not self._is_hasty:
             self._end, self._ended = sample.k + 1, REACHED
             self._sequel.end(sample.k + 1)
         elif self._decision is None and sample.k == self._end:
             self._decision = self._pool.submit(self._decide, sample.k, self._ended)
-            self._saved = self._pool.submit(self._folder.save_round, self._made)
         if self._decision is not None:
             self._go_on(self._sequel, self._decision, sample.k)
 
@@ -346,8 +349,10 @@ class _Experiment:
         record = read_record(self._path, made.declared.description, rows=slice(count + 1))
         self._on_round(made.tell(record, ended))
         self._folder.write_decisions(made)
+        self._told.append(self._folder.told(made))
         if self._monitor is not None:
             self._monitor.enough = 1 / made.haste
+        self._is_hasty = ended == REACHED
         asked, count = made.ask(), len(made.rounds)
         self._folder.write_decisions(made)
         # Another plant needs another monitor and filter.
@@ -426,11 +431,17 @@ class _Folder:
             write_bytes(self.root / "knowledge.csv", csv_text(columns).encode())
             made.result.save(self.root / "estimate", overwrite=True)
 
+    def told(self, made: Campaign) -> tuple[Path, Identification] | None:
+        """What the rounds so far tell together, if anything, and the run folder for it."""
+        lengths = [len(record.time) for record in made.records]
+        if made.result is None or [len(f.record.time) for f in made.result.fitted] != lengths:
+            return None
+        return self.path(len(made.rounds) - 1).with_suffix(""), made.result
+
     def save_round(self, made: Campaign) -> None:
         """The run folder of what the rounds so far tell together."""
-        lengths = [len(record.time) for record in made.records]
-        if made.result is not None and [len(f.record.time) for f in made.result.fitted] == lengths:
-            made.result.save(self.path(len(made.rounds) - 1).with_suffix(""), overwrite=True)
+        if (told := self.told(made)) is not None:
+            told[1].save(told[0], overwrite=True)
 
     def _ends(
         self, first: int, total: int, before: Sequence[Mapping[str, Any]], pause: int | None
