@@ -179,8 +179,7 @@ def without_rest(begin, plant, first, coast):
             outputs = response(plant, known.params, whole)
             known.rounds = [(whole, outputs + noise[: len(outputs)])]
             known.estimate()
-            filled = jnp.concatenate([whole, jnp.tile(rest[:1], (room - len(whole), 1))])
-            past = Past(filled, jnp.asarray(len(whole)), PAUSE)
+            past = Past.of(whole, PAUSE, room)
             n = SHORT if rounds == 1 else LONG
             made = redesigned(plant, known.region, asked, starts[n], coast, past=past)
             if not np.isfinite(made.shares).any():

@@ -10,6 +10,7 @@ import click
 from .identify import given_priors
 from .next import OF_TARGETS, TARGETS
 from .options import (
+    CARRY,
     COAST,
     NUMBERS,
     OUT_FILE,
@@ -85,7 +86,7 @@ from .options import (
 )
 @click.option(
     "--carry",
-    type=WholeNumber(1, 10_000),
+    type=CARRY,
     metavar="N",
     help="Play the safe input for N samples after a round while the next one is decided, and go "
     "on from there; without it, and where no redesigned signal is safe, rounds begin at rest.",

@@ -9,6 +9,7 @@ import click
 
 from .identify import given_priors
 from .options import (
+    CARRY,
     COAST,
     OUT_FILE,
     SEED,
@@ -74,7 +75,7 @@ OF_TARGETS = (
 )
 @click.option(
     "--carry",
-    type=WholeNumber(1, 10_000),
+    type=CARRY,
     metavar="N",
     help="Go on from the end of the last record, after N samples of the safe input; without it, "
     "the experiment begins at rest.",

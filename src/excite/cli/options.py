@@ -152,6 +152,7 @@ def _option_value(text: str) -> bool | float | list[object]:
 
 
 COAST = WholeNumber(0, 100_000)
+CARRY = WholeNumber(1, 10_000)
 coast_option = click.option(
     "--coast",
     type=COAST,

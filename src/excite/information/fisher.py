@@ -126,24 +126,33 @@ class Past(eqx.Module):
     count: Int[Array, ""]
     pause: int = eqx.field(static=True)
 
+    @classmethod
+    def of(cls, played: Float[Array | np.ndarray, "time input"], pause: int, room: int = 0) -> Past:
+        """After these inputs, in an array for at least `room` of them.
+
+        One room for experiments of different lengths makes one compiled program serve all.
+        """
+        inputs, count = jnp.asarray(played), len(played)
+        inputs = jnp.pad(inputs, ((0, max(room - count, 0)), (0, 0)))
+        return cls(inputs, jnp.asarray(count), pause)
+
 
 @eqx.filter_jit
 def start_after(plant: AbstractPlant, params: Params, past: Past) -> Start:
-    """Where a plant without input delay has come to; the pause does not count."""
-    size, num_params = relative_size(plant, params), len(params)
-    theta = jnp.stack([jnp.asarray(p, float) for p in params])
+    """The state of a plant without input delay before the pause."""
+    changed = _changed(plant, params)
 
     def end(change: Array) -> Float[Array, " state"]:
-        changed = plant.Params(*(theta + size * change))
+        own = changed(change)
 
         def advance(state: Array, now: tuple) -> tuple[Array, None]:
             k, input = now
-            return jnp.where(k < past.count, step(plant, state, input, changed), state), None
+            return jnp.where(k < past.count, step(plant, state, input, own), state), None
 
         steps = jnp.arange(len(past.inputs)), past.inputs
         return jax.lax.scan(advance, plant.initial_state, steps)[0]
 
-    at = jnp.zeros(num_params)
+    at = jnp.zeros(len(params))
     return Start(end(at), jax.jacfwd(end)(at))
 
 
@@ -168,12 +177,8 @@ def experiment_information(
         start: where it begins, if not at rest; its first measurement is of what was before.
     """
     require_double_precision()
-    theta = jnp.stack([jnp.asarray(p, float) for p in params])
-    size, num_params = relative_size(plant, params), len(theta)
+    changed, num_params = _changed(plant, params), len(params)
     num_states = 0 if initial_state_known else len(plant.initial_state)
-
-    def changed(change: Array) -> Params:
-        return plant.Params(*(theta + size * change[:num_params]))
 
     if measured is not None and plant.definition.observes_state:
         S = sensitivity(
@@ -185,7 +190,7 @@ def experiment_information(
     def outputs(change: Array) -> Array:
         moved = change[num_params:] if num_states else 0.0
         begin = plant.initial_state if start is None else start.after(change[:num_params])
-        return response(plant, changed(change), inputs, begin + moved)
+        return response(plant, changed(change[:num_params]), inputs, begin + moved)
 
     S = sensitivity(outputs, jnp.zeros(num_params + num_states))
     S = S if start is None else S[1:]
@@ -205,17 +210,23 @@ def running_information(
 
     The last is that of the whole experiment.
     """
-    theta, size = jnp.stack([jnp.asarray(p, float) for p in params]), relative_size(plant, params)
+    changed = _changed(plant, params)
 
     def outputs(change: Array) -> Array:
         begin = None if start is None else start.after(change)
-        return response(plant, plant.Params(*(theta + size * change)), inputs, begin)
+        return response(plant, changed(change), inputs, begin)
 
-    weighted = sensitivity(outputs, jnp.zeros(len(theta))) / plant.sensor.sd[None, :, None]
+    weighted = sensitivity(outputs, jnp.zeros(len(params))) / plant.sensor.sd[None, :, None]
     each = jnp.einsum("koi,koj->kij", weighted, weighted)
     if start is not None:
         return jnp.cumsum(each[1:], axis=0)
     return jnp.cumsum(each, axis=0)[1:]
+
+
+def _changed(plant: AbstractPlant, params: Params) -> Callable[[Float[Array, " param"]], Params]:
+    """Parameters after relative changes, which are a function's arguments."""
+    theta, size = jnp.stack([jnp.asarray(p, float) for p in params]), relative_size(plant, params)
+    return lambda change: plant.Params(*(theta + size * change))
 
 
 def relative_size(plant: AbstractPlant, params: Params) -> Float[Array, " param"]:

@@ -43,7 +43,7 @@ from ..estimation.identify import RecordLike, identify, record_for
 from ..estimation.prior import Prior, uniform_names
 from ..estimation.prior_knowledge import PriorLike, plants_of, with_prior
 from ..estimation.result import Identification
-from ..excitation import PolicyExcitation, Replay
+from ..excitation import Replay
 from ..information import Past, Start, require_noise, running_information, start_after
 from ..plant import AbstractPlant, Params
 from ..plant.catalogue import PlantLike, plant_from, require_inputs
@@ -69,7 +69,15 @@ from .knowledge import (
     unexplained,
 )
 from .monitor import Monitor
-from .next_experiment import COAST, Candidate, NextExperiment, best_of, candidate, candidates
+from .next_experiment import (
+    COAST,
+    Candidate,
+    NextExperiment,
+    best_of,
+    candidate,
+    candidates,
+    played_as,
+)
 from .quantities import (
     AbstractQuantity,
     OneParameter,
@@ -95,7 +103,6 @@ REACHED = "every target is reached"
 WHOLE = (COMPLETE, REACHED)  # ends of rounds that count in the budget
 
 DISCRIMINATING, ROBUST, FOR_PRIOR = "signal for rivals", "robust", "signal for the prior"
-_ON = ", without rest"  # of a round that goes on
 NO_POLICY = "none"  # instead of a policy's name
 
 DESIGNED = 50  # samples of a round without a policy, unless another number is given
@@ -415,9 +422,7 @@ class Campaign:
         played, room, coming = self.records[-1].inputs[:-1], self.longest, self.carry + self.steps
         if len(played) + coming > room or not self._fits(self.num_samples + self.carry):
             return None
-        rest = np.zeros((room - len(played), played.shape[1]))
-        inputs = jnp.asarray(np.concatenate([played, rest]))
-        return Past(inputs, jnp.asarray(len(played)), self.carry)
+        return Past.of(played, self.carry, room)
 
     def ask(self) -> Policy | Replay | None:
         """What to play in the next round; None once the campaign has ended.
@@ -462,7 +467,7 @@ class Campaign:
             self.reason = told
             return None
         self.playing = self._opening_name if chosen is None else chosen.name
-        self.playing += _ON * self.continues
+        self.playing += ", without rest" * self.continues
         return self.opening if chosen is None else chosen.excitation
 
     def _fits(self, played: int) -> bool:
@@ -587,7 +592,7 @@ class Campaign:
         before = 0
         if self._goes_on(record):
             before = len(self.records.pop().time) - 1
-        elif self.playing.endswith(_ON) and not played:
+        elif self.playing and self.continues and not played:
             raise ValueError(
                 "this round goes on from the last one: tell the record of everything since rest, "
                 "which begins with the same samples as the last one, or call rest() before ask()"
@@ -799,11 +804,7 @@ class Campaign:
 
     def _expected(self, redesigns: bool) -> Expected:
         """The same, with redesigned signals after the first round or without them."""
-        opening, steps = self.opening, self.steps
-        if isinstance(opening, Policy):
-            excitation = PolicyExcitation.of(opening)
-        else:
-            excitation, steps = opening, len(opening.inputs)
+        excitation, steps = played_as(self.opening)
         count = _FEWER if redesigns or self.policy is None else _PLANTS
         keys = jax.random.split(jax.random.key(0), count)
         drawn = None if self.prior is None else plants_of(self.plant, self.prior, self.spread)
@@ -845,7 +846,7 @@ class Campaign:
         """
         gained = running_information(self.plant, params, first)[-1]
         region = Region(jnp.stack(list(params)), self._before.information + gained)
-        past = None if self.carry is None else Past(first, jnp.asarray(len(first)), self.carry)
+        past = None if self.carry is None else Past.of(first, self.carry)
         made = self._candidates(region, past)[-1]
         again = np.resize(first, made.inputs.shape)
         return jnp.asarray(made.inputs if made.is_safe else again), made.is_safe
@@ -1014,7 +1015,7 @@ def _halves(
         opened = known[None] + running_information(plant, params, first)
         start = None
         if goes_on is not None:
-            on = start_after(plant, params, Past(first, jnp.asarray(len(first)), 0))
+            on = start_after(plant, params, Past.of(first, 0))
             state = jnp.where(goes_on, on.state, plant.initial_state)
             start = Start(state, jnp.where(goes_on, on.slope, 0.0))
         each = running_information(plant, params, later, start)

@@ -44,6 +44,7 @@ from ..simulation import simulate
 from .campaign import REACHED, WHOLE, Campaign, Round
 from .discrimination import RivalLike
 from .monitor import Monitor
+from .next_experiment import played_as
 from .targets import TargetLike
 
 _OWN = {"campaign.json", "run.json", ".lock"}  # files of a campaign without rounds
@@ -201,7 +202,6 @@ def campaign(
                 made.interrupted = signals[0]
             made.rest()
             folder.write(made)
-            folder.save_round(made)
     progress("done", rounds, rounds)
     return made
 
@@ -228,10 +228,6 @@ def _rehearse(made: Campaign) -> None:
         own.ask()
 
 
-def _length(asked: Policy | Replay) -> int:
-    return asked.layout.num_steps if isinstance(asked, Policy) else len(asked.inputs)
-
-
 class _Experiment:
     """One or more rounds on a rig: all but the first go on where the last one ended.
 
@@ -254,7 +250,7 @@ class _Experiment:
         self._sequel: Sequel | None = None
         self._waits, self._end, self._ended = True, 0, COMPLETE
         self._decision: Future[np.ndarray | None] | None = None
-        self._told: list[tuple[Path, Identification] | None] = []
+        self._told: list[tuple[Path, Identification]] = []
         self._is_hasty = False  # the last round ended too early
         self.is_late = False
 
@@ -274,7 +270,7 @@ class _Experiment:
         is_decided, self._waits = not made.is_undecided, not rig.is_real_time
         self._monitor = made.monitor(self._waits) if is_decided else None
         if made.carry is not None and is_decided:
-            self._sequel, self._end = Sequel(made.longest), _length(asked)
+            self._sequel, self._end = Sequel(made.longest), played_as(asked)[1]
         self._progress(f"round {self._first + 1}", self._first, made.most_rounds)
         with interruptible() as self._stop:
             try:
@@ -299,14 +295,19 @@ class _Experiment:
         if _has_samples(path) and not made.reason:
             record = read_record(path, made.declared.description)
             if is_unsafe or self._is_new(record):
-                self._on_round(made.tell(record, outcome.reason, is_unsafe))
+                self._tell(record, outcome.reason, is_unsafe)
         if self._decision is not None and outcome.error is None:
             self._decision.result()  # raises its error
-        for told in self._told:  # written now, because it would make a real-time loop late
-            if told is not None:
-                told[1].save(told[0], overwrite=True)
+        for path, result in self._told:  # now, because writing would make a real-time loop late
+            result.save(path, overwrite=True)
         signals = [s for s in self._stop.asked if s not in WHOLE]
         return cast("RunResult", played), signals
+
+    def _tell(self, record: Record, ended: str, unsafe: bool = False) -> None:
+        """Tells the campaign of a round; its run folder is written at the experiment's end."""
+        self._on_round(self._made.tell(record, ended, unsafe))
+        if (told := self._folder.told(self._made)) is not None:
+            self._told.append(told)
 
     def _is_new(self, record: Record) -> bool:
         """Whether a record has more than the rounds that were told, and the pause after them."""
@@ -347,9 +348,8 @@ class _Experiment:
         """Tells of the round that ended after so many samples; the signal that goes on, if any."""
         made = self._made
         record = read_record(self._path, made.declared.description, rows=slice(count + 1))
-        self._on_round(made.tell(record, ended))
+        self._tell(record, ended)
         self._folder.write_decisions(made)
-        self._told.append(self._folder.told(made))
         if self._monitor is not None:
             self._monitor.enough = 1 / made.haste
         self._is_hasty = ended == REACHED
@@ -432,16 +432,11 @@ class _Folder:
             made.result.save(self.root / "estimate", overwrite=True)
 
     def told(self, made: Campaign) -> tuple[Path, Identification] | None:
-        """What the rounds so far tell together, if anything, and the run folder for it."""
+        """What the rounds so far tell together, if anything, and its run folder."""
         lengths = [len(record.time) for record in made.records]
         if made.result is None or [len(f.record.time) for f in made.result.fitted] != lengths:
             return None
         return self.path(len(made.rounds) - 1).with_suffix(""), made.result
-
-    def save_round(self, made: Campaign) -> None:
-        """The run folder of what the rounds so far tell together."""
-        if (told := self.told(made)) is not None:
-            told[1].save(told[0], overwrite=True)
 
     def _ends(
         self, first: int, total: int, before: Sequence[Mapping[str, Any]], pause: int | None
@@ -496,8 +491,9 @@ class _Folder:
                 goes_on = end != ends[-1] or _has_samples(self.path(count + 1))
                 name = "".join(names[count : count + 1])
                 on_round(made.tell(part, str(told), unsafe and is_last, goes_on, name))
-                if not self.path(count).with_suffix("").is_dir():  # killed before it was written
-                    self.save_round(made)
+                known = self.told(made)
+                if known is not None and not known[0].is_dir():  # killed before it was written
+                    known[1].save(known[0], overwrite=True)
                 if not is_same:  # rounds that ended at other targets did not end too early
                     made.haste = 1.0
         made.rest()

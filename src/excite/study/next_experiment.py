@@ -163,6 +163,13 @@ def candidates(
     return [*found, redesign if is_found else replace(redesign, nearness=np.inf)]
 
 
+def played_as(given: Policy | Replay) -> tuple[AbstractExcitation, int]:
+    """A policy or a signal as an excitation, and its number of samples."""
+    if isinstance(given, Policy):
+        return PolicyExcitation.of(given), given.layout.num_steps
+    return given, len(given.inputs)
+
+
 def candidate(
     plant: AbstractPlant,
     region: Region,
@@ -178,8 +185,7 @@ def candidate(
 
     It begins at rest, or as a signal where another experiment has come to.
     """
-    own = PolicyExcitation.of(given) if isinstance(given, Policy) else given
-    length = given.layout.num_steps if isinstance(given, Policy) else len(given.inputs)
+    own, length = played_as(given)
     key = jax.random.key(seed)
     quantities = quantities_of(plant, targets)
     outlook = _outlook(plant, region, own, min(num_steps, length), coast, key, quantities, past)
@@ -511,5 +517,4 @@ def _past(given: Knowledge, carry: int) -> Past:
         )
     if not np.allclose(np.diff(record.time), dt, rtol=0.1, atol=0.0):
         raise ValueError(f"{where} is not sampled every {dt:g} s throughout, as carry needs it")
-    played = jnp.asarray(record.inputs[:-1])
-    return Past(played, jnp.asarray(len(played)), carry)
+    return Past.of(record.inputs[:-1], carry)
