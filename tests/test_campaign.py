@@ -915,3 +915,9 @@ def test_the_command_ends_a_round_as_soon_as_enough_is_known(tmp_path):
     refused = excite("campaign", "aero2", "--target", "D_p=x", "--out", tmp_path / "c")
     assert refused.returncode == 2
     assert "target of D_p must be a number above 0" in refused.stderr
+
+
+def test_a_budget_of_samples_that_is_too_short_names_its_option():
+    asked = ex.Campaign("aero2", {"D_p": "0.0001%"}, policy="aero2", samples=600)
+    with pytest.raises(ValueError, match=r"at most 1 round of 500 samples .* more samples \(--s"):
+        asked.require_reachable()

@@ -29,7 +29,7 @@ from excite.estimation.identify import identify
 from excite.excitation import Chirp, Multisine, PolicyExcitation, PositionLoop, Square
 from excite.files import csv_text
 from excite.plant import Aero2, Aero2Detailed
-from excite.plant.catalogue import with_sensor
+from excite.plant.catalogue import plant_from, with_sensor
 from excite.policy import read_policy, shipped_policies
 from excite.record import read_record, write_record
 from excite.rig import (
@@ -765,6 +765,17 @@ def test_latency_is_a_part_of_the_plants_own_sampling_time():
     fast = PLANT.changed(dt=0.004)
     rig = SimulatedRig(fast, Hardware.draw(fast, 2, 0.0, jax.random.key(0)), 2, is_real_time=False)
     assert rig.num_latency == 0
+
+
+@pytest.mark.parametrize("name", ["dc_motor", "emps", "cart_pole", "aero2"])
+def test_the_usual_latency_is_one_that_a_record_can_show(name):
+    """A part of a reading would be a delay that the plant of that name does not have."""
+    plant = plant_from(name)
+    count = readings_per_sample(plant)
+    hardware = Hardware.draw(plant, count, 0.0, jax.random.key(0))
+    in_readings = float(hardware.latency) / float(plant.dt) * count
+    assert in_readings == pytest.approx(round(in_readings), abs=1e-9)
+    assert in_readings == pytest.approx(count / 10, abs=0.5)
 
 
 # ------------------------------------------------------------------------ safety filter

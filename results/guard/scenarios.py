@@ -218,12 +218,13 @@ class Play:
             return there.delay(params)
 
         count = num_written(delay, len(box.names), dt)
+        numbers = usual_numbers(dt, self.num_readings, {"latency": dt / 10})
 
         def draw(key):
             point, rig, fault = jax.random.split(key, 3)
             there, params = box.at(box.draw(point))
             return Hardware(
-                at_interval(there, self.num_readings), params, *usual_numbers(dt, {}).values(),
+                at_interval(there, self.num_readings), params, *numbers.values(),
                 rig, faults=faults(fault), num_written=count,
             )  # fmt: skip
 

@@ -86,7 +86,7 @@ class OnRig(AbstractExperiments):
             uncertainty=dataclasses.replace(box, plant=at_interval(plant, num_readings)),
             excitation=excitation,
             safety_filter=safety_filter,
-            numbers=usual_numbers(float(plant.dt), numbers),
+            numbers=usual_numbers(float(plant.dt), num_readings, numbers),
             rules=safety_filter.supervision(Supervision.of(plant.description)),
             num_steps=num_steps,
             num_readings=num_readings,

@@ -110,8 +110,8 @@ class Hardware(eqx.Module):
             effects: values of extensions that the true plant has and `plant` has not, by name:
                 `gain_voltage`, `delay_voltage`, ...
             faults: of sensor and actuator.
-            numbers: `latency`, `jitter`, `dropout`; by default a tenth of dt, a thousandth
-                of dt, and zero.
+            numbers: `latency`, `jitter`, `dropout`; by default a tenth of dt in whole
+                readings, a thousandth of dt, and zero.
         """
         params_key, rig_key = jax.random.split(key)
         dt, given = float(plant.dt), effects or {}
@@ -130,7 +130,7 @@ class Hardware(eqx.Module):
             key=rig_key,
             faults=faults,
             num_written=num_written(delay, len(own), dt),
-            **usual_numbers(dt, numbers),
+            **usual_numbers(dt, num_readings, numbers),
         )
 
     def start(self, noise: Float[Array, " output"] | None = None) -> HardwareState:
@@ -248,9 +248,15 @@ class Hardware(eqx.Module):
         return jax.random.normal(key, (len(self.plant.definition.outputs),), float)
 
 
-def usual_numbers(dt: float, given: Mapping[str, float]) -> dict[str, Float[Array, ""]]:
-    """Latency, jitter and dropout of a simulated rig, where they are not given."""
-    usual = {"latency": dt / 10, "jitter": dt / 1000, "dropout": 0.0}
+def usual_numbers(
+    dt: float, num_readings: int, given: Mapping[str, float]
+) -> dict[str, Float[Array, ""]]:
+    """Latency, jitter and dropout of a simulated rig, where they are not given.
+
+    The usual latency is a tenth of dt in whole readings: a record can take no other into account.
+    """
+    latency = round(num_readings / 10) * dt / num_readings
+    usual = {"latency": latency, "jitter": dt / 1000, "dropout": 0.0}
     return {name: jnp.asarray(value, float) for name, value in (usual | dict(given)).items()}
 
 

@@ -856,10 +856,14 @@ class Campaign:
         if far := self.expected.missed:
             name, share = max(far.items(), key=lambda item: item[1])
             target = next(t for t in self.targets if t.name == name)
+            count = self._whole_rounds
+            more = "samples (--samples)" if count < self.most_rounds else "rounds (--rounds)"
+            if self.policy is None:
+                more += " or longer rounds (--steps)"
             raise ValueError(
-                f"no campaign of at most {self._whole_rounds} rounds of {self.steps} samples "
+                f"no campaign of at most {count} round{'s' * (count != 1)} of {self.steps} samples "
                 f"reaches {name} to {target}: at best {target.at(share)}; ask for less, or for "
-                "more " + ("rounds" if self.policy else "rounds or steps")
+                f"more {more}"
             )
         self.prediction = str(self.expected)
 

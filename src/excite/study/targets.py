@@ -141,6 +141,8 @@ def farthest(shares: Mapping[str, float]) -> str:
     name, share = max(shares.items(), key=lambda item: item[1])
     if not share < float("inf"):
         return f"{name} is not identifiable yet"
+    if share < 1.05:
+        return f"{name} is slightly more uncertain than asked"
     return f"{name} is {share:.2g} times as uncertain as asked"
 
 
