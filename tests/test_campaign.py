@@ -921,3 +921,14 @@ def test_a_budget_of_samples_that_is_too_short_names_its_option():
     asked = ex.Campaign("aero2", {"D_p": "0.0001%"}, policy="aero2", samples=600)
     with pytest.raises(ValueError, match=r"at most 1 round of 500 samples .* more samples \(--s"):
         asked.require_reachable()
+
+
+def test_a_policy_whose_experiment_ends_unsafely_is_told_before_the_first_round():
+    """That of `dc_motor` ends at full speed: the safe input would drive the current."""
+    told = ex.Campaign("dc_motor", {"K": "5%"})
+    told.require_reachable()
+    (warning,) = told.warnings
+    assert re.search(r"reaches 2\.\d of a critical level, .* on 32 of 32 plants", warning)
+    braked = ex.Campaign("dc_motor", {"K": "5%"})
+    braked.require_reachable(brakes=True)
+    assert not braked.warnings

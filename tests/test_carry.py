@@ -281,7 +281,7 @@ def test_a_guard_does_not_go_on(tmp_path):
 def opening(monkeypatch):
     """The first signal of campaigns on rigs, without its design."""
     monkeypatch.setattr(Campaign, "opening", Replay(jnp.asarray(SQUARE)))
-    monkeypatch.setattr(Campaign, "require_reachable", lambda _: None)
+    monkeypatch.setattr(Campaign, "require_reachable", lambda *_, **__: None)
 
 
 def played(folder, damping: str = "0.2%", **options):

@@ -428,7 +428,7 @@ def test_rounds_that_tell_rivals_apart_are_played_without_guard_and_filter(
         raise InterruptedError
 
     monkeypatch.setattr(campaign_on_rig, "run", played)
-    monkeypatch.setattr(ex.Campaign, "require_reachable", lambda self: None)
+    monkeypatch.setattr(ex.Campaign, "require_reachable", lambda *_, **__: None)
     monkeypatch.setattr(ex.Campaign, "is_undecided", not is_decided)
     monkeypatch.setattr(ex.Campaign, "ask", lambda self: self.opening)
     monkeypatch.setattr(ex.Campaign, "monitor", lambda self, waits: None)

@@ -37,6 +37,7 @@ from ..description import (
     wrong_type,
 )
 from ..environment import run_episodes
+from ..environment.falsification import nearness
 from ..estimation import Status
 from ..estimation.diagnosis import chi2_tail
 from ..estimation.identify import RecordLike, identify, record_for
@@ -53,7 +54,8 @@ from ..record import Record
 from ..report.tables import html_table, text_table
 from ..rig.contract import Interval, as_data
 from ..rig.loop import COMPLETE
-from ..safety import critical_levels
+from ..safety import critical_levels, safe_input
+from ..simulation import response
 from ..training.design import design
 from ..training.redesign import Region
 from .discrimination import Discrimination, RivalLike, judged, rivals_from, with_experiment
@@ -152,11 +154,14 @@ class Expected:
         shares: of each target, half of the interval over that allowed after all rounds, of the
             plant on which it is smallest.
         drawn_from: spread or prior.
+        nearness: of each plant, the largest output over its critical level in a whole first round
+            and the free motion after it.
     """
 
     samples: Float[np.ndarray, " plant"]
     shares: Mapping[str, float]
-    drawn_from: str = "spread"
+    drawn_from: str
+    nearness: Float[np.ndarray, " plant"]
 
     @property
     def missed(self) -> dict[str, float]:
@@ -313,7 +318,7 @@ class Campaign:
         self.rounds: list[Round] = []
         self.result: Identification | None = None
         self.next: NextExperiment | None = None
-        self.reason, self.interrupted, self.prediction = "", "", ""
+        self.reason, self.interrupted, self.prediction, self._unsafe = "", "", "", ""
         self.haste, self.playing = 1.0, ""
         self._counts_prior = True
         if self.prior is not None:
@@ -338,6 +343,7 @@ class Campaign:
     def warnings(self) -> tuple[str, ...]:
         """Sentences about policy and plant, and where the plant does not explain the records."""
         told = [*_about_policy(self.policy, self.plant, self.spread), *unexplained(self.result)]
+        told += [self._unsafe] if self._unsafe else []
         is_declared = self.plant.description.hash == self.declared.description.hash
         if self.result is not None and is_declared:
             region = region_of(self.plant, self.result, self.spread)
@@ -835,7 +841,9 @@ class Campaign:
         is_reached = np.max(list(shares.values()), axis=0) <= 1  # plant, sample
         samples = np.where(is_reached.any(axis=1), is_reached.argmax(axis=1) + 1.0, np.inf)
         best = {name: float(np.nanmin(s[:, -1])) for name, s in shares.items()}
-        return Expected(samples, best, "spread" if self.prior is None else "prior")
+        sizes = _nearness(self.plant, episodes.params, first, self.coast)
+        drawn_from = "spread" if self.prior is None else "prior"
+        return Expected(samples, best, drawn_from, np.asarray(sizes))
 
     def _redesigned(
         self, params: Params, first: Float[Array, "time input"]
@@ -851,8 +859,15 @@ class Campaign:
         again = np.resize(first, made.inputs.shape)
         return jnp.asarray(made.inputs if made.is_safe else again), made.is_safe
 
-    def require_reachable(self) -> None:
-        """Predicts what is reached; ValueError where no plant of the spread reaches the targets."""
+    def require_reachable(self, brakes: bool = False) -> None:
+        """Predicts what is reached, and whether the first round is safe.
+
+        Args:
+            brakes: whether a guard brakes after a round, in place of the safe input.
+
+        Raises:
+            ValueError: where no plant of the spread reaches the targets.
+        """
         if far := self.expected.missed:
             name, share = max(far.items(), key=lambda item: item[1])
             target = next(t for t in self.targets if t.name == name)
@@ -866,6 +881,14 @@ class Campaign:
                 f"more {more}"
             )
         self.prediction = str(self.expected)
+        sizes = self.expected.nearness
+        if not brakes and (count := np.sum(~(sizes < 1))):
+            self._unsafe = (
+                f"a whole round of the {self._opening_told} reaches {np.max(sizes):.2g} of a "
+                "critical level, or the free motion after it does, on "
+                f"{count} of {len(sizes)} plants of the {self.expected.drawn_from}: give another "
+                "policy or none (--policy), or a guard that brakes (--guard)"
+            )
 
     @property
     def num_samples(self) -> int:
@@ -1030,6 +1053,19 @@ def _halves(
         return values, half_intervals(quantities, plant, params, running)
 
     return jax.vmap(one)(params, first, later, goes_on)
+
+
+@eqx.filter_jit
+def _nearness(
+    plant: AbstractPlant, params: Params, inputs: Float[Array, "plant time input"], coast: int
+) -> Float[Array, " plant"]:
+    """Largest output over its critical level on each plant, free motion included."""
+    rest = jnp.tile(jnp.asarray(safe_input(plant.definition)), (coast, 1))
+
+    def of(params: Params, inputs: Array) -> Array:
+        return nearness(plant, response(plant, params, jnp.concatenate([inputs, rest])))
+
+    return jax.vmap(of)(params, inputs)
 
 
 def _policy(given: str | Path | Policy | None, plant: PlantDescription) -> Policy | None:

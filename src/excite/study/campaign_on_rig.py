@@ -163,7 +163,7 @@ def campaign(
     if not folder.has_rounds:
         designing = "designing the first signal, and " * (made.policy is None)
         progress(f"{designing}predicting what can be reached", 0, rounds)
-        made.require_reachable()
+        made.require_reachable(brakes=guard)
     if rivals and (guard or filter):
         on_warning("rounds that tell rivals apart are played without guard and filter")
     for sentence in made.warnings:
