@@ -928,7 +928,18 @@ def test_a_policy_whose_experiment_ends_unsafely_is_told_before_the_first_round(
     told = ex.Campaign("dc_motor", {"K": "5%"})
     told.require_reachable()
     (warning,) = told.warnings
-    assert re.search(r"reaches 2\.\d of a critical level, .* on 32 of 32 plants", warning)
-    braked = ex.Campaign("dc_motor", {"K": "5%"})
-    braked.require_reachable(brakes=True)
-    assert not braked.warnings
+    assert re.match(
+        r"the free motion after a whole round of the policy reaches .* on 32 of 32", warning
+    )
+    assert np.all(told.expected.nearness < 1)
+    told.require_reachable(brakes=True)
+    assert not told.warnings
+    wide = ex.Campaign("dc_motor", {"K": "5%"}, spread=0.6)
+    wide.require_reachable(brakes=True)
+    assert any(w.startswith("a whole round of the policy reaches") for w in wide.warnings)
+
+
+def test_a_policy_that_ends_safely_is_not_told():
+    asked = ex.Campaign("aero2", {"D_p": "5%"})
+    asked.require_reachable()
+    assert not asked.warnings

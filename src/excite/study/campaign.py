@@ -37,7 +37,6 @@ from ..description import (
     wrong_type,
 )
 from ..environment import run_episodes
-from ..environment.falsification import nearness
 from ..estimation import Status
 from ..estimation.diagnosis import chi2_tail
 from ..estimation.identify import RecordLike, identify, record_for
@@ -54,8 +53,7 @@ from ..record import Record
 from ..report.tables import html_table, text_table
 from ..rig.contract import Interval, as_data
 from ..rig.loop import COMPLETE
-from ..safety import critical_levels, safe_input
-from ..simulation import response
+from ..safety import critical_levels
 from ..training.design import design
 from ..training.redesign import Region
 from .discrimination import Discrimination, RivalLike, judged, rivals_from, with_experiment
@@ -154,14 +152,16 @@ class Expected:
         shares: of each target, half of the interval over that allowed after all rounds, of the
             plant on which it is smallest.
         drawn_from: spread or prior.
-        nearness: of each plant, the largest output over its critical level in a whole first round
-            and the free motion after it.
+        nearness: of each plant, the largest output over its critical level in a whole round of what
+            is played first.
+        nearness_after: the same, with the free motion after it.
     """
 
     samples: Float[np.ndarray, " plant"]
     shares: Mapping[str, float]
     drawn_from: str
-    nearness: Float[np.ndarray, " plant"]
+    nearness: Float[np.ndarray, " drawn"]
+    nearness_after: Float[np.ndarray, " drawn"]
 
     @property
     def missed(self) -> dict[str, float]:
@@ -217,6 +217,8 @@ class Campaign:
             one ended too early.
         prediction: what was expected before the first round, as a sentence; empty if that was not
             computed.
+        unsafe: a sentence where the first round, or the free motion after it, was expected to reach
+            a critical level.
     """
 
     def __init__(
@@ -318,7 +320,7 @@ class Campaign:
         self.rounds: list[Round] = []
         self.result: Identification | None = None
         self.next: NextExperiment | None = None
-        self.reason, self.interrupted, self.prediction, self._unsafe = "", "", "", ""
+        self.reason, self.interrupted, self.prediction, self.unsafe = "", "", "", ""
         self.haste, self.playing = 1.0, ""
         self._counts_prior = True
         if self.prior is not None:
@@ -343,8 +345,8 @@ class Campaign:
     def warnings(self) -> tuple[str, ...]:
         """Sentences about policy and plant, and where the plant does not explain the records."""
         told = [*_about_policy(self.policy, self.plant, self.spread), *unexplained(self.result)]
-        told += [self._unsafe] if self._unsafe else []
         is_declared = self.plant.description.hash == self.declared.description.hash
+        told += [self.unsafe] if self.unsafe and is_declared else []
         if self.result is not None and is_declared:
             region = region_of(self.plant, self.result, self.spread)
             told += [sentence] if (sentence := excluded(self.plant, region, self.spread)) else []
@@ -806,7 +808,9 @@ class Campaign:
             return found
         other = self._expected(True)
         least = {name: min(share, found.shares[name]) for name, share in other.shares.items()}
-        return dataclasses.replace(other, shares=least)
+        return dataclasses.replace(
+            other, shares=least, nearness=found.nearness, nearness_after=found.nearness_after
+        )
 
     def _expected(self, redesigns: bool) -> Expected:
         """The same, with redesigned signals after the first round or without them."""
@@ -814,7 +818,9 @@ class Campaign:
         count = _FEWER if redesigns or self.policy is None else _PLANTS
         keys = jax.random.split(jax.random.key(0), count)
         drawn = None if self.prior is None else plants_of(self.plant, self.prior, self.spread)
-        episodes = run_episodes(self.plant, excitation, steps, self.spread, keys, prior=drawn)
+        episodes = run_episodes(
+            self.plant, excitation, steps, self.spread, keys, coast=self.coast, prior=drawn
+        )
         first = later = episodes.trajectory.inputs
         if redesigns and self._may_redesign_first:
             made = self._candidates(self._before)[-1]
@@ -841,9 +847,10 @@ class Campaign:
         is_reached = np.max(list(shares.values()), axis=0) <= 1  # plant, sample
         samples = np.where(is_reached.any(axis=1), is_reached.argmax(axis=1) + 1.0, np.inf)
         best = {name: float(np.nanmin(s[:, -1])) for name, s in shares.items()}
-        sizes = _nearness(self.plant, episodes.params, first, self.coast)
-        drawn_from = "spread" if self.prior is None else "prior"
-        return Expected(samples, best, drawn_from, np.asarray(sizes))
+        levels = critical_levels(self.plant.description)
+        largest = np.abs(episodes.trajectory.outputs).max(axis=1), episodes.max_abs_output
+        sizes = [np.max(np.asarray(own) / levels, axis=1) for own in largest]
+        return Expected(samples, best, "spread" if self.prior is None else "prior", *sizes)
 
     def _redesigned(
         self, params: Params, first: Float[Array, "time input"]
@@ -881,14 +888,25 @@ class Campaign:
                 f"more {more}"
             )
         self.prediction = str(self.expected)
-        sizes = self.expected.nearness
-        if not brakes and (count := np.sum(~(sizes < 1))):
-            self._unsafe = (
-                f"a whole round of the {self._opening_told} reaches {np.max(sizes):.2g} of a "
-                "critical level, or the free motion after it does, on "
-                f"{count} of {len(sizes)} plants of the {self.expected.drawn_from}: give another "
-                "policy or none (--policy), or a guard that brakes (--guard)"
-            )
+        self.unsafe = self._unsafe(brakes)
+
+    def _unsafe(self, brakes: bool) -> str:
+        """A sentence where the first round reaches a level on drawn plants; else nothing."""
+        what, sizes = f"a whole round of the {self._opening_told}", self.expected.nearness
+        if np.all(sizes < 1) and not brakes:
+            what, sizes = f"the free motion after {what}", self.expected.nearness_after
+        count = np.sum(~(sizes < 1))
+        if not count:
+            return ""
+        instead = "a smaller spread or fewer steps (--spread, --steps)"
+        if self.policy is not None:
+            instead = "another policy or none (--policy)"
+            if self.policy.guard is not None and self.carry is None and not brakes:
+                instead += ", or let its guard brake (--guard)"
+        return (
+            f"{what} reaches up to {100 * np.max(sizes):.0f} % of a critical level, on {count} of "
+            f"{len(sizes)} plants of the {self.expected.drawn_from}: give {instead}"
+        )
 
     @property
     def num_samples(self) -> int:
@@ -916,6 +934,7 @@ class Campaign:
             "structure": self.discrimination and self.discrimination.to_dict(),
             "warnings": list(self.warnings),
             "expected": self.prediction,
+            **({"unsafe": self.unsafe} if self.unsafe else {}),
             "reason": self.reason,
             "playing": self.playing,
             "interrupted": self.interrupted,
@@ -1053,19 +1072,6 @@ def _halves(
         return values, half_intervals(quantities, plant, params, running)
 
     return jax.vmap(one)(params, first, later, goes_on)
-
-
-@eqx.filter_jit
-def _nearness(
-    plant: AbstractPlant, params: Params, inputs: Float[Array, "plant time input"], coast: int
-) -> Float[Array, " plant"]:
-    """Largest output over its critical level on each plant, free motion included."""
-    rest = jnp.tile(jnp.asarray(safe_input(plant.definition)), (coast, 1))
-
-    def of(params: Params, inputs: Array) -> Array:
-        return nearness(plant, response(plant, params, jnp.concatenate([inputs, rest])))
-
-    return jax.vmap(of)(params, inputs)
 
 
 def _policy(given: str | Path | Policy | None, plant: PlantDescription) -> Policy | None:

@@ -473,6 +473,7 @@ class _Folder:
                     "compare them with the new ones"
                 )
             made.prediction = str(kept["expected"]) if is_same else ""
+            made.unsafe = str(kept.get("unsafe", ""))
             names = [*(str(r["played"]) for r in before), str(kept.get("playing", ""))]
         while _has_samples(path := self.path(len(made.rounds))):
             record, first = read_record(path, made.declared.description), len(made.rounds)
