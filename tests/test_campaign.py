@@ -29,7 +29,7 @@ from excite.study.campaign import REACHED
 from excite.study.campaign_on_rig import _Folder, _paused
 from excite.study.monitor import Monitor
 from excite.study.quantities import known_of, propagated
-from excite.study.targets import others_of, targets_from
+from excite.study.targets import farthest, others_of, targets_from
 from excite.training.design import Design
 
 TRUE = {"J_p": 0.025, "K_pu": 0.0110, "D_p": 0.0011}
@@ -943,3 +943,11 @@ def test_a_policy_that_ends_safely_is_not_told():
     asked = ex.Campaign("aero2", {"D_p": "5%"})
     asked.require_reachable()
     assert not asked.warnings
+
+
+@pytest.mark.parametrize(
+    ("share", "told"),
+    [(1.04, "slightly more uncertain"), (1.06, "1.1 times as"), (math.inf, "not identifiable yet")],
+)
+def test_a_target_that_is_nearly_reached_is_not_once_as_uncertain(share, told):
+    assert told in farthest({"J_p": 0.5, "D_p": share})
