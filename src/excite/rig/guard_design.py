@@ -276,8 +276,8 @@ def guard_for(
 
     def played(function: Callable[..., Array], rules: GuardRules, *series: Array) -> np.ndarray:
         """A function of all experiments, chunk by chunk."""
-        filter, late = GuardFilter(model, rules, num_steps), float(plant.dt) / 10
-        play, rows = OnRig.of(box, excitation, num_steps, filter, latency=late), []
+        watched, latency = GuardFilter(model, rules, num_steps), float(plant.dt) / 10
+        play, rows = OnRig.of(box, excitation, num_steps, watched, latency=latency), []
         for first in range(0, num_runs, _CHUNK):
             progress("calibrating the guard", first, num_runs)
             chunk = jax.tree.map(lambda x, at=first: x[at : at + _CHUNK], (cases, *series))

@@ -53,7 +53,7 @@ from ..record import Record
 from ..report.tables import html_table, text_table
 from ..rig.contract import Interval, as_data
 from ..rig.loop import COMPLETE
-from ..safety import critical_levels
+from ..safety import critical_levels, max_abs_output
 from ..training.design import design
 from ..training.redesign import Region
 from .discrimination import Discrimination, RivalLike, judged, rivals_from, with_experiment
@@ -848,7 +848,7 @@ class Campaign:
         samples = np.where(is_reached.any(axis=1), is_reached.argmax(axis=1) + 1.0, np.inf)
         best = {name: float(np.nanmin(s[:, -1])) for name, s in shares.items()}
         levels = critical_levels(self.plant.description)
-        largest = np.abs(episodes.trajectory.outputs).max(axis=1), episodes.max_abs_output
+        largest = max_abs_output(episodes.trajectory.outputs), episodes.max_abs_output
         sizes = [np.max(np.asarray(own) / levels, axis=1) for own in largest]
         return Expected(samples, best, "spread" if self.prior is None else "prior", *sizes)
 
