@@ -88,11 +88,11 @@ def main() -> None:
             lengths = [len(ex.read_record(folder / name).time) - 1 for name in now]
             first = [int(name[6:8]) - 1 for name in now]
             counts = [r["num_samples"] for r in ended["rounds"]]
-            told = [sum(counts[i:j]) for i, j in itertools.pairwise([*first, len(counts)])]
+            sums = [sum(counts[i:j]) for i, j in itertools.pairwise([*first, len(counts)])]
             if asked.carry is None and first != [*range(len(counts))]:
                 sys.exit(f"{folder}: rounds {list(now)}")
             if any(
-                not 0 <= n - t <= (asked.carry or 0) for n, t in zip(lengths, told, strict=True)
+                not 0 <= n - t <= (asked.carry or 0) for n, t in zip(lengths, sums, strict=True)
             ):
                 sys.exit(f"{folder}: the rounds {counts} are not the records {lengths}")
             if (ended["reason"], process.returncode) != ("every target is reached", 0):

@@ -261,6 +261,10 @@ def check_reading(
 def about_to_reach(samples: AnyArray, critical: AnyArray) -> AnyArray:
     """Whether each output is near its level, and reaches it one sample later.
 
+    Args:
+        samples: the last three, axis 0, newest last; output is the last axis.
+        critical: level of each output.
+
     A parabola through the last three samples, newest last, takes into account that a swing slows
     down before it turns. It says nothing of a plant that turns within a sample.
     """

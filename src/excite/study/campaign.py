@@ -879,9 +879,10 @@ class Campaign:
             name, share = max(far.items(), key=lambda item: item[1])
             target = next(t for t in self.targets if t.name == name)
             count = self._whole_rounds
-            more = "samples (--samples)" if count < self.most_rounds else "rounds (--rounds)"
-            if self.policy is None:
-                more += " or longer rounds (--steps)"
+            more = ["rounds (--rounds)"] * (count == self.most_rounds)
+            if self.most_samples is not None and self.most_samples // self.steps == count:
+                more.append("samples (--samples)")
+            more = " and ".join(more) + " or longer rounds (--steps)" * (self.policy is None)
             raise ValueError(
                 f"no campaign of at most {count} round{'s' * (count != 1)} of {self.steps} samples "
                 f"reaches {name} to {target}: at best {target.at(share)}; ask for less, or for "
@@ -903,9 +904,12 @@ class Campaign:
             instead = "another policy or none (--policy)"
             if self.policy.guard is not None and self.carry is None and not brakes:
                 instead += ", or let its guard brake (--guard)"
+        most = f"reaches up to {100 * np.max(sizes):.0f} % of a critical level, on"
+        if not np.isfinite(sizes).all():
+            most = "diverges or reaches a critical level on"
         return (
-            f"{what} reaches up to {100 * np.max(sizes):.0f} % of a critical level, on {count} of "
-            f"{len(sizes)} plants of the {self.expected.drawn_from}: give {instead}"
+            f"{what} {most} {count} of {len(sizes)} plants of the {self.expected.drawn_from}: "
+            f"give {instead}"
         )
 
     @property

@@ -23,7 +23,7 @@ from scipy.stats import chi2
 from ..environment.falsification import nearness
 from ..information import Past, Start, experiment_information, start_after
 from ..plant import AbstractPlant, Params
-from ..safety import safe_input
+from ..safety import about_to_reach, critical_levels, safe_input
 from ..simulation import response
 from .gradient import GradientSettings, mean_excess, optimiser
 from .signals import random_sines
@@ -80,7 +80,8 @@ class Redesigned(eqx.Module):
         inputs: of each of the coming rounds, in the inputs' units; the first is to be played.
         shares: of every start, the mean over plants of how uncertain the parameters would be
             after all of these rounds, over the goals (root of the sum of squares).
-        nearness: largest output over its critical level on the plants, coast included.
+        nearness: largest output over its critical level on the plants, coast included; at least
+            one where a supervisor would end the round of one of them.
     """
 
     inputs: Float[Array, "round time input"]
@@ -170,12 +171,14 @@ def redesigned(
         over = jax.vmap(jax.vmap(beyond, (None, None, 0)), (0, 0, None))(*points, inputs)
         return jnp.mean(unknown) + settings.penalty_weight * jnp.mean(over), None
 
-    def largest(inputs: Array) -> Array:
-        def of(own: Array) -> Array:
-            played = jax.vmap(outputs, (0, 0, None))(*judges, own)
-            return jax.vmap(lambda outputs: nearness(plant, outputs))(played)
+    def size(params: Params, start: Start | None, own: Float[Array, "time input"]) -> Array:
+        played = outputs(params, start, own)
+        triples = jnp.stack([played[:-2], played[1:-1], played[2:]])
+        is_tripped = jnp.any(about_to_reach(triples, critical_levels(plant.definition)[None]))
+        return jnp.maximum(nearness(plant, played), is_tripped)
 
-        return jnp.max(jax.vmap(of)(inputs))
+    def largest(inputs: Array) -> Array:
+        return jnp.max(jax.vmap(jax.vmap(size, (None, None, 0)), (0, 0, None))(*judges, inputs))
 
     def from_start(start: Array) -> tuple[Array, Array, Array]:
         found = searched(plant, loss, start, None, settings)
