@@ -918,14 +918,30 @@ def test_the_command_ends_a_round_as_soon_as_enough_is_known(tmp_path):
 
 
 def test_a_budget_of_samples_that_is_too_short_names_its_option():
-    asked = ex.Campaign("aero2", {"D_p": "0.0001%"}, policy="aero2", samples=600)
-    with pytest.raises(ValueError, match=r"at most 1 round of 500 samples .* more samples \(--s"):
+    few = r"at most 1 round of 500 samples .* more {}samples \(--samples\)$"
+    for rounds, also in ((10, ""), (1, r"rounds \(--rounds\) and ")):
+        target = {"D_p": "0.0001%"}
+        asked = ex.Campaign("aero2", target, policy="aero2", rounds=rounds, samples=600)
+        with pytest.raises(ValueError, match=few.format(also)):
+            asked.require_reachable()
+
+
+def test_a_plant_that_diverges_is_told_without_a_size():
+    asked = ex.Campaign("aero2", {"D_p": "5%"})
+    sizes = np.full(32, 0.9)
+    sizes[:2] = np.inf, np.nan
+    for name in ("nearness_after", "nearness"):
+        asked.expected = dataclasses.replace(asked.expected, **{name: sizes})
         asked.require_reachable()
+        assert asked.unsafe.endswith(
+            "diverges or reaches a critical level on 2 of 32 plants of the spread: "
+            "give another policy or none (--policy)"
+        )
 
 
 def test_a_policy_whose_experiment_ends_unsafely_is_told_before_the_first_round():
     """That of `dc_motor` ends at full speed: the safe input would drive the current."""
-    told = ex.Campaign("dc_motor", {"K": "5%"})
+    told = ex.Campaign("dc_motor", {"K": "5%"}, policy="dc_motor")
     told.require_reachable()
     (warning,) = told.warnings
     assert re.match(
@@ -934,13 +950,20 @@ def test_a_policy_whose_experiment_ends_unsafely_is_told_before_the_first_round(
     assert np.all(told.expected.nearness < 1)
     told.require_reachable(brakes=True)
     assert not told.warnings
-    wide = ex.Campaign("dc_motor", {"K": "5%"}, spread=0.6)
+    wide = ex.Campaign("dc_motor", {"K": "5%"}, policy="dc_motor", spread=0.6)
     wide.require_reachable(brakes=True)
     assert any(w.startswith("a whole round of the policy reaches") for w in wide.warnings)
 
 
-def test_a_policy_that_ends_safely_is_not_told():
-    asked = ex.Campaign("aero2", {"D_p": "5%"})
+@pytest.mark.parametrize(
+    ("plant", "target"),
+    [("aero2", {"D_p": "5%"}), ("dc_motor", {"R": "1%"}), ("cart_pole", {"l": "1%"}),
+     ("emps", {"M": "1%"})],
+)  # fmt: skip
+def test_the_usual_policies_are_for_wide_spreads_and_end_safely(plant, target):
+    asked = ex.Campaign(plant, target)
+    assert asked.policy is not None
+    assert asked.policy.hash == ex.read_policy(f"{plant}-wide").hash
     asked.require_reachable()
     assert not asked.warnings
 

@@ -131,8 +131,7 @@ def test_the_page_compares_campaigns_with_other_methods(name):
             line.startswith(f"| {method}{f', {plant}' * is_named} | {' | '.join(cells)} |")
             for line in PAGE.splitlines()
         )
-    policy = FOLDER / f"policies/{plant}-wide.safetensors" if plant else "aero2-wide"
-    assert found["policy_hash"] == read_policy(policy).hash
+    assert found["policy_hash"] == read_policy(f"{plant or 'aero2'}-wide").hash
     assert name == "compare_emps" or not any(row["violations"] for row in found["rows"].values())
 
 
