@@ -22,10 +22,11 @@ from excite.excitation import Replay
 from excite.files import locked_folder, read_columns
 from excite.information import experiment_information
 from excite.plant import Aero2, draw_params
+from excite.plant.catalogue import plant_named
 from excite.policy import Layout
 from excite.rig.contract import Interval, Sample
 from excite.simulation import response, run_episode
-from excite.study.campaign import REACHED
+from excite.study.campaign import REACHED, usual_policy
 from excite.study.campaign_on_rig import _Folder, _paused
 from excite.study.monitor import Monitor
 from excite.study.quantities import known_of, propagated
@@ -936,6 +937,25 @@ def test_a_plant_that_diverges_is_told_without_a_size():
         assert asked.unsafe.endswith(
             "diverges or reaches a critical level on 2 of 32 plants of the spread: "
             "give another policy or none (--policy)"
+        )
+
+
+@pytest.mark.parametrize(
+    ("plant", "usual", "with_guard"),
+    [("aero2", "aero2-wide", "aero2"), ("dc_motor", "dc_motor-wide", "dc_motor"),
+     ("emps", "emps-wide", "emps-wide"), ("aero2_detailed", "aero2_detailed", "aero2_detailed"),
+     ("van_der_pol", "none", "none")],
+)  # fmt: skip
+def test_with_a_guard_the_usual_policy_is_one_that_has_it(plant, usual, with_guard):
+    description = dataclasses.replace(plant_named("aero2").description, name=plant)
+    assert usual_policy(description) == usual
+    assert usual_policy(description, guarded=True) == with_guard
+
+
+def test_a_campaign_with_guard_needs_no_name_of_a_policy(tmp_path):
+    with pytest.raises(ValueError, match="no campaign of at most 1 round of 500 samples"):
+        ex.campaign(
+            "dc_motor", {"R": "0.000001%"}, guard=True, rounds=1, fast=True, out=tmp_path / "c"
         )
 
 

@@ -1078,11 +1078,23 @@ def _halves(
     return jax.vmap(one)(params, first, later, goes_on)
 
 
+def usual_policy(plant: PlantDescription, guarded: bool = False) -> str:
+    """Name of the shipped policy that a campaign plays: for a wide spread, where there is one.
+
+    Args:
+        plant: of the campaign.
+        guarded: whether one that has a guard goes first.
+    """
+    shipped = shipped_policies()
+    names = [n for n in (f"{plant.name}-wide", plant.name) if n in shipped]
+    if guarded:
+        names.sort(key=lambda name: read_policy(name).guard is None)
+    return next(iter(names), NO_POLICY)
+
+
 def _policy(given: str | Path | Policy | None, plant: PlantDescription) -> Policy | None:
     """The policy to play, if there is one; ValueError where it cannot be played on the plant."""
-    if given is None:
-        shipped = shipped_policies()
-        given = next((n for n in (f"{plant.name}-wide", plant.name) if n in shipped), NO_POLICY)
+    given = usual_policy(plant) if given is None else given
     if isinstance(given, str) and given == NO_POLICY:
         return None
     found = given if isinstance(given, Policy) else read_policy(given)

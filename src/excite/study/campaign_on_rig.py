@@ -28,7 +28,7 @@ from ..estimation.prior_knowledge import PriorLike
 from ..estimation.result import Identification
 from ..excitation import Replay
 from ..files import csv_text, json_ready, locked_folder, read_json, write_bytes, write_json
-from ..plant.catalogue import PlantLike
+from ..plant.catalogue import PlantLike, plant_from
 from ..policy import Policy, guard_of
 from ..progress import SHOWN, Progress
 from ..record import Record, read_record
@@ -41,7 +41,7 @@ from ..rig.session import RunResult, run
 from ..rig.simulated import SimulatedRig
 from ..safety import Trip
 from ..simulation import simulate
-from .campaign import REACHED, WHOLE, Campaign, Round
+from .campaign import REACHED, WHOLE, Campaign, Round, usual_policy
 from .discrimination import RivalLike
 from .monitor import Monitor
 from .next_experiment import played_as
@@ -103,8 +103,9 @@ def campaign(
         seed: of a simulated rig's hidden parameters, noise and jitter.
         fault: of a simulated rig, as for `run`.
         filter: adds a predictive safety filter for parameters within the spread.
-        guard: ends a round that no declared plant explains, as for `run`. Guard and filter know
-            one plant: rounds that tell rivals apart are played without them.
+        guard: ends a round that no declared plant explains, as for `run`. The default policy is
+            then one that has a guard, where one is shipped. Guard and filter know one plant:
+            rounds that tell rivals apart are played without them.
         pause: before every round from rest but the first, so that the plant comes to rest [s]. A
             simulated rig and an FMU begin at rest by themselves; for any other rig it must be
             given.
@@ -121,6 +122,8 @@ def campaign(
     """
     if guard and carry is not None:
         raise ValueError("a guard knows a policy, which begins at rest: it does not go with carry")
+    if guard and policy is None:
+        policy = usual_policy(plant_from(plant).description, guarded=True)
     made = Campaign(
         plant, target, policy=policy, steps=steps, spread=spread, rounds=rounds, samples=samples,
         coast=coast, carry=carry,
