@@ -115,11 +115,12 @@ def test_the_page_says_how_often_the_true_rival_is_found_with_much_noise():
 
 
 @pytest.mark.parametrize(
-    "name", ["compare", "compare_emps", "compare_dc_motor", "compare_cart_pole"]
+    "name",
+    ["compare", "compare_emps", "compare_dc_motor", "compare_cart_pole", "compare_cart_pole_2"],
 )
 def test_the_page_compares_campaigns_with_other_methods(name):
     found = json.loads((FOLDER / f"{name}.json").read_text())
-    plant = name.partition("_")[2]
+    plant = name.partition("_")[2].removesuffix("_2")
     is_named = plant in ("dc_motor", "cart_pole")
     for method, row in found["rows"].items():
         cells = []
