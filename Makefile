@@ -88,6 +88,9 @@ policies: ## what is shipped in src/excite/policy/shipped, from the results of t
 	cp results/table1/seeds/RL_D_p/5/policy.safetensors src/excite/policy/shipped/aero2-ppo-D_p.safetensors
 	cp results/emps/seeds/gradient_D/0/policy.safetensors src/excite/policy/shipped/emps.safetensors
 	cp results/dc_motor/seeds/gradient_D/0/policy.safetensors src/excite/policy/shipped/dc_motor.safetensors
+	cp results/emps_wide/seeds/gradient_A/0/policy.safetensors src/excite/policy/shipped/emps-wide.safetensors
+	cp results/dc_motor_wide/seeds/gradient_A/0/policy.safetensors src/excite/policy/shipped/dc_motor-wide.safetensors
+	cp results/cart_pole_wide/seeds/gradient_A/0/policy.safetensors src/excite/policy/shipped/cart_pole-wide.safetensors
 	cp results/aero2_lag/seeds/gradient_D/0/policy.safetensors src/excite/policy/shipped/aero2_lag.safetensors
 	cp results/cart_pole/seeds/gradient_D/0/policy.safetensors src/excite/policy/shipped/cart_pole.safetensors
 	cp results/sim_to_real/seeds/gradient_robust/0/policy.safetensors src/excite/policy/shipped/aero2_detailed.safetensors
@@ -110,11 +113,15 @@ certificates: .venv/core ## searches for the worst plant of each shipped policy;
 
 evaluations: .venv/core ## evaluates the shipped policies on new plants, in results/policies
 	mkdir -p results/policies
-	for policy in $(filter-out cart_pole aero2 aero2-wide aero2-ideal aero2-goals aero2-damping,$(notdir $(basename $(wildcard src/excite/policy/shipped/*.safetensors)))); do \
+	for policy in $(filter-out cart_pole %-wide aero2 aero2-ideal aero2-goals aero2-damping,$(notdir $(basename $(wildcard src/excite/policy/shipped/*.safetensors)))); do \
 	  $(BIN)/excite evaluate $$policy --episodes 1000 --seed 7 --json > results/policies/$$policy.json || exit 1; \
 	done
 	$(BIN)/excite evaluate cart_pole --episodes 200 --seed 7 --json > results/policies/cart_pole.json
 	$(BIN)/excite evaluate aero2-wide --spread factor:3 --coast 50 --episodes 1000 --seed 7 --json > results/policies/aero2-wide.json
+	for policy in dc_motor-wide emps-wide; do \
+	  $(BIN)/excite evaluate $$policy --spread factor:2 --coast 50 --episodes 1000 --seed 7 --json > results/policies/$$policy.json || exit 1; \
+	done
+	$(BIN)/excite evaluate cart_pole-wide --spread factor:2 --coast 50 --episodes 200 --seed 7 --json > results/policies/cart_pole-wide.json
 	for policy in aero2 aero2-ideal aero2-goals aero2-damping; do \
 	  $(BIN)/excite evaluate $$policy --episodes 10000 --seed 7 --json > results/policies/$$policy.json || exit 1; \
 	done

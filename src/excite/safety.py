@@ -261,12 +261,12 @@ def check_reading(
 def about_to_reach(samples: AnyArray, critical: AnyArray) -> AnyArray:
     """Whether each output is near its level, and reaches it one sample later.
 
+    A parabola through the last three samples takes into account that a swing slows down before it
+    turns. It says nothing of a plant that turns within a sample.
+
     Args:
         samples: the last three, axis 0, newest last; output is the last axis.
         critical: level of each output.
-
-    A parabola through the last three samples, newest last, takes into account that a swing slows
-    down before it turns. It says nothing of a plant that turns within a sample.
     """
     predicted = 3 * samples[2] - 3 * samples[1] + samples[0]
     is_smooth = abs(samples[2] - 2 * samples[1] + samples[0]) < 0.25 * critical

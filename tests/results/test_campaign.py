@@ -128,10 +128,10 @@ def test_the_page_compares_campaigns_with_other_methods(name):
             own = row[target]
             shown = [f"{own[q]:.0f}" if own[q] else "–" for q in ("median", "90 %", "all")]
             cells.append(", ".join([*shown, str(own["missed"])]))
-        assert any(
-            line.startswith(f"| {method}{f', {plant}' * is_named} | {' | '.join(cells)} |")
-            for line in PAGE.splitlines()
-        )
+        if plant:
+            cells.append(f"{row['violations']}, {row['largest']:.3f}")
+        whole = f"| {method}{f', {plant}' * is_named} | {' | '.join(cells)} |"
+        assert whole in PAGE.splitlines()
     assert found["policy_hash"] == read_policy(f"{plant or 'aero2'}-wide").hash
     assert name == "compare_emps" or not any(row["violations"] for row in found["rows"].values())
 

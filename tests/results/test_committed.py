@@ -42,8 +42,8 @@ def test_the_committed_efficiency_is_near_the_best_that_could_be_had():
 def test_every_shipped_policy_was_evaluated_as_it_is(name):
     seen = json.loads((RESULTS / "policies" / f"{name}.json").read_text())
     assert seen["policy_hash"] == read_policy(shipped_policies()[name]).hash
-    plant, is_wide = name.removesuffix("-wide"), name.endswith("-wide")
-    factor = {"aero2": "factor:3"}.get(plant, "factor:2")
+    is_wide = name.endswith("-wide")
+    factor = "factor:3" if name == "aero2-wide" else "factor:2"
     assert seen["study"]["spread"] == (factor if is_wide else 0.3)
     assert seen["study"].get("coast", 0) == (50 if is_wide else 0)
     for row in seen["rows"]:

@@ -34,7 +34,8 @@ from .study import show_comparison
 def policies(files: tuple[str, ...], as_json: bool) -> None:
     """List the policies that come with the package, or those in files.
 
-    A policy with its plant's name is the default of that plant.
+    A policy with its plant's name is the default of that plant. Campaigns prefer the one that
+    ends in -wide.
     """
     from ..policy import policy_path, read_policy, shipped_policies
 

@@ -38,7 +38,7 @@ def read_policy(policy: str | Path) -> Policy:
 
 
 def shipped_policies() -> dict[str, Path]:
-    """Policies that come with the package, by name; a plant's default has the plant's name."""
+    """Policies that come with the package, by name; a plant's usual one has the plant's name."""
     return {path.stem: path for path in sorted(SHIPPED.glob(f"*{POLICY_ENDING}"))}
 
 

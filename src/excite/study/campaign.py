@@ -246,9 +246,9 @@ class Campaign:
                 of the parameters, or its file `path/to/file.py:function`; or an output that is
                 predicted for an experiment from rest, `pitch@2:step.csv` after 2 s of the inputs
                 in a file, or of a signal by name.
-            policy: to be played, its name or file; default the plant's shipped policy for a
-                spread by a factor, or its usual one. "none", or a plant without one, begins with
-                a robust signal, which `design` makes safe for the spread.
+            policy: to be played, its name or file; default the shipped one of the plant's name
+                and `-wide`, or else of the plant's name. "none", or a plant without one, begins
+                with a robust signal, which `design` makes safe for the spread.
             steps: samples of a round without a policy, default 50; the first has half as many,
                 because little is known of the plant.
             spread: of the parameters; default that of the policy's training, or 0.3.

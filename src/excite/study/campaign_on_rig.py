@@ -122,8 +122,9 @@ def campaign(
     """
     if guard and carry is not None:
         raise ValueError("a guard knows a policy, which begins at rest: it does not go with carry")
+    plant = plant_from(plant)
     if guard and policy is None:
-        policy = usual_policy(plant_from(plant).description, guarded=True)
+        policy = usual_policy(plant.description, guarded=True)
     made = Campaign(
         plant, target, policy=policy, steps=steps, spread=spread, rounds=rounds, samples=samples,
         coast=coast, carry=carry,

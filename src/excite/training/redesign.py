@@ -81,7 +81,7 @@ class Redesigned(eqx.Module):
         shares: of every start, the mean over plants of how uncertain the parameters would be
             after all of these rounds, over the goals (root of the sum of squares).
         nearness: largest output over its critical level on the plants, coast included; at least
-            one where a supervisor would end the round of one of them.
+            one where a supervisor would predict that one of them reaches it, without noise.
     """
 
     inputs: Float[Array, "round time input"]
